@@ -1,0 +1,46 @@
+PYTHON ?= python3
+VENV   ?= .venv
+OUT    ?= out
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+PROFILE ?= quick
+
+.DEFAULT_GOAL := help
+.PHONY: help setup reproduce test lint types benchmark clean
+
+help:            ## list the targets
+	@grep -hE '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+
+setup: $(READY)  ## make the environment in .venv
+
+$(READY): pyproject.toml constraints.txt
+	@echo "[setup] creating $(VENV) and installing forcegp (once; a few minutes)"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --upgrade --progress-bar off --quiet "pip>=24"
+	@echo "[setup] PyTorch"
+	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt torch
+	@echo "[setup] forcegp and the tools that test it"
+	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt -e ".[pybullet,test,dev]"
+	@touch $(READY)
+	@echo "[setup] done"
+
+reproduce: $(READY)  ## the main job: simulate, select, train, report
+	$(BIN)/forcegp reproduce --profile $(PROFILE) --out $(OUT)/$(PROFILE)
+
+test: lint types $(READY)  ## lint, types and tests
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+	@echo "[test] all passed: see the summary above"
+
+lint: $(READY)   ## ruff, check and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(READY)  ## pyright
+	$(BIN)/pyright
+
+benchmark: $(READY)  ## every benchmark, results as JSON under out/benchmarks
+	@mkdir -p $(OUT)/benchmarks
+	@for f in benchmarks/*.py; do $(BIN)/python $$f --json $(OUT)/benchmarks/$$(basename $$f .py).json; done
+
+clean:           ## remove what the targets made
+	rm -rf $(VENV) $(OUT) build dist .pytest_cache .ruff_cache

@@ -1,0 +1,196 @@
+"""The frozen description of a robot: a tree of one-degree-of-freedom joints with rigid links.
+
+Joint `i` moves link `i`. Its frame sits at `placement` in the frame of its parent link; the link frame
+is the joint frame after the motion. All inertial figures of link `i` are in the axes of link frame `i`,
+the inertia about the centre of mass. Fixed joints are folded into the links; their frames keep a name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import ShapeError, UnknownNameError
+
+JointType = Literal["revolute", "prismatic"]
+BASE = -1
+"""Index of the fixed base where a joint index is expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotModel:
+    """A robot arm with `nq` joints and `nf` named frames, as constants (SI units, radians).
+
+    Args:
+        name: name of the robot.
+        joint_names: the moving joints, parents before children.
+        joint_types: `"revolute"` or `"prismatic"`, one a joint (continuous joints are revolute).
+        parents: index of the parent joint of each joint, −1 for the base.
+        placement_rotation: `(nq, 3, 3)` joint frame in the parent link frame at q = 0.
+        placement_position: `(nq, 3)` [m].
+        axis: `(nq, 3)` unit joint axis in the joint frame.
+        mass: `(nq,)` [kg].
+        com: `(nq, 3)` centre of mass in the link frame [m].
+        inertia: `(nq, 3, 3)` rotational inertia about the centre of mass, link axes [kg m²].
+        damping: `(nq,)` viscous joint friction [N m s/rad, N s/m].
+        friction: `(nq,)` Coulomb joint friction [N m, N].
+        lower, upper: `(nq,)` joint limits [rad, m], infinite where there are none.
+        velocity_limit, effort_limit: `(nq,)` [rad/s, m/s], [N m, N], infinite where there are none.
+        frame_names: every link and fixed frame of the file.
+        frame_parents: index of the joint that moves each frame, −1 for the base.
+        frame_rotation, frame_position: `(nf, 3, 3)`, `(nf, 3)` pose in that joint's link frame.
+        base_rotation, base_position: pose of the base in the world `(3, 3)`, `(3,)` [m].
+        gravity: `(3,)` gravitational acceleration in the world [m/s²].
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    joint_types: tuple[JointType, ...]
+    parents: tuple[int, ...]
+    placement_rotation: Tensor
+    placement_position: Tensor
+    axis: Tensor
+    mass: Tensor
+    com: Tensor
+    inertia: Tensor
+    damping: Tensor
+    friction: Tensor
+    lower: Tensor
+    upper: Tensor
+    velocity_limit: Tensor
+    effort_limit: Tensor
+    frame_names: tuple[str, ...]
+    frame_parents: tuple[int, ...]
+    frame_rotation: Tensor
+    frame_position: Tensor
+    base_rotation: Tensor
+    base_position: Tensor
+    gravity: Tensor
+
+    @property
+    def nq(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating-point type of every constant."""
+        return self.axis.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of every constant."""
+        return self.axis.device
+
+    @cached_property
+    def levels(self) -> tuple[tuple[int, ...], ...]:
+        """Joints by depth in the tree, the base's children first."""
+        depth: list[int] = []
+        for parent in self.parents:
+            depth.append(0 if parent == BASE else depth[parent] + 1)
+        return tuple(
+            tuple(i for i, d in enumerate(depth) if d == level) for level in range(max(depth, default=-1) + 1)
+        )
+
+    @cached_property
+    def ancestors(self) -> Tensor:
+        """E `(nq, nq)`: E[i, j] = 1 where joint j moves link i."""
+        E = torch.eye(self.nq, dtype=self.dtype, device=self.device)
+        for i, parent in enumerate(self.parents):
+            if parent != BASE:
+                E[i] += E[parent]
+        return E
+
+    @cached_property
+    def revolute(self) -> Tensor:
+        """`(nq,)` 1 for revolute joints, 0 for prismatic ones."""
+        flags = [float(kind == "revolute") for kind in self.joint_types]
+        return torch.tensor(flags, dtype=self.dtype, device=self.device)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 over joint names, kinematics and inertial figures: tells whether two robots are the same."""
+        digest = hashlib.sha256(repr((self.joint_names, self.joint_types, self.parents)).encode())
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                digest.update(field.name.encode())
+                digest.update(value.detach().to("cpu", torch.float64).contiguous().numpy().tobytes())
+        return digest.hexdigest()[:16]
+
+    def frame_index(self, frame: str) -> int:
+        """Index of a named frame.
+
+        Raises:
+            UnknownNameError: no such frame; the message lists the frames and the nearest one.
+        """
+        try:
+            return self.frame_names.index(frame)
+        except ValueError:
+            raise UnknownNameError(f"frame of robot {self.name!r}", frame, self.frame_names) from None
+
+    def joint_index(self, joint: str) -> int:
+        """Index of a named joint.
+
+        Raises:
+            UnknownNameError: no such joint; the message lists the joints and the nearest one.
+        """
+        try:
+            return self.joint_names.index(joint)
+        except ValueError:
+            raise UnknownNameError(f"joint of robot {self.name!r}", joint, self.joint_names) from None
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RobotModel:
+        """The same robot with its constants on another device or in another precision."""
+        return self.replace(**{
+            field.name: value.to(device=device, dtype=dtype)
+            for field in dataclasses.fields(self)
+            if isinstance(value := getattr(self, field.name), Tensor)
+        })
+
+    def replace(self, **fields: object) -> RobotModel:
+        """A robot with some fields changed, such as `robot.replace(mass=mass)`.
+
+        Raises:
+            UnknownNameError: a field does not exist.
+            ShapeError: a tensor has another shape than the one it replaces.
+        """
+        names = [field.name for field in dataclasses.fields(self)]
+        for name, value in fields.items():
+            if name not in names:
+                raise UnknownNameError("robot field", name, names)
+            old = getattr(self, name)
+            if isinstance(old, Tensor) and isinstance(value, Tensor) and value.shape != old.shape:
+                raise ShapeError(
+                    f"robot field {name!r} has the wrong shape",
+                    expected=tuple(old.shape),
+                    got=tuple(value.shape),
+                )
+        return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
+
+    def check_state(self, **states: Tensor) -> None:
+        """Check that joint-space arguments end in `nq` and share the robot's dtype and device.
+
+        Raises:
+            ShapeError: one does not; the message names the argument.
+        """
+        for name, value in states.items():
+            if value.ndim == 0 or value.shape[-1] != self.nq:
+                raise ShapeError(
+                    f"{name} does not fit robot {self.name!r}",
+                    expected=f"shape (*batch, {self.nq}) for joints {', '.join(self.joint_names)}",
+                    got=tuple(value.shape),
+                )
+            if value.dtype != self.dtype or value.device != self.device:
+                raise ShapeError(
+                    f"{name} is not in the precision or on the device of robot {self.name!r}",
+                    expected=f"{self.dtype} on {self.device}",
+                    got=f"{value.dtype} on {value.device}",
+                    hint=f"convert {name}, or the robot with robot.to(device, dtype)",
+                )

@@ -1,0 +1,23 @@
+"""Shape aliases: every batched quantity has its batch dimensions first, `(*batch, …)`.
+
+`nq` joints, `nf` frames, `m` constraint rows, `n` samples, `d` components. The aliases document shapes
+in signatures; the test suite enforces them at run time.
+"""
+
+from __future__ import annotations
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+Scalars = Float[Tensor, "*batch"]
+Vector3 = Float[Tensor, "*batch 3"]
+Rotation = Float[Tensor, "*batch 3 3"]
+JointVector = Float[Tensor, "*batch nq"]
+JointMatrix = Float[Tensor, "*batch nq nq"]
+JointVectors3 = Float[Tensor, "*batch nq 3"]
+PointJacobian = Float[Tensor, "*batch 3 nq"]
+FrameJacobian = Float[Tensor, "*batch 6 nq"]
+ConstraintVector = Float[Tensor, "*batch m"]
+ConstraintMatrix = Float[Tensor, "*batch m nq"]
+ConstraintInverse = Float[Tensor, "*batch nq m"]
+ActiveContacts = Bool[Tensor, "*batch m"]
