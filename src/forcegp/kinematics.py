@@ -126,7 +126,8 @@ def _movers(robot: RobotModel, index: int) -> Tensor:
     return torch.zeros_like(robot.revolute) if parent == BASE else robot.ancestors[parent]
 
 
-def _point(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> Tensor:
+def point_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> Vector3:
+    """Position relative to the base origin `(*batch, 3)` [m] of a point fixed in a frame, world axes."""
     rotation, position = _frame_in_base(robot, poses, index)
     return position + (rotation @ point[..., None])[..., 0]
 
@@ -183,7 +184,7 @@ def frame_jacobian(
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
     """`frame_jacobian` from poses already known."""
-    x = _point(robot, poses, index, point)
+    x = point_of_poses(robot, poses, index, point)
     linear = poses.linear + cross(poses.angular, x[..., None, :])
     screws = torch.cat([poses.angular, linear], dim=-1) * _movers(robot, index)[:, None]
     return screws.mT
@@ -222,7 +223,7 @@ def bias_acceleration_of_motion(
         return torch.zeros(
             *poses.position.shape[:-2], 6, dtype=poses.position.dtype, device=poses.position.device
         )
-    x = _point(robot, poses, index, point)
+    x = point_of_poses(robot, poses, index, point)
     omega, alpha = motion.omega[..., parent, :], motion.alpha[..., parent, :]
     velocity = motion.velocity[..., parent, :] + cross(omega, x)
     acceleration = motion.acceleration[..., parent, :] + cross(alpha, x) + cross(omega, velocity)

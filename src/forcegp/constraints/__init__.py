@@ -1,0 +1,20 @@
+"""Implicit constraints: surfaces, contacts, stabilization, and the constrained equations of motion."""
+
+from forcegp.constraints.baumgarte import Baumgarte
+from forcegp.constraints.contact import Constraint, PointConnection, SurfaceContact
+from forcegp.constraints.gauss import ConstrainedSystem, Equations
+from forcegp.constraints.surface import Cylinder, ImplicitSurface, Plane, Sphere, Surface
+
+__all__ = [
+    "Baumgarte",
+    "ConstrainedSystem",
+    "Constraint",
+    "Cylinder",
+    "Equations",
+    "ImplicitSurface",
+    "Plane",
+    "PointConnection",
+    "Sphere",
+    "Surface",
+    "SurfaceContact",
+]

@@ -1,0 +1,141 @@
+"""Holonomic constraints c(q) = 0 of a robot: a point that touches a surface, two points that coincide.
+
+Differentiating twice gives A q̈ = b with A = ∂c/∂q and b = −Ȧ q̇ (eq. 3).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from torch import Tensor
+
+from forcegp import kinematics
+from forcegp.constraints.surface import Surface
+from forcegp.kinematics import LinkMotion, LinkPoses
+from forcegp.robot.model import RobotModel
+
+
+class ConstraintTerms(NamedTuple):
+    """A constraint at a state.
+
+    Attributes:
+        c: `(*batch, rows)` position-level error.
+        A: `(*batch, rows, nq)` Jacobian of c.
+        b: `(*batch, rows)` with A q̈ = b, no stabilization.
+    """
+
+    c: Tensor
+    A: Tensor
+    b: Tensor
+
+
+class ContactPoint(NamedTuple):
+    """The point of the robot that touches a surface.
+
+    Attributes:
+        position, velocity: `(*batch, 3)` in the world [m], [m/s].
+        bias: `(*batch, 3)` acceleration at q̈ = 0 [m/s²].
+        jacobian: J_E `(*batch, 3, nq)`, world axes.
+        normal: ∇c `(*batch, 3)` at the point.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    bias: Tensor
+    jacobian: Tensor
+    normal: Tensor
+
+
+class Constraint(ABC):
+    """A named holonomic constraint with a fixed number of rows."""
+
+    name: str
+    rows: int
+
+    @abstractmethod
+    def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
+        """c, A and b at a state whose link motion is known."""
+
+    @abstractmethod
+    def check(self, robot: RobotModel) -> None:
+        """Raise `UnknownNameError` where a frame is not the robot's."""
+
+
+def _moving_point(
+    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor, frame: str, point: Sequence[float]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Position, velocity, bias acceleration and Jacobian of a point fixed in a frame."""
+    index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
+    J = kinematics.jacobian_of_poses(robot, poses, index, x)[..., 3:, :]
+    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)[..., 3:]
+    position = kinematics.point_of_poses(robot, poses, index, x) + robot.base_position
+    return position, (J @ qd[..., None])[..., 0], bias, J
+
+
+@dataclass(frozen=True)
+class SurfaceContact(Constraint):
+    """A point of the robot that slides on a surface, c(q) = c_surface(p(q)).
+
+    A = ∇cᵀ J_E and b = −(∇cᵀ J̇_E q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force where |∇c| = 1.
+
+    Args:
+        name: name of the contact, as in `contact.<name>` of a data set.
+        frame: link or frame that carries the point.
+        point: coordinates in that frame [m].
+        surface: the surface, in the world.
+    """
+
+    name: str
+    frame: str
+    point: Sequence[float]
+    surface: Surface
+    rows: int = 1
+
+    def check(self, robot: RobotModel) -> None:
+        robot.frame_index(self.frame)
+
+    def contact_point(
+        self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor
+    ) -> ContactPoint:
+        """Position, velocity, bias acceleration, Jacobian and surface normal at the touching point."""
+        p, v, bias, J = _moving_point(robot, poses, motion, qd, self.frame, self.point)
+        return ContactPoint(p, v, bias, J, self.surface.gradient(p))
+
+    def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
+        at = self.contact_point(robot, poses, motion, qd)
+        A = at.normal[..., None, :] @ at.jacobian
+        b = -((at.normal * at.bias).sum(-1) + self.surface.curvature(at.position, at.velocity))
+        return ConstraintTerms(self.surface.value(at.position)[..., None], A, b[..., None])
+
+
+@dataclass(frozen=True)
+class PointConnection(Constraint):
+    """Two points that coincide, c(q) = p_1(q) − p_2(q): closes a kinematic loop.
+
+    Args:
+        name: name of the constraint.
+        frame, point: first frame, and the point in its coordinates [m].
+        other_frame, other_point: the second; `None` holds the first point at a place of the world.
+    """
+
+    name: str
+    frame: str
+    point: Sequence[float]
+    other_frame: str | None
+    other_point: Sequence[float]
+    rows: int = 3
+
+    def check(self, robot: RobotModel) -> None:
+        robot.frame_index(self.frame)
+        if self.other_frame is not None:
+            robot.frame_index(self.other_frame)
+
+    def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
+        p, _, bias, J = _moving_point(robot, poses, motion, qd, self.frame, self.point)
+        if self.other_frame is None:
+            return ConstraintTerms(p - kinematics.as_point(robot, self.other_point), J, -bias)
+        p2, _, bias2, J2 = _moving_point(robot, poses, motion, qd, self.other_frame, self.other_point)
+        return ConstraintTerms(p - p2, J - J2, bias2 - bias)

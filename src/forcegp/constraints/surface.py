@@ -1,0 +1,169 @@
+"""Rigid surfaces as implicit functions c(p) of a point: zero on the surface, positive outside the solid.
+
+The gradient points out of the solid, so a contact that presses has a multiplier λ ≥ 0. For the surfaces
+of this file but `ImplicitSurface`, c is the signed distance and the gradient the unit normal.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import ForceGPError
+from forcegp.types import Scalars, Vector3
+
+
+class Surface(ABC):
+    """A surface with the derivatives that a contact needs, batched over points in the world."""
+
+    @abstractmethod
+    def value(self, p: Vector3) -> Scalars:
+        """c(p), `(*batch,)`; metres for signed distances."""
+
+    @abstractmethod
+    def gradient(self, p: Vector3) -> Vector3:
+        """∇c(p), `(*batch, 3)`."""
+
+    @abstractmethod
+    def curvature(self, p: Vector3, v: Vector3) -> Scalars:
+        """vᵀ ∇²c(p) v, `(*batch,)`."""
+
+
+def _vector(values: Sequence[float], like: Tensor) -> Tensor:
+    return torch.tensor(tuple(values), dtype=like.dtype, device=like.device)
+
+
+def _unit(values: Sequence[float], what: str) -> tuple[float, ...]:
+    length = sum(float(x) ** 2 for x in values) ** 0.5
+    if len(values) != 3 or not 0.0 < length < float("inf"):
+        raise ForceGPError(f"{what} gives no direction", expected="three finite numbers, not all zero", got=values)
+    return tuple(float(x) / length for x in values)
+
+
+def _positive(value: float, what: str) -> None:
+    if not 0.0 < value < float("inf"):
+        raise ForceGPError(f"{what} is not a length", expected="a positive finite number [m]", got=value)
+
+
+@dataclass(frozen=True)
+class Plane(Surface):
+    """The plane c(p) = n·p − offset.
+
+    Args:
+        normal: direction out of the solid; scaled to unit length.
+        offset: distance from the world origin along the normal [m].
+
+    Raises:
+        ForceGPError: the normal has no direction.
+    """
+
+    normal: Sequence[float] = (0.0, 0.0, 1.0)
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "normal", _unit(self.normal, "the plane's normal"))
+
+    def value(self, p: Vector3) -> Scalars:
+        return p @ _vector(self.normal, p) - self.offset
+
+    def gradient(self, p: Vector3) -> Vector3:
+        return _vector(self.normal, p).expand_as(p)
+
+    def curvature(self, p: Vector3, v: Vector3) -> Scalars:
+        return torch.zeros_like(p[..., 0])
+
+
+@dataclass(frozen=True)
+class Sphere(Surface):
+    """The sphere c(p) = |p − center| − radius, touched from outside.
+
+    Raises:
+        ForceGPError: the radius is not positive.
+    """
+
+    center: Sequence[float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        _positive(self.radius, "the sphere's radius")
+
+    def value(self, p: Vector3) -> Scalars:
+        return torch.linalg.vector_norm(p - _vector(self.center, p), dim=-1) - self.radius
+
+    def gradient(self, p: Vector3) -> Vector3:
+        return torch.nn.functional.normalize(p - _vector(self.center, p), dim=-1)
+
+    def curvature(self, p: Vector3, v: Vector3) -> Scalars:
+        r = p - _vector(self.center, p)
+        distance = torch.linalg.vector_norm(r, dim=-1)
+        along = (r * v).sum(-1) / distance
+        return ((v * v).sum(-1) - along**2) / distance
+
+
+@dataclass(frozen=True)
+class Cylinder(Surface):
+    """The infinite cylinder c(p) = |p − center − a aᵀ(p − center)| − radius, touched from outside.
+
+    Args:
+        center: a point of the axis [m].
+        axis: direction a of the axis; scaled to unit length.
+        radius: [m].
+
+    Raises:
+        ForceGPError: the axis has no direction, or the radius is not positive.
+    """
+
+    center: Sequence[float]
+    axis: Sequence[float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        _positive(self.radius, "the cylinder's radius")
+        object.__setattr__(self, "axis", _unit(self.axis, "the cylinder's axis"))
+
+    def _across(self, x: Tensor) -> Tensor:
+        a = _vector(self.axis, x)
+        return x - (x @ a)[..., None] * a
+
+    def value(self, p: Vector3) -> Scalars:
+        r = self._across(p - _vector(self.center, p))
+        return torch.linalg.vector_norm(r, dim=-1) - self.radius
+
+    def gradient(self, p: Vector3) -> Vector3:
+        return torch.nn.functional.normalize(self._across(p - _vector(self.center, p)), dim=-1)
+
+    def curvature(self, p: Vector3, v: Vector3) -> Scalars:
+        r, across = self._across(p - _vector(self.center, p)), self._across(v)
+        distance = torch.linalg.vector_norm(r, dim=-1)
+        along = (r * across).sum(-1) / distance
+        return ((across * across).sum(-1) - along**2) / distance
+
+
+@dataclass(frozen=True)
+class ImplicitSurface(Surface):
+    """Any smooth c(p), differentiated automatically.
+
+    Args:
+        function: maps one point `(3,)` to a scalar tensor, positive outside the solid, in operations
+            that PyTorch differentiates twice. The multiplier is in newtons where |∇c| = 1.
+    """
+
+    function: Callable[[Tensor], Tensor]
+
+    def value(self, p: Vector3) -> Scalars:
+        return torch.func.vmap(self.function)(p.reshape(-1, 3)).reshape(p.shape[:-1])
+
+    def gradient(self, p: Vector3) -> Vector3:
+        return torch.func.vmap(torch.func.grad(self.function))(p.reshape(-1, 3)).reshape(p.shape)
+
+    def curvature(self, p: Vector3, v: Vector3) -> Scalars:
+        def along(point: Tensor, direction: Tensor) -> Tensor:
+            _, change = torch.func.jvp(torch.func.grad(self.function), (point,), (direction,))
+            return (change * direction).sum()
+
+        flat = torch.func.vmap(along)(p.reshape(-1, 3), v.expand_as(p).reshape(-1, 3))
+        return flat.reshape(p.shape[:-1])
