@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from forcegp.friction import JointFriction
 from forcegp.kinematics import LinkMotion, LinkPoses, cross, link_motion, link_poses, skew
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointMatrix, JointVector
@@ -41,14 +42,14 @@ def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
 
 
 def mass_matrix_of_poses(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> JointMatrix:
-    """M_ij = s_iᵀ I^c_j s_j for i an ancestor of j, with the composite inertias I^c = Eᵀ I."""
+    """M_ij = s_iᵀ I^c_j s_j for i an ancestor of j, with the composite inertias I^c = Eᵀ I, plus the drives."""
     Et = robot.ancestors.mT
     mass, moment = links.mass @ robot.ancestors, Et @ links.moment
     inertia = (Et @ links.inertia.flatten(-2)).unflatten(-1, (3, 3))
     angular = (inertia @ poses.angular[..., None])[..., 0] + cross(moment, poses.linear)
     linear = mass[..., None] * poses.linear - cross(moment, poses.angular)
     M = (poses.angular @ angular.mT + poses.linear @ linear.mT) * Et
-    return M + torch.triu(M, 1).mT
+    return M + torch.triu(M, 1).mT + torch.diag_embed(robot.armature)
 
 
 def gravity_force_of_poses(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> JointVector:
@@ -127,9 +128,13 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
 
 
 def damping_force(robot: RobotModel, qd: JointVector) -> JointVector:
-    """Viscous joint friction Q_D = −d q̇ of the robot file, `(*batch, nq)` [N m, N]."""
+    """Joint friction Q_D(q̇) of the robot: viscous, Coulomb and Stribeck, `(*batch, nq)` [N m, N].
+
+    Raises:
+        ShapeError: qd does not fit the robot.
+    """
     robot.check_state(qd=qd)
-    return -robot.damping * qd
+    return JointFriction.of(robot).force(qd)
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
@@ -151,7 +156,8 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
     E = robot.ancestors
     alpha = motion.alpha + E @ (poses.angular * qdd[..., None])
     acceleration = motion.acceleration + E @ (poses.linear * qdd[..., None]) - robot.gravity
-    return _newton_euler(robot, poses, link_inertia(robot, poses), motion, alpha, acceleration)
+    force = _newton_euler(robot, poses, link_inertia(robot, poses), motion, alpha, acceleration)
+    return force + robot.armature * qdd
 
 
 def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector) -> JointVector:

@@ -83,7 +83,7 @@ def load_robot(
     return RobotModel(
         name=str(urdf.name), joint_names=tuple(names), joint_types=tuple(types), parents=tuple(parents),
         placement_rotation=t(place[:, :3, :3]), placement_position=t(place[:, :3, 3]), axis=t(axes),
-        mass=t(mass), com=t(com), inertia=t(inertia), damping=t(dyn[:, 0]), friction=t(dyn[:, 1]),
+        mass=t(mass), com=t(com), inertia=t(inertia), damping=t(dyn[:, 0]), friction=t(dyn[:, 1]), stribeck=t(np.zeros(n)), stribeck_velocity=t(np.full(n,.1)), friction_velocity=t(np.full(n,.1)), armature=t(np.zeros(n)),
         lower=t(np.full(n, -np.inf)), upper=t(np.full(n, np.inf)),
         velocity_limit=t(dyn[:, 3]), effort_limit=t(dyn[:, 2]),
         frame_names=tuple(f[0] for f in frames), frame_parents=tuple(f[1] for f in frames),

@@ -40,6 +40,10 @@ class RobotModel:
         inertia: `(nq, 3, 3)` rotational inertia about the centre of mass, link axes [kg m²].
         damping: `(nq,)` viscous joint friction [N m s/rad, N s/m].
         friction: `(nq,)` Coulomb joint friction [N m, N].
+        stribeck: `(nq,)` static friction above the Coulomb level [N m, N].
+        stribeck_velocity: `(nq,)` speed at which the static part has fallen off [rad/s, m/s].
+        friction_velocity: `(nq,)` speed over which Coulomb friction changes sign [rad/s, m/s].
+        armature: `(nq,)` inertia of the drive, reflected to the joint [kg m², kg].
         lower, upper: `(nq,)` joint limits [rad, m], infinite where there are none.
         velocity_limit, effort_limit: `(nq,)` [rad/s, m/s], [N m, N], infinite where there are none.
         frame_names: every link and fixed frame of the file.
@@ -47,6 +51,7 @@ class RobotModel:
         frame_rotation, frame_position: `(nf, 3, 3)`, `(nf, 3)` pose in that joint's link frame.
         base_rotation, base_position: pose of the base in the world `(3, 3)`, `(3,)` [m].
         gravity: `(3,)` gravitational acceleration in the world [m/s²].
+        remarks: what the loader accepted though it is doubtful, one sentence each.
     """
 
     name: str
@@ -61,6 +66,10 @@ class RobotModel:
     inertia: Tensor
     damping: Tensor
     friction: Tensor
+    stribeck: Tensor
+    stribeck_velocity: Tensor
+    friction_velocity: Tensor
+    armature: Tensor
     lower: Tensor
     upper: Tensor
     velocity_limit: Tensor
@@ -72,6 +81,7 @@ class RobotModel:
     base_rotation: Tensor
     base_position: Tensor
     gravity: Tensor
+    remarks: tuple[str, ...] = ()
 
     @property
     def nq(self) -> int:
