@@ -7,24 +7,27 @@ ch. 5 and 6), written in world axes so that sums over subtrees are products with
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from forcegp import batchlast
+from forcegp.batchlast import apply, batch_first, batch_last, cross, dot, sum_over
 from forcegp.friction import JointFriction
-from forcegp.kinematics import LinkMotion, LinkPoses, cross, link_motion, link_poses, skew
+from forcegp.kinematics import LinkMotion, LinkPoses, common_states, link_motion, link_poses
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointMatrix, JointVector
 
 
-class LinkInertia(NamedTuple):
+@dataclass(frozen=True)
+class LinkInertia:
     """Spatial inertias of the links about the base origin, world axes.
 
     Attributes:
-        mass: `(*batch, nq)` [kg].
-        moment: `(*batch, nq, 3)` first moment m c [kg m].
-        inertia: `(*batch, nq, 3, 3)` second moment about the base origin [kg m²].
+        mass: `(nq, 1)` [kg].
+        moment: `(3, nq, B)` first moment m c [kg m].
+        inertia: `(3, 3, nq, B)` second moment about the base origin [kg m²].
     """
 
     mass: Tensor
@@ -34,30 +37,44 @@ class LinkInertia(NamedTuple):
 
 def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
     """Inertia of each link, moved to the base origin: I_o = R I_c Rᵀ + m(cᵀc 1 − c cᵀ)."""
-    R = poses.rotation
-    c = poses.position + (R @ robot.com[..., None])[..., 0]
-    C = skew(c)
-    inertia = R @ robot.inertia @ R.mT - robot.mass[:, None, None] * (C @ C)
-    return LinkInertia(robot.mass.expand(c.shape[:-1]), robot.mass[:, None] * c, inertia)
+    R, mass = poses.R, robot.mass[:, None]
+    c = poses.p + apply(R, robot.com.T[..., None])
+    moment = mass * c
+    turned = batchlast.product(R, robot.inertia.permute(1, 2, 0)[..., None])
+    inertia = batchlast.product(turned, R.transpose(0, 1))
+    inertia = torch.addcmul(inertia, c[:, None], moment, value=-1)
+    eye = torch.eye(3, dtype=mass.dtype, device=mass.device)[..., None, None]
+    return LinkInertia(mass, moment, torch.addcmul(inertia, eye, dot(c, moment)))
+
+
+def _mass_matrix(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
+    """`mass_matrix_of_poses` with the batch last, `(nq, nq, B)`."""
+    E, S, L = robot.ancestors, poses.angular, poses.linear
+    mass, moment = E.mT @ links.mass, sum_over(E.mT, links.moment)
+    inertia = sum_over(E.mT, links.inertia)
+    angular = apply(inertia, S) + cross(moment, L)
+    linear = mass * L - cross(moment, S)
+    M = dot(torch.cat([S, L]).unsqueeze(2), torch.cat([angular, linear]).unsqueeze(1))
+    strictly = torch.tril(E, -1)
+    upper = torch.addcmul(torch.diag(robot.armature)[..., None], M, E.mT[..., None])
+    return torch.addcmul(upper, M.transpose(0, 1), strictly[..., None])
 
 
 def mass_matrix_of_poses(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> JointMatrix:
     """M_ij = s_iᵀ I^c_j s_j for i an ancestor of j, with the composite inertias I^c = Eᵀ I, plus the drives."""
-    Et = robot.ancestors.mT
-    mass, moment = links.mass @ robot.ancestors, Et @ links.moment
-    inertia = (Et @ links.inertia.flatten(-2)).unflatten(-1, (3, 3))
-    angular = (inertia @ poses.angular[..., None])[..., 0] + cross(moment, poses.linear)
-    linear = mass[..., None] * poses.linear - cross(moment, poses.angular)
-    M = (poses.angular @ angular.mT + poses.linear @ linear.mT) * Et
-    return M + torch.triu(M, 1).mT + torch.diag_embed(robot.armature)
+    return batch_first(_mass_matrix(robot, poses, links), poses.batch)
+
+
+def _gravity_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
+    """`gravity_force_of_poses` with the batch last, `(nq, B)`."""
+    Et, g = robot.ancestors.mT, robot.gravity[:, None, None]
+    torque = cross(sum_over(Et, links.moment), g)
+    return dot(poses.angular, torque) + dot(poses.linear, (Et @ links.mass) * g)
 
 
 def gravity_force_of_poses(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> JointVector:
     """Q_G = sᵀ Eᵀ [m c × g; m g]."""
-    Et, g = robot.ancestors.mT, robot.gravity
-    torque = cross(Et @ links.moment, g)
-    force = (links.mass @ robot.ancestors)[..., None] * g
-    return (poses.angular * torque + poses.linear * force).sum(-1)
+    return batch_first(_gravity_force(robot, poses, links), poses.batch)
 
 
 def _newton_euler(
@@ -67,26 +84,27 @@ def _newton_euler(
     motion: LinkMotion,
     alpha: Tensor,
     acceleration: Tensor,
-) -> JointVector:
-    """Joint forces sᵀ Eᵀ (I a + V ×* I V) that links moving at V with spatial acceleration a need."""
+) -> Tensor:
+    """Joint forces sᵀ Eᵀ (I a + V ×* I V), `(nq, B)`, that links moving at V with acceleration a need."""
 
     def momentum(w: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        turning = (links.inertia @ w[..., None])[..., 0] + cross(links.moment, v)
-        return turning, links.mass[..., None] * v - cross(links.moment, w)
+        turning = apply(links.inertia, w) + cross(links.moment, v)
+        return turning, links.mass * v - cross(links.moment, w)
 
     n, l = momentum(motion.omega, motion.velocity)
     torque, force = momentum(alpha, acceleration)
     torque = torque + cross(motion.omega, n) + cross(motion.velocity, l)
     force = force + cross(motion.omega, l)
     Et = robot.ancestors.mT
-    return (poses.angular * (Et @ torque) + poses.linear * (Et @ force)).sum(-1)
+    return dot(poses.angular, sum_over(Et, torque)) + dot(poses.linear, sum_over(Et, force))
 
 
 def bias_force_of_motion(
     robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion
 ) -> JointVector:
     """Q_C from link motion already known."""
-    return -_newton_euler(robot, poses, links, motion, motion.alpha, motion.acceleration)
+    force = _newton_euler(robot, poses, links, motion, motion.alpha, motion.acceleration)
+    return batch_first(-force, poses.batch)
 
 
 def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
@@ -122,7 +140,7 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
     Raises:
         ShapeError: q or qd does not fit the robot.
     """
-    robot.check_state(qd=qd)
+    q, qd = common_states(robot, q=q, qd=qd)
     poses = link_poses(robot, q)
     return bias_force_of_motion(robot, poses, link_inertia(robot, poses), link_motion(robot, poses, qd))
 
@@ -150,14 +168,14 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
     Raises:
         ShapeError: an argument does not fit the robot.
     """
-    robot.check_state(qd=qd, qdd=qdd)
+    q, qd, qdd = common_states(robot, q=q, qd=qd, qdd=qdd)
     poses = link_poses(robot, q)
     motion = link_motion(robot, poses, qd)
-    E = robot.ancestors
-    alpha = motion.alpha + E @ (poses.angular * qdd[..., None])
-    acceleration = motion.acceleration + E @ (poses.linear * qdd[..., None]) - robot.gravity
+    E, a = robot.ancestors, batch_last(qdd, 1)
+    alpha = motion.alpha + sum_over(E, poses.angular * a)
+    acceleration = motion.acceleration + sum_over(E, poses.linear * a) - robot.gravity[:, None, None]
     force = _newton_euler(robot, poses, link_inertia(robot, poses), motion, alpha, acceleration)
-    return force + robot.armature * qdd
+    return batch_first(force + robot.armature[:, None] * a, poses.batch)
 
 
 def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector) -> JointVector:
@@ -174,22 +192,24 @@ def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: 
     Raises:
         ShapeError: an argument does not fit the robot.
     """
-    robot.check_state(qd=qd, force=force)
+    q, qd, force = common_states(robot, q=q, qd=qd, force=force)
     poses = link_poses(robot, q)
-    links = link_inertia(robot, poses)
-    M = mass_matrix_of_poses(robot, poses, links)
-    Q_C = bias_force_of_motion(robot, poses, links, link_motion(robot, poses, qd))
-    Q = force + Q_C + gravity_force_of_poses(robot, poses, links)
-    return torch.cholesky_solve(Q[..., None], torch.linalg.cholesky(M))[..., 0]
+    links, motion = link_inertia(robot, poses), link_motion(robot, poses, qd)
+    # The force that gravity and motion take at q̈ = 0: gravity enters as an acceleration of the base.
+    lifted = motion.acceleration - robot.gravity[:, None, None]
+    Q = batch_last(force, 1) - _newton_euler(robot, poses, links, motion, motion.alpha, lifted)
+    qdd = batchlast.solve_spd(_mass_matrix(robot, poses, links), Q.unsqueeze(1))
+    return batch_first(qdd.squeeze(1), poses.batch)
 
 
 def kinetic_energy(robot: RobotModel, q: JointVector, qd: JointVector) -> Tensor:
     """½ q̇ᵀ M q̇, `(*batch,)` [J]."""
-    robot.check_state(qd=qd)
+    q, qd = common_states(robot, q=q, qd=qd)
     return 0.5 * (qd * (mass_matrix(robot, q) @ qd[..., None])[..., 0]).sum(-1)
 
 
 def potential_energy(robot: RobotModel, q: JointVector) -> Tensor:
     """−Σ m g·c, relative to the base origin, `(*batch,)` [J]; its gradient is −Q_G."""
     poses = link_poses(robot, q)
-    return -(link_inertia(robot, poses).moment @ robot.gravity).sum(-1)
+    moment = link_inertia(robot, poses).moment.sum(1)
+    return batch_first(-dot(moment, robot.gravity[:, None]), poses.batch)

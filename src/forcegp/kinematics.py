@@ -7,36 +7,53 @@ V_i = Σ_j E_ij s_j q̇_j, so only the poses need a recursion, over the depth of
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from forcegp import batchlast
+from forcegp.batchlast import batch_first, batch_last, sum_over, take
+from forcegp.errors import ShapeError
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.types import FrameJacobian, JointVector, PointJacobian, Rotation, Vector3
 
 
-class LinkPoses(NamedTuple):
-    """Poses of the links and the screws of their joints.
+@dataclass(frozen=True)
+class LinkPoses:
+    """Poses of the links relative to the base origin and the screws of their joints, world axes.
 
     Attributes:
-        rotation: `(*batch, nq, 3, 3)` link axes in the world.
-        position: `(*batch, nq, 3)` link origin relative to the base origin, world axes [m].
-        angular, linear: `(*batch, nq, 3)` the joint screws s_j.
+        batch: shape of the batch, B states in all.
+        R: `(3, 3, nq, B)` link axes.
+        p: `(3, nq, B)` link origins [m].
+        angular, linear: `(3, nq, B)` the joint screws s_j.
     """
 
-    rotation: Tensor
-    position: Tensor
+    batch: torch.Size
+    R: Tensor
+    p: Tensor
     angular: Tensor
     linear: Tensor
 
+    @property
+    def rotation(self) -> Tensor:
+        """`(*batch, nq, 3, 3)` link axes."""
+        return batch_first(self.R, self.batch).movedim(-1, -3)
 
-class LinkMotion(NamedTuple):
+    @property
+    def position(self) -> Tensor:
+        """`(*batch, nq, 3)` link origins [m]."""
+        return batch_first(self.p, self.batch).mT
+
+
+@dataclass(frozen=True)
+class LinkMotion:
     """First-order motion of the links at a state (q, q̇).
 
     Attributes:
-        omega, velocity: `(*batch, nq, 3)` twists V_i [rad/s], [m/s].
-        alpha, acceleration: `(*batch, nq, 3)` spatial accelerations at q̈ = 0 [rad/s²], [m/s²].
+        omega, velocity: `(3, nq, B)` twists V_i [rad/s], [m/s].
+        alpha, acceleration: `(3, nq, B)` spatial accelerations at q̈ = 0 [rad/s²], [m/s²].
     """
 
     omega: Tensor
@@ -58,16 +75,60 @@ def skew(v: Vector3) -> Rotation:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
 
 
-def _joint_poses(robot: RobotModel, q: JointVector) -> tuple[Tensor, Tensor]:
-    """Pose of each link in its parent link at q (Rodrigues' formula about a constant axis)."""
-    angle = (q * robot.revolute)[..., None, None]
-    K = skew(robot.axis)
-    eye = torch.eye(3, dtype=q.dtype, device=q.device)
-    turn = eye + torch.sin(angle) * K + (1.0 - torch.cos(angle)) * (K @ K)
-    rotation = robot.placement_rotation @ turn
-    slide = (robot.placement_rotation @ robot.axis[..., None])[..., 0]
-    position = robot.placement_position + (q * (1.0 - robot.revolute))[..., None] * slide
-    return rotation, position
+def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
+    """Joint-space arguments, checked and broadcast to one batch.
+
+    Raises:
+        ShapeError: one does not fit the robot, or their batches do not fit each other.
+    """
+    robot.check_state(**states)
+    if len({value.shape for value in states.values()}) == 1:
+        return tuple(states.values())
+    try:
+        return torch.broadcast_tensors(*states.values())
+    except RuntimeError:
+        shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in states.items())
+        raise ShapeError(
+            f"the batches of {', '.join(states)} do not fit each other",
+            expected=f"batch shapes that broadcast, each followed by {robot.nq}",
+            got=shapes,
+        ) from None
+
+
+def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
+    """Pose [R p] of each link in its parent link, `(3, 4, nq, B)`: Rodrigues about a constant axis a.
+
+    With K = [a]× and the placement P: R = P a aᵀ + sin(q) P K + cos(q) (P − P a aᵀ).
+    """
+    P, a = robot.placement_rotation, robot.axis[:, None, :]
+    slide = (P * a).sum(-1)
+    along = slide[..., None] * a
+    # The fourth column holds the placement and takes no part in the turn.
+    still = torch.cat([along, robot.placement_position[..., None]], dim=-1)
+    sine = torch.nn.functional.pad(torch.linalg.cross(P, a.expand_as(P)), (0, 1))
+    cosine = torch.nn.functional.pad(P - along, (0, 1))
+    still, sine, cosine = (x.permute(1, 2, 0)[..., None] for x in (still, sine, cosine))
+    if "prismatic" not in robot.joint_types:
+        return torch.addcmul(torch.addcmul(still, sine, torch.sin(q)), cosine, torch.cos(q))
+    turns = robot.revolute[:, None]
+    angle = q * turns
+    slides = torch.nn.functional.pad(slide[..., None], (3, 0)).permute(1, 2, 0)[..., None]
+    turned = torch.addcmul(torch.addcmul(still, sine, torch.sin(angle)), cosine, torch.cos(angle))
+    return torch.addcmul(turned, slides, q * (1.0 - turns))
+
+
+def _chain(robot: RobotModel, local: Tensor) -> Tensor:
+    """R_parent [R p]_local of every link, `(3, 4, nq, B)`, level by level of the tree."""
+    turned, parents = robot.base_rotation[..., None, None], [BASE]
+    blocks, order = [], []
+    for level in robot.levels:
+        slots = [parents.index(robot.parents[i]) for i in level]
+        turned = batchlast.product(take(turned[:, :3], slots), take(local, level))
+        blocks.append(turned)
+        order += level
+        parents = list(level)
+    joined = torch.cat(blocks, dim=2)
+    return take(joined, [order.index(i) for i in range(robot.nq)])
 
 
 def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
@@ -81,43 +142,35 @@ def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
         ShapeError: q does not fit the robot.
     """
     robot.check_state(q=q)
-    local_rotation, local_position = _joint_poses(robot, q)
-    rotation: list[Tensor] = [local_rotation[..., 0, :, :]] * robot.nq
-    position: list[Tensor] = [local_position[..., 0, :]] * robot.nq
-    for level in robot.levels:
-        for i in level:
-            parent = robot.parents[i]
-            R, p = local_rotation[..., i, :, :], local_position[..., i, :]
-            if parent == BASE:
-                rotation[i] = robot.base_rotation @ R
-                position[i] = p @ robot.base_rotation.mT
-            else:
-                rotation[i] = rotation[parent] @ R
-                position[i] = position[parent] + (rotation[parent] @ p[..., None])[..., 0]
-    R, p = torch.stack(rotation, dim=-3), torch.stack(position, dim=-2)
-    z = (R @ robot.axis[..., None])[..., 0]
+    T = _chain(robot, _local_poses(robot, batch_last(q, 1)))
+    R, p = T[:, :3], sum_over(robot.ancestors, T[:, 3])
+    z = batchlast.apply(R, robot.axis.T[..., None])
+    if "prismatic" not in robot.joint_types:
+        return LinkPoses(q.shape[:-1], R, p, z, batchlast.cross(p, z))
     turns = robot.revolute[:, None]
-    return LinkPoses(R, p, turns * z, turns * cross(p, z) + (1.0 - turns) * z)
+    return LinkPoses(q.shape[:-1], R, p, turns * z, turns * batchlast.cross(p, z) + (1.0 - turns) * z)
 
 
 def link_motion(robot: RobotModel, poses: LinkPoses, qd: JointVector) -> LinkMotion:
     """Twists V = E(s q̇) and the accelerations E(ṡ q̇) that remain at q̈ = 0, with ṡ_j = V_j × s_j."""
-    rate, E = qd[..., None], robot.ancestors
-    omega, velocity = E @ (poses.angular * rate), E @ (poses.linear * rate)
-    alpha = E @ (cross(omega, poses.angular) * rate)
-    turned = cross(omega, poses.linear) + cross(velocity, poses.angular)
-    return LinkMotion(omega, velocity, alpha, E @ (turned * rate))
+    rate, E = batch_last(qd.expand(*poses.batch, robot.nq), 1), robot.ancestors
+    turning, sliding = poses.angular * rate, poses.linear * rate
+    omega, velocity = sum_over(E, turning), sum_over(E, sliding)
+    alpha = sum_over(E, batchlast.cross(omega, turning))
+    turned = batchlast.cross(omega, sliding) + batchlast.cross(velocity, turning)
+    return LinkMotion(omega, velocity, alpha, sum_over(E, turned))
 
 
 def _frame_in_base(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Tensor, Tensor]:
-    """Rotation and position of a frame relative to the base origin, world axes."""
+    """Rotation `(3, 3, B)` and position `(3, B)` of a frame relative to the base origin, world axes."""
     parent, R, p = robot.frame_parents[index], robot.frame_rotation[index], robot.frame_position[index]
     if parent == BASE:
-        batch = poses.rotation.shape[:-3]
-        rotation = (robot.base_rotation @ R).expand(*batch, 3, 3)
-        return rotation, (robot.base_rotation @ p).expand(*batch, 3)
-    link = poses.rotation[..., parent, :, :]
-    return link @ R, poses.position[..., parent, :] + (link @ p[..., None])[..., 0]
+        B = poses.p.shape[-1]
+        return (robot.base_rotation @ R)[..., None].expand(3, 3, B), (robot.base_rotation @ p)[
+            :, None
+        ].expand(3, B)
+    link = poses.R[:, :, parent]
+    return batchlast.product(link, R[..., None]), poses.p[:, parent] + batchlast.apply(link, p[:, None])
 
 
 def _movers(robot: RobotModel, index: int) -> Tensor:
@@ -126,10 +179,15 @@ def _movers(robot: RobotModel, index: int) -> Tensor:
     return torch.zeros_like(robot.revolute) if parent == BASE else robot.ancestors[parent]
 
 
+def _point(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> Tensor:
+    """`point_of_poses` with the batch last, `(3, B)`."""
+    rotation, position = _frame_in_base(robot, poses, index)
+    return position + batchlast.apply(rotation, point[:, None])
+
+
 def point_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> Vector3:
     """Position relative to the base origin `(*batch, 3)` [m] of a point fixed in a frame, world axes."""
-    rotation, position = _frame_in_base(robot, poses, index)
-    return position + (rotation @ point[..., None])[..., 0]
+    return batch_first(_point(robot, poses, index, point), poses.batch)
 
 
 def as_point(robot: RobotModel, point: object) -> Vector3:
@@ -152,8 +210,9 @@ def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation,
         UnknownNameError: no such frame.
         ShapeError: q does not fit the robot.
     """
-    rotation, position = _frame_in_base(robot, link_poses(robot, q), robot.frame_index(frame))
-    return rotation, position + robot.base_position
+    poses = link_poses(robot, q)
+    rotation, position = _frame_in_base(robot, poses, robot.frame_index(frame))
+    return batch_first(rotation, poses.batch), batch_first(position, poses.batch) + robot.base_position
 
 
 def point_position(robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)) -> Vector3:
@@ -184,10 +243,10 @@ def frame_jacobian(
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
     """`frame_jacobian` from poses already known."""
-    x = point_of_poses(robot, poses, index, point)
-    linear = poses.linear + cross(poses.angular, x[..., None, :])
-    screws = torch.cat([poses.angular, linear], dim=-1) * _movers(robot, index)[:, None]
-    return screws.mT
+    x = _point(robot, poses, index, point)
+    linear = poses.linear + batchlast.cross(poses.angular, x[:, None])
+    screws = torch.cat([poses.angular, linear]) * _movers(robot, index)[:, None]
+    return batch_first(screws, poses.batch)
 
 
 def point_velocity(
@@ -208,7 +267,7 @@ def frame_bias_acceleration(
     robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> Tensor:
     """[ω̇; p̈] at q̈ = 0 of a frame and a point fixed in it, `(*batch, 6)` [rad/s²], [m/s²]."""
-    robot.check_state(qd=qd)
+    q, qd = common_states(robot, q=q, qd=qd)
     poses = link_poses(robot, q)
     motion = link_motion(robot, poses, qd)
     return bias_acceleration_of_motion(robot, poses, motion, robot.frame_index(frame), as_point(robot, point))
@@ -220,11 +279,9 @@ def bias_acceleration_of_motion(
     """`frame_bias_acceleration` from motion already known: a + α × x + ω × (v + ω × x)."""
     parent = robot.frame_parents[index]
     if parent == BASE:
-        return torch.zeros(
-            *poses.position.shape[:-2], 6, dtype=poses.position.dtype, device=poses.position.device
-        )
-    x = point_of_poses(robot, poses, index, point)
-    omega, alpha = motion.omega[..., parent, :], motion.alpha[..., parent, :]
-    velocity = motion.velocity[..., parent, :] + cross(omega, x)
-    acceleration = motion.acceleration[..., parent, :] + cross(alpha, x) + cross(omega, velocity)
-    return torch.cat([alpha, acceleration], dim=-1)
+        return poses.p.new_zeros(*poses.batch, 6)
+    x = _point(robot, poses, index, point)
+    omega, alpha = motion.omega[:, parent], motion.alpha[:, parent]
+    velocity = motion.velocity[:, parent] + batchlast.cross(omega, x)
+    turned = batchlast.cross(alpha, x) + batchlast.cross(omega, velocity)
+    return batch_first(torch.cat([alpha, motion.acceleration[:, parent] + turned]), poses.batch)

@@ -1,0 +1,95 @@
+"""Arithmetic on many small vectors and matrices whose batch is the last dimension.
+
+Public tensors have their batch first. Inside kinematics and dynamics it is last and flat, so that one
+element-wise operation runs along memory over all samples instead of one small matrix at a time: a vector
+per link is `(3, nq, B)`, a matrix per link `(3, 3, nq, B)`, a joint-space vector `(nq, B)`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+_SMALL = 4096
+"""Below so many elements the number of operations counts, above it the time each one takes."""
+
+
+def batch_last(x: Tensor, tail: int) -> Tensor:
+    """`(*batch, *tail)` as `(*tail, B)`, laid out in that order in memory."""
+    shape = x.shape[x.ndim - tail :]
+    flat = x.reshape((math.prod(x.shape[: x.ndim - tail]), *shape))
+    return flat.movedim(0, -1).contiguous()
+
+
+def batch_first(x: Tensor, batch: torch.Size) -> Tensor:
+    """`(*tail, B)` as a view `(*batch, *tail)`."""
+    return x.movedim(-1, 0).reshape((*batch, *x.shape[:-1]))
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Vector product over the first dimension, broadcasting over the others."""
+    if a.numel() < _SMALL:
+        return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=0)
+    (ax, ay, az), (bx, by, bz) = a, b
+    return torch.stack(
+        [
+            torch.addcmul(ay * bz, az, by, value=-1),
+            torch.addcmul(az * bx, ax, bz, value=-1),
+            torch.addcmul(ax * by, ay, bx, value=-1),
+        ]
+    )
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Σ_k a_k b_k over the first dimension, broadcasting over the others."""
+    total = a[0] * b[0]
+    for k in range(1, len(a)):
+        total = torch.addcmul(total, a[k], b[k])
+    return total
+
+
+def apply(A: Tensor, v: Tensor) -> Tensor:
+    """A v for matrices `(r, k, …)` and vectors `(k, …)`."""
+    return dot(A.transpose(0, 1), v)
+
+
+def product(A: Tensor, X: Tensor) -> Tensor:
+    """A X for matrices `(r, k, …)` and `(k, c, …)`."""
+    return dot(A.transpose(0, 1).unsqueeze(2), X)
+
+
+def sum_over(E: Tensor, x: Tensor) -> Tensor:
+    """Σ_j E_ij x_j over the joint dimension, the last but one, of `(…, nq, B)`."""
+    return E @ x
+
+
+def take(x: Tensor, joints: Sequence[int]) -> Tensor:
+    """The entries of some joints of `(…, nq, B)`; a view where they are evenly spaced."""
+    first, last, count = joints[0], joints[-1], len(joints)
+    step = (last - first) // (count - 1) if count > 1 else 1
+    if step > 0 and list(joints) == list(range(first, last + 1, step)):
+        return x[..., first : last + 1 : step, :]
+    return x[..., list(joints), :]
+
+
+def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
+    """M⁻¹ rhs for symmetric positive definite `(n, n, B)` and `(n, k, B)`.
+
+    Large batches are eliminated without pivoting (stable for such M), every step over all samples at once.
+    """
+    n, B = M.shape[0], M.shape[-1]
+    if M.numel() < _SMALL:
+        factor = torch.linalg.cholesky(M.movedim(-1, 0))
+        return torch.cholesky_solve(rhs.movedim(-1, 0), factor).movedim(0, -1)
+    rest, rows = torch.cat([M, rhs], dim=1), []
+    for _ in range(n):
+        rows.append(rest[0, 1:] / rest[0, 0])
+        rest = torch.addcmul(rest[1:, 1:], rest[1:, :1], rows[-1], value=-1)
+    x = rows[-1].unsqueeze(0)
+    for row in reversed(rows[:-1]):
+        known = len(x)
+        x = torch.cat([(row[known:] - dot(row[:known, None], x)).unsqueeze(0), x])
+    return x.reshape(n, -1, B)
