@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+from typing_extensions import Self
+
 
 class ForceGPError(Exception):
     """Base of every error that a user of the library can cause.
@@ -19,12 +21,18 @@ class ForceGPError(Exception):
     def __init__(
         self, message: str, *, expected: object = None, got: object = None, hint: str | None = None
     ) -> None:
-        self.expected, self.got, self.hint = expected, got, hint
+        self.message, self.expected, self.got, self.hint = message, expected, got, hint
         parts = [message]
         parts += [f"expected: {expected}"] if expected is not None else []
         parts += [f"got: {got}"] if got is not None else []
         parts += [f"hint: {hint}"] if hint else []
         super().__init__("\n  ".join(parts))
+
+    @classmethod
+    def at(cls, place: str, cause: ForceGPError) -> Self:
+        """An error of this class that adds to another one where it arose (a file, a line)."""
+        message = f"{place}: {cause.message}"
+        return cls(message, expected=cause.expected, got=cause.got, hint=cause.hint)
 
 
 class RobotFileError(ForceGPError, ValueError):
@@ -37,6 +45,10 @@ class UnsupportedRobotError(RobotFileError):
 
 class InertiaError(RobotFileError):
     """Inertial parameters that no rigid body can have (the message names the link and the reason)."""
+
+
+class RobotFileWarning(UserWarning):
+    """A robot file that is usable but doubtful; the same sentence is kept in `RobotModel.remarks`."""
 
 
 class UnknownNameError(ForceGPError, LookupError):

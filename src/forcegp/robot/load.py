@@ -1,93 +1,93 @@
-"""Robots from URDF files, read by yourdfpy behind a parser that expands no entities."""
+"""`load_robot`: a robot model from a bundled name, a URDF file or an MJCF file."""
 
 from __future__ import annotations
 
-from importlib.resources import files
+from collections.abc import Mapping, Sequence
+from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
-from forcegp.robot.model import BASE, RobotModel
+from forcegp.errors import RobotFileError, ShapeError, UnknownNameError
+from forcegp.robot.fold import Pose, build_robot
+from forcegp.robot.mjcf import read_mjcf
+from forcegp.robot.model import RobotModel
+from forcegp.robot.safety import parse_xml, read_bytes
+from forcegp.robot.tree import Tree, lock_joints, transform
+from forcegp.robot.urdf import read_urdf
 
-BUNDLED = ("kuka_iiwa",)
+BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa")
 
 
 def load_robot(
-    source,
+    source: str | Path,
     *,
-    base_position=(0.0, 0.0, 0.0),
-    base_rpy=(0.0, 0.0, 0.0),
-    gravity=(0.0, 0.0, -9.81),
-    dtype=torch.float64,
-    device="cpu",
+    base_position: Sequence[float] = (0.0, 0.0, 0.0),
+    base_rpy: Sequence[float] = (0.0, 0.0, 0.0),
+    gravity: Sequence[float] = (0.0, 0.0, -9.81),
+    locked_joints: Mapping[str, float] | None = None,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
 ) -> RobotModel:
-    import yourdfpy
-    from scipy.spatial.transform import Rotation
+    """A robot model from a bundled name, a URDF file or an MJCF file.
 
-    path = files("forcegp.robot") / "bundled" / f"{source}.urdf" if str(source) in BUNDLED else Path(source)
-    urdf = yourdfpy.URDF.load(
-        str(path), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
-    ).robot
-    links = {l.name: l for l in urdf.links}
-    children = {}
-    for j in urdf.joints:
-        children.setdefault(j.parent, []).append(j)
-    root = next(l for l in links if l not in {j.child for j in urdf.joints})
-    names, types, parents, place, axes, dyn = [], [], [], [], [], []
-    frames = []
-    bodies = []
+    What is doubtful but usable in the file is a `RobotFileWarning` and a sentence in `robot.remarks`.
 
-    def visit(link, joint, T):
-        frames.append((link, joint, T))
-        inertial = links[link].inertial
-        if inertial is not None and joint != BASE:
-            X = T @ (np.eye(4) if inertial.origin is None else inertial.origin)
-            bodies.append((joint, inertial.mass, X[:3, 3], X[:3, :3] @ inertial.inertia @ X[:3, :3].T))
-        for j in children.get(link, []):
-            X = T @ (np.eye(4) if j.origin is None else j.origin)
-            if j.type == "fixed":
-                visit(j.child, joint, X)
-            else:
-                names.append(j.name)
-                types.append("prismatic" if j.type == "prismatic" else "revolute")
-                parents.append(joint)
-                place.append(X)
-                axes.append(np.array(j.axis) / np.linalg.norm(j.axis))
-                dyn.append(
-                    (
-                        float(j.dynamics.damping or 0.0) if j.dynamics else 0.0,
-                        float(j.dynamics.friction or 0.0) if j.dynamics else 0.0,
-                        j.limit.effort if j.limit and j.limit.effort else np.inf,
-                        j.limit.velocity if j.limit and j.limit.velocity else np.inf,
-                    )
-                )
-                visit(j.child, len(names) - 1, np.eye(4))
+    Args:
+        source: `"kuka_iiwa"`, `"franka_panda"`, `"double_pendulum"`, or the path of a file.
+        base_position: position of the root link in the world [m].
+        base_rpy: its roll, pitch and yaw about the world's axes [rad].
+        gravity: gravitational acceleration in the world [m/s²].
+        locked_joints: joints to hold at a position [rad, m], as if they were fixed in the file.
+        dtype: floating-point type of all constants.
+        device: device of all constants.
 
-    visit(root, BASE, np.eye(4))
-    n = len(names)
-    mass, moment = np.zeros(n), np.zeros((n, 3))
-    for b, m, c, _ in bodies:
-        mass[b] += m
-        moment[b] += m * c
-    com = moment / mass[:, None]
-    inertia = np.zeros((n, 3, 3))
-    for b, m, c, I in bodies:
-        d = c - com[b]
-        inertia[b] += I + m * (d @ d * np.eye(3) - np.outer(d, d))
-
-    def t(x):
-        return torch.tensor(np.asarray(x), dtype=dtype, device=device)
-
-    place, dyn = np.array(place), np.array(dyn)
-    return RobotModel(
-        name=str(urdf.name), joint_names=tuple(names), joint_types=tuple(types), parents=tuple(parents),
-        placement_rotation=t(place[:, :3, :3]), placement_position=t(place[:, :3, 3]), axis=t(axes),
-        mass=t(mass), com=t(com), inertia=t(inertia), damping=t(dyn[:, 0]), friction=t(dyn[:, 1]), stribeck=t(np.zeros(n)), stribeck_velocity=t(np.full(n,.1)), friction_velocity=t(np.full(n,.1)), armature=t(np.zeros(n)),
-        lower=t(np.full(n, -np.inf)), upper=t(np.full(n, np.inf)),
-        velocity_limit=t(dyn[:, 3]), effort_limit=t(dyn[:, 2]),
-        frame_names=tuple(f[0] for f in frames), frame_parents=tuple(f[1] for f in frames),
-        frame_rotation=t([f[2][:3, :3] for f in frames]), frame_position=t([f[2][:3, 3] for f in frames]),
-        base_rotation=t(Rotation.from_euler("xyz", base_rpy).as_matrix()), base_position=t(base_position),
-        gravity=t(gravity),
+    Raises:
+        UnknownNameError: no such bundled robot, or no such joint to lock.
+        RobotFileError: the file cannot be read or is no valid robot; the message names link or joint.
+        UnsupportedRobotError: a joint is floating, planar, ball or mimic.
+        InertiaError: the inertia of a link is not physical.
+        ShapeError: base_position, base_rpy or gravity is not three finite numbers.
+    """
+    base = transform(
+        Rotation.from_euler("xyz", _vector(base_rpy, "base_rpy")).as_matrix(),
+        _vector(base_position, "base_position"),
     )
+    pose = Pose(base, _vector(gravity, "gravity"), dtype, device)
+    tree = lock_joints(_read(source), locked_joints or {})
+    return build_robot(tree, pose)
+
+
+def _read(source: str | Path) -> Tree:
+    if str(source) in BUNDLED:
+        with as_file(files("forcegp.robot") / "bundled" / f"{source}.urdf") as path:
+            return _read_file(path)
+    path = Path(source).expanduser()
+    if not path.suffix and path.name == str(source):
+        raise UnknownNameError("robot", source, (*BUNDLED, "path of a .urdf or .xml file"))
+    return _read_file(path)
+
+
+def _read_file(path: Path) -> Tree:
+    root = parse_xml(read_bytes(path), str(path))
+    if root.tag == "robot":
+        return read_urdf(root, str(path))
+    if root.tag == "mujoco":
+        return read_mjcf(root, path)
+    raise RobotFileError(
+        f"{path}: neither URDF nor MJCF",
+        expected="a <robot> or a <mujoco> document",
+        got=f"<{root.tag[:60]}>",
+    )
+
+
+def _vector(value: Sequence[float], name: str) -> np.ndarray:
+    try:
+        vector = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ShapeError(f"{name} is not valid", expected="three finite numbers", got=value)
+    return vector

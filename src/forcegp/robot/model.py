@@ -125,7 +125,7 @@ class RobotModel:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over joint names, kinematics and inertial figures: tells whether two robots are the same."""
+        """SHA-256 over joint names, kinematics and inertial figures: tells whether two robots are equal."""
         digest = hashlib.sha256(repr((self.joint_names, self.joint_types, self.parents)).encode())
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -158,11 +158,13 @@ class RobotModel:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RobotModel:
         """The same robot with its constants on another device or in another precision."""
-        return self.replace(**{
-            field.name: value.to(device=device, dtype=dtype)
-            for field in dataclasses.fields(self)
-            if isinstance(value := getattr(self, field.name), Tensor)
-        })
+        return self.replace(
+            **{
+                field.name: value.to(device=device, dtype=dtype)
+                for field in dataclasses.fields(self)
+                if isinstance(value := getattr(self, field.name), Tensor)
+            }
+        )
 
     def replace(self, **fields: object) -> RobotModel:
         """A robot with some fields changed, such as `robot.replace(mass=mass)`.

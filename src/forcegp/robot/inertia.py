@@ -1,0 +1,130 @@
+"""Inertial parameters of a rigid body: what is physical, and coordinates that are always physical.
+
+A body has the ten parameters π = (m, m c, I_o), with I_o about the link origin. They belong to a
+distribution of mass exactly when the pseudo-inertia J = [[Σ, m c], [m cᵀ, m]], Σ = ½ tr(I_o) 1 − I_o, is
+positive definite (Wensing, Kim, Slotine, RA-L 2018). The log-Cholesky coordinates θ of
+Rucker and Wensing, *Smooth parameterization of rigid-body inertia* (RA-L 2022), reach all such J and
+no others.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InertiaError
+from forcegp.types import Rotation, Scalars, Vector3
+
+PseudoInertia = Float[Tensor, "*batch 4 4"]
+InertialParameters = Float[Tensor, "*batch 10"]
+ROUNDING = 1e-6
+"""Share of the largest principal moment that figures printed with a few digits may be off by."""
+
+
+def inertia_error(mass: float, com: np.ndarray, inertia: np.ndarray) -> str:
+    """Why no rigid body can have these figures, or "" if one can (up to `inertia_doubt`)."""
+    if not (np.isfinite(mass) and np.isfinite(com).all() and np.isfinite(inertia).all()):
+        return "a figure is not finite"
+    if mass < 0.0:
+        return f"the mass {mass:g} kg is negative"
+    moments = np.linalg.eigvalsh(inertia)
+    if moments[0] < -ROUNDING * max(abs(moments[2]), 1e-12):
+        return f"the inertia is not positive definite: a principal moment is {moments[0]:.6g} kg m²"
+    return ""
+
+
+def inertia_doubt(mass: float, inertia: np.ndarray) -> str:
+    """What no exact body has but rounded or invented figures of published files do, or ""."""
+    low, mid, high = np.linalg.eigvalsh(inertia)
+    if mass == 0.0 and high > 0.0:
+        return f"it has a rotational inertia of {high:.4g} kg m² but no mass"
+    if high > (low + mid) * (1.0 + ROUNDING) + 1e-15:
+        return (
+            "its principal moments violate the triangle inequality "
+            f"({low:.6g} + {mid:.6g} < {high:.6g} kg m²), which no distribution of mass does"
+        )
+    return ""
+
+
+def pseudo_inertia(mass: Scalars, com: Vector3, inertia: Rotation) -> PseudoInertia:
+    """J = [[Σ, m c], [m cᵀ, m]] with Σ = ½ tr(I_c) 1 − I_c + m c cᵀ.
+
+    Args:
+        mass: `(*batch,)` [kg].
+        com: `(*batch, 3)` centre of mass in the link frame [m].
+        inertia: `(*batch, 3, 3)` rotational inertia about the centre of mass, link axes [kg m²].
+
+    Returns:
+        `(*batch, 4, 4)`, positive definite for a physical body.
+    """
+    eye = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
+    half_trace = 0.5 * inertia.diagonal(dim1=-2, dim2=-1).sum(-1)
+    h = mass[..., None] * com
+    Sigma = half_trace[..., None, None] * eye - inertia + h[..., :, None] * com[..., None, :]
+    top = torch.cat([Sigma, h[..., :, None]], dim=-1)
+    bottom = torch.cat([h, mass[..., None]], dim=-1)[..., None, :]
+    return torch.cat([top, bottom], dim=-2)
+
+
+def from_pseudo_inertia(J: PseudoInertia) -> tuple[Scalars, Vector3, Rotation]:
+    """Mass, centre of mass and inertia about it of a pseudo-inertia (inverse of `pseudo_inertia`)."""
+    mass = J[..., 3, 3]
+    com = J[..., :3, 3] / mass[..., None]
+    Sigma = J[..., :3, :3] - mass[..., None, None] * com[..., :, None] * com[..., None, :]
+    eye = torch.eye(3, dtype=J.dtype, device=J.device)
+    return mass, com, Sigma.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * eye - Sigma
+
+
+def from_log_cholesky(theta: InertialParameters) -> PseudoInertia:
+    """J = U Uᵀ with U = e^α [[e^{d1}, s12, s13, t1], [0, e^{d2}, s23, t2], [0, 0, e^{d3}, t3], [0, 0, 0, 1]].
+
+    Args:
+        theta: `(*batch, 10)` = (α, d1, d2, d3, s12, s23, s13, t1, t2, t3).
+
+    Returns:
+        `(*batch, 4, 4)` positive definite, whatever θ.
+    """
+    alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = theta.unbind(-1)
+    zero, one = torch.zeros_like(alpha), torch.ones_like(alpha)
+    rows = (
+        (d1.exp(), s12, s13, t1),
+        (zero, d2.exp(), s23, t2),
+        (zero, zero, d3.exp(), t3),
+        (zero, zero, zero, one),
+    )
+    U = alpha.exp()[..., None, None] * torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    return U @ U.mT
+
+
+def log_cholesky(J: PseudoInertia) -> InertialParameters:
+    """θ of a pseudo-inertia (inverse of `from_log_cholesky`), `(*batch, 10)`.
+
+    Raises:
+        InertiaError: J is not positive definite.
+    """
+    # An upper factor is the lower factor of the matrix with rows and columns reversed.
+    lower, info = torch.linalg.cholesky_ex(J.flip(-1, -2))
+    if bool((info != 0).any()):
+        raise InertiaError(
+            "the pseudo-inertia is not positive definite",
+            expected="positive mass and principal moments that obey the triangle inequality strictly",
+            got=f"smallest eigenvalue {float(torch.linalg.eigvalsh(J).min().detach()):.4g}",
+        )
+    U = lower.flip(-1, -2)
+    scale = U[..., 3, 3]
+    V = U / scale[..., None, None]
+    d = V.diagonal(dim1=-2, dim2=-1)[..., :3].log()
+    s = torch.stack([V[..., 0, 1], V[..., 1, 2], V[..., 0, 2]], dim=-1)
+    return torch.cat([scale.log()[..., None], d, s, V[..., :3, 3]], dim=-1)
+
+
+def inertial_parameters(mass: Scalars, com: Vector3, inertia: Rotation) -> InertialParameters:
+    """π = (m, m c, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz), the inertia about the link origin, `(*batch, 10)`."""
+    m = mass[..., None]
+    eye = torch.eye(3, dtype=com.dtype, device=com.device)
+    square = (com * com).sum(-1)[..., None, None] * eye - com[..., :, None] * com[..., None, :]
+    I = inertia + m[..., None] * square
+    rows, columns = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+    return torch.cat([m, m * com, I[..., rows, columns]], dim=-1)

@@ -1,0 +1,157 @@
+"""MJCF files: reduced to the mechanics, compiled by MuJoCo, and read from its compiled model."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, tostring
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
+from forcegp.robot.mjcf_reduce import reduce_mjcf
+from forcegp.robot.tree import Inertial, Joint, JointKind, Link, Site, Tree, joint_motion, transform
+
+_KINDS: dict[int, JointKind] = {
+    int(mujoco.mjtJoint.mjJNT_HINGE): "revolute",
+    int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic",
+}
+
+
+def read_mjcf(root: Element, path: Path) -> Tree:
+    """Links and joints of an MJCF document: bodies are links, bodies and sites are frames.
+
+    A body with several joints gets a massless link between each two of them.
+
+    Args:
+        root: its `<mujoco>` element.
+        path: the file, for messages and includes.
+
+    Raises:
+        RobotFileError: the document is not valid; the message is MuJoCo's where its compiler refuses.
+        UnsupportedRobotError: the document uses what is not modelled; the message names it.
+        InertiaError: a mass or an inertia is not physical.
+    """
+    document, coupled, remarks = reduce_mjcf(root, path)
+    model = _compile(document, str(path))
+    names = _names(model, "body", model.nbody)
+    joint_names = _names(model, "jnt", model.njnt)
+    links = [Link(names[0])]
+    joints: list[Joint] = []
+    for b in range(1, model.nbody):
+        if model.body_gravcomp[b] != 0.0:
+            raise UnsupportedRobotError(f"{path}: body {names[b]!r} has gravity compensation")
+        links.append(Link(names[b], _inertial(model, b)))
+        chain = _chain(model, b, names, joint_names, coupled, str(path))
+        links += [Link(joint.child, frame=False) for joint in chain[:-1]]
+        joints += chain
+    return Tree(
+        name=root.get("model", path.stem),
+        label=str(path),
+        links=tuple(links),
+        joints=tuple(joints),
+        sites=_sites(model, names),
+        remarks=tuple(remarks),
+    )
+
+
+def _compile(document: Element, label: str) -> Any:
+    try:
+        return mujoco.MjModel.from_xml_string(tostring(document, encoding="unicode"))
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        text = " ".join(str(error).split())
+        kind = InertiaError if re.search(r"mass|inertia", text) else RobotFileError
+        message = f"{label}: refused by MuJoCo's compiler"
+        raise kind(message, expected="a valid MJCF model", got=text) from error
+
+
+def _names(model: Any, kind: str, count: int) -> list[str]:
+    """Names of the bodies or joints; those without one get `body_<number>` or `joint_<number>`."""
+    objects = {"body": mujoco.mjtObj.mjOBJ_BODY, "jnt": mujoco.mjtObj.mjOBJ_JOINT}
+    word = "body" if kind == "body" else "joint"
+    return [mujoco.mj_id2name(model, objects[kind], i) or f"{word}_{i}" for i in range(count)]
+
+
+def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    return transform(Rotation.from_quat(quaternion, scalar_first=True).as_matrix(), position)
+
+
+def _inertial(model: Any, b: int) -> Inertial | None:
+    if model.body_mass[b] == 0.0 and not model.body_inertia[b].any():
+        return None
+    R = _pose(model.body_ipos[b], model.body_iquat[b])[:3, :3]
+    inertia = R @ np.diag(model.body_inertia[b]) @ R.T
+    return Inertial(float(model.body_mass[b]), model.body_ipos[b].copy(), inertia)
+
+
+def _chain(
+    model: Any, b: int, names: list[str], joint_names: list[str], coupled: dict[str, str], label: str
+) -> list[Joint]:
+    """The joints of body b in order, each about its own anchor, and the fixed joint that ends at the body."""
+    parent, placement = names[model.body_parentid[b]], _pose(model.body_pos[b], model.body_quat[b])
+    chain: list[Joint] = []
+    anchor = np.zeros(3)
+    for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
+        step = transform(np.eye(3), model.jnt_pos[j] - anchor)
+        link = f"{names[b]}/{joint_names[j]}"
+        chain.append(_joint(model, j, joint_names[j], parent, link, placement @ step, coupled, label))
+        parent, placement, anchor = link, np.eye(4), model.jnt_pos[j].copy()
+    last = transform(np.eye(3), -anchor)
+    chain.append(Joint("", "fixed", parent, names[b], placement @ last))
+    return chain
+
+
+def _joint(
+    model: Any,
+    j: int,
+    name: str,
+    parent: str,
+    child: str,
+    placement: np.ndarray,
+    coupled: dict[str, str],
+    label: str,
+) -> Joint:
+    kind, dof = _KINDS.get(int(model.jnt_type[j])), model.jnt_dofadr[j]
+    if kind is None:
+        word = "free (floating)" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE else "ball"
+        raise UnsupportedRobotError(
+            f"{label}: joint {name!r} of link {child.split('/')[0]!r} is a {word} joint",
+            expected="hinge and slide joints",
+            got=word,
+            hint="remove the free joint to hold the robot by its base" if "free" in word else None,
+        )
+    refused = coupled.get(name, "")
+    if model.jnt_stiffness[j] or model.jnt_stiffnesspoly[j].any() or model.dof_dampingpoly[dof].any():
+        refused = "has a spring or nonlinear damping, which is not modelled"
+    axis = model.jnt_axis[j].copy()
+    start = float(model.qpos0[model.jnt_qposadr[j]])
+    limits = model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf)
+    effort = np.abs(model.jnt_actfrcrange[j]).max() if model.jnt_actfrclimited[j] else np.inf
+    return Joint(
+        name=name,
+        kind=kind,
+        parent=parent,
+        child=child,
+        placement=placement @ joint_motion(kind, axis, -start),
+        axis=axis,
+        damping=float(model.dof_damping[dof]),
+        friction=float(model.dof_frictionloss[dof]),
+        armature=float(model.dof_armature[dof]),
+        lower=float(limits[0]),
+        upper=float(limits[1]),
+        effort=float(effort),
+        refused=refused,
+    )
+
+
+def _sites(model: Any, names: list[str]) -> tuple[Site, ...]:
+    found = []
+    for s in range(model.nsite):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
+        if name:
+            body = names[model.site_bodyid[s]]
+            found.append(Site(name, body, _pose(model.site_pos[s], model.site_quat[s])))
+    return tuple(found)

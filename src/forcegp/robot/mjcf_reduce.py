@@ -1,0 +1,209 @@
+"""MJCF documents reduced to what the mechanics need, before MuJoCo's compiler sees them.
+
+Bodies, joints, sites, inertias and defaults stay. What only draws, senses, drives or collides is left out,
+so no mesh or texture is ever opened. What would change the motion and is not modelled is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement
+
+from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
+from forcegp.robot.safety import MAX_ELEMENTS, MAX_NUMBER, parse_xml, read_bytes
+
+_IGNORED_SECTIONS = (
+    "size", "statistic", "visual", "asset", "contact", "sensor", "keyframe", "custom", "actuator", "tendon",
+)  # fmt: skip
+_BODY_PARTS = ("body", "frame", "joint", "freejoint", "inertial", "site", "geom")
+_IGNORED_PARTS = ("camera", "light")
+_DEFAULTS = ("default", "joint", "geom", "site")
+_COMPILER = (
+    "autolimits", "boundmass", "boundinertia", "settotalmass", "balanceinertia", "coordinate", "angle",
+    "eulerseq", "inertiafromgeom", "inertiagrouprange", "alignfree",
+)  # fmt: skip
+_NO_MESH = ("material", "mesh", "hfield", "user")
+_WORDS = ("name", "class", "childclass", "user", "joint1", "joint2")
+
+
+def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, str], list[str]]:
+    """The reduced document, the joints that equality constraints couple, and remarks.
+
+    Args:
+        root: the `<mujoco>` element.
+        path: its file; includes are looked for beside it.
+
+    Returns:
+        The reduced `<mujoco>` element; reason by joint name; remarks.
+
+    Raises:
+        RobotFileError: an include or a figure is not valid.
+        UnsupportedRobotError: the document uses what is not modelled.
+    """
+    _expand_includes(root, path)
+    document = Element("mujoco", model=root.get("model", path.stem))
+    from_geoms = [c.get("inertiafromgeom") == "true" for c in root.iter("compiler")]
+    coupled: dict[str, str] = {}
+    remarks: list[str] = []
+    for section in root:
+        where = f"{path}: <{section.tag}>"
+        if section.tag == "compiler":
+            SubElement(document, "compiler", {k: section.attrib[k] for k in _COMPILER if k in section.attrib})
+        elif section.tag == "option":
+            remarks += _fluid(section, where)
+        elif section.tag == "default":
+            document.append(_copy_default(section))
+        elif section.tag == "worldbody":
+            document.append(_copy_body(section, any(from_geoms), f"{path}: body"))
+        elif section.tag == "equality":
+            coupled.update(_couplings(section, path))
+        elif section.tag not in _IGNORED_SECTIONS:
+            raise UnsupportedRobotError(
+                f"{where} is not supported", expected="bodies with joints", got=section.tag
+            )
+        elif section.tag == "tendon" and len(section):
+            remarks.append(f"{path}: the forces of tendons are left out")
+    _check_numbers(document, path)
+    return document, coupled, remarks
+
+
+def _expand_includes(root: Element, path: Path) -> None:
+    """Put included files in place; each at most once, and only from the folder of the robot file or below."""
+    folder = path.resolve().parent
+    seen = {path.resolve()}
+    stack = [root]
+    count = 0
+    while stack:
+        element = stack.pop()
+        position = 0
+        while position < len(element):
+            child = element[position]
+            count += 1
+            if count > MAX_ELEMENTS:
+                raise RobotFileError(f"{path}: too many elements", expected=f"at most {MAX_ELEMENTS}")
+            if child.tag == "include":
+                element[position : position + 1] = list(_included(child, folder, seen, path))
+            else:
+                stack.append(child)
+                position += 1
+
+
+def _included(include: Element, folder: Path, seen: set[Path], path: Path) -> Element:
+    name = include.get("file", "")
+    try:
+        target = (folder / name).resolve()
+        inside = target.is_relative_to(folder)
+    except (ValueError, OSError, RuntimeError):
+        target, inside = folder, False
+    if not inside or target in seen:
+        raise RobotFileError(
+            f"{path}: include of {name!r} is refused",
+            expected="a file in the folder of the robot file, included once",
+            got="it was included before" if target in seen else "a file elsewhere",
+        )
+    seen.add(target)
+    return parse_xml(read_bytes(target), str(target))
+
+
+def _fluid(option: Element, where: str) -> list[str]:
+    present = [name for name in ("density", "viscosity", "wind") if option.get(name)]
+    return [f"{where}: the forces of {', '.join(present)} are left out"] if present else []
+
+
+def _copy_default(default: Element) -> Element:
+    copy = Element("default", default.attrib)
+    for child in default:
+        if child.tag == "default":
+            copy.append(_copy_default(child))
+        elif child.tag in _DEFAULTS:
+            SubElement(copy, child.tag, {k: v for k, v in child.attrib.items() if k not in _NO_MESH})
+    return copy
+
+
+def _parts(body: Element) -> Iterator[Element]:
+    """What belongs to a body itself, through frames but not through child bodies."""
+    for child in body:
+        yield child
+        if child.tag == "frame":
+            yield from _parts(child)
+
+
+def _copy_body(body: Element, from_geoms: bool, where: str) -> Element:
+    name = body.get("name", "(unnamed)")
+    has_inertial = any(part.tag == "inertial" for part in _parts(body))
+    keep_geoms = body.tag == "body" and (from_geoms or not has_inertial)
+    copy = Element(body.tag, {k: v for k, v in body.attrib.items() if k not in ("user", "mocap", "sleep")})
+    _copy_parts(body, copy, keep_geoms, from_geoms, f"{where} {name!r}")
+    return copy
+
+
+def _copy_parts(source: Element, copy: Element, keep_geoms: bool, from_geoms: bool, where: str) -> None:
+    for part in source:
+        if part.tag == "body":
+            copy.append(_copy_body(part, from_geoms, where.rsplit(" ", 1)[0]))
+        elif part.tag == "frame":
+            frame = SubElement(copy, "frame", part.attrib)
+            _copy_parts(part, frame, keep_geoms, from_geoms, where)
+        elif part.tag == "geom":
+            if keep_geoms and part.get("mass") != "0":
+                _refuse_mesh(part, where)
+                unwanted = ("name", *_NO_MESH)
+                SubElement(copy, "geom", {k: v for k, v in part.attrib.items() if k not in unwanted})
+        elif part.tag in _BODY_PARTS:
+            SubElement(copy, part.tag, {k: v for k, v in part.attrib.items() if k != "user"})
+        elif part.tag not in _IGNORED_PARTS:
+            raise UnsupportedRobotError(
+                f"{where} has a <{part.tag[:60]}>, which is not supported",
+                expected=", ".join(_BODY_PARTS),
+                hint="save the compiled model from MuJoCo, which writes such elements out",
+            )
+
+
+def _refuse_mesh(geom: Element, where: str) -> None:
+    mesh = geom.get("mesh") or geom.get("hfield")
+    if mesh:
+        raise UnsupportedRobotError(
+            f"{where} takes its inertia from the mesh {mesh!r}",
+            expected="an <inertial>, or geoms that are primitive shapes",
+            hint="write the figures that MuJoCo computes from the mesh into an <inertial>",
+        )
+
+
+def _couplings(equality: Element, path: Path) -> dict[str, str]:
+    coupled = {}
+    for constraint in equality:
+        if constraint.get("active") == "false":
+            continue
+        first, second = constraint.get("joint1"), constraint.get("joint2")
+        if constraint.tag == "joint" and first:
+            coupled[first] = f"mimics joint {second!r} by an equality constraint"
+        else:
+            raise UnsupportedRobotError(
+                f"{path}: equality constraint <{constraint.tag[:60]}> is not supported",
+                expected="no <equality> but between joints",
+                got=f"one on body {constraint.get('body1')!r}",
+                hint="close the loop with a point constraint of this library",
+            )
+    return coupled
+
+
+def _check_numbers(document: Element, path: Path) -> None:
+    """Refuse NaN, infinite and absurd numbers, which MuJoCo's compiler lets through."""
+    for element in document.iter():
+        for attribute, text in element.attrib.items():
+            if attribute in _WORDS or element.tag == "mujoco":
+                continue
+            for word in text.split():
+                try:
+                    value = float(word)
+                except ValueError:
+                    continue
+                if not abs(value) <= MAX_NUMBER:
+                    error = InertiaError if element.tag == "inertial" else RobotFileError
+                    name = element.get("name")
+                    raise error(
+                        f"{path}: <{element.tag}>{f' {name!r}' if name else ''} {attribute} is not valid",
+                        expected=f"finite numbers below {MAX_NUMBER:g}",
+                        got=repr(text[:80]),
+                    )

@@ -1,0 +1,138 @@
+"""Reading XML from files that nobody vouches for: bounded in size, depth and count, and without entities."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder
+
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import DefusedXMLParser
+
+from forcegp.errors import RobotFileError
+
+MAX_BYTES = 8 * 2**20
+MAX_ELEMENTS = 20_000
+MAX_DEPTH = 128
+MAX_NUMBER = 1e12
+"""Bound on every length, mass and moment, so that no product of them overflows."""
+
+
+class _BoundedBuilder(TreeBuilder):
+    """A tree builder that gives up early on files that are too large or too deep."""
+
+    def __init__(self, label: str) -> None:
+        super().__init__()
+        self._label, self._count, self._depth = label, 0, 0
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> Element:
+        self._count += 1
+        self._depth += 1
+        if self._count > MAX_ELEMENTS:
+            raise RobotFileError(
+                f"{self._label}: too many elements",
+                expected=f"at most {MAX_ELEMENTS} XML elements",
+                got="more",
+                hint="remove what is not links, joints or bodies from the file",
+            )
+        if self._depth > MAX_DEPTH:
+            raise RobotFileError(
+                f"{self._label}: elements are nested too deeply",
+                expected=f"at most {MAX_DEPTH} levels",
+                got=f"more, at <{tag[:60]}>",
+            )
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> Element:
+        self._depth -= 1
+        return super().end(tag)
+
+
+def read_bytes(path: Path) -> bytes:
+    """Content of a regular file of at most `MAX_BYTES`.
+
+    Raises:
+        RobotFileError: the file is missing, not a regular file, unreadable or too large.
+    """
+    try:
+        if not path.is_file():
+            found = "a folder" if path.is_dir() else "something else" if path.exists() else "no such file"
+            raise RobotFileError(f"{path}: cannot be read", expected="a URDF or MJCF file", got=found)
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        if isinstance(error, RobotFileError):
+            raise
+        reason = getattr(error, "strerror", None) or error
+        raise RobotFileError(f"{path}: cannot be read", expected="a readable file", got=reason) from error
+    if len(data) > MAX_BYTES:
+        raise RobotFileError(
+            f"{path}: the file is too large", expected=f"at most {MAX_BYTES} bytes", got="more"
+        )
+    return data
+
+
+def parse_xml(data: bytes, label: str) -> Element:
+    """The element tree of an XML document without DTD, entities or external references.
+
+    Args:
+        data: the document.
+        label: the file name for messages.
+
+    Raises:
+        RobotFileError: the document is malformed, hostile, too large or too deep.
+    """
+    parser = DefusedXMLParser(
+        target=_BoundedBuilder(label), forbid_dtd=True, forbid_entities=True, forbid_external=True
+    )
+    try:
+        parser.feed(data)
+        return parser.close()
+    except DefusedXmlException as error:
+        raise RobotFileError(
+            f"{label}: document types and entities are refused",
+            expected="plain XML without <!DOCTYPE> and <!ENTITY>",
+            got=type(error).__name__,
+            hint="write the text out instead of using entities",
+        ) from error
+    except ParseError as error:
+        raise RobotFileError(
+            f"{label}: not well-formed XML",
+            expected="a complete URDF or MJCF document",
+            got=str(error),
+            hint="the file may be truncated or no XML at all",
+        ) from error
+    except (LookupError, UnicodeError, ValueError, AssertionError) as error:
+        if isinstance(error, RobotFileError):
+            raise
+        raise RobotFileError(f"{label}: not readable as XML", expected="UTF-8 text", got=error) from error
+
+
+def parse_numbers(
+    text: str, where: str, count: int, *, infinite: bool = False, error: type[RobotFileError] = RobotFileError
+) -> list[float]:
+    """`count` finite numbers from an attribute.
+
+    Args:
+        text: the attribute's value.
+        where: file, element and attribute, for messages.
+        count: how many numbers it must hold.
+        infinite: whether ±infinity is allowed (limits).
+        error: the class of error to raise.
+
+    Raises:
+        RobotFileError: another count, no numbers, not finite, or beyond `MAX_NUMBER`.
+    """
+    expected = f"{count} finite number{'s' if count > 1 else ''}"
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise error(f"{where} is not valid", expected=expected, got=repr(text[:80]))
+    for value in values:
+        if math.isnan(value) or (not infinite and abs(value) > MAX_NUMBER):
+            raise error(
+                f"{where} is not valid", expected=f"{expected} below {MAX_NUMBER:g}", got=repr(text[:80])
+            )
+    return values

@@ -1,0 +1,196 @@
+"""URDF files: checked here, interpreted by yourdfpy."""
+
+from __future__ import annotations
+
+import io
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+import numpy as np
+import yourdfpy
+
+from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
+from forcegp.robot.safety import parse_numbers
+from forcegp.robot.tree import Inertial, Joint, Link, Tree, unit_axis
+
+_LINK_PARTS = ("inertial",)
+_JOINT_PARTS = ("origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
+_NUMBERS = {
+    "origin": {"xyz": 3, "rpy": 3},
+    "axis": {"xyz": 3},
+    "mass": {"value": 1},
+    "inertia": {"ixx": 1, "ixy": 1, "ixz": 1, "iyy": 1, "iyz": 1, "izz": 1},
+    "limit": {"lower": 1, "upper": 1, "effort": 1, "velocity": 1},
+    "dynamics": {"damping": 1, "friction": 1},
+}
+_NEEDED = {
+    "mass": ("value",),
+    "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
+    "parent": ("link",),
+    "child": ("link",),
+}
+_MOVING = ("revolute", "continuous", "prismatic")
+
+
+def read_urdf(root: Element, label: str) -> Tree:
+    """Links and joints of a URDF document.
+
+    Args:
+        root: its `<robot>` element.
+        label: the file name for messages.
+
+    Raises:
+        RobotFileError: an element or a figure is missing or not valid; the message names it.
+        UnsupportedRobotError: a joint is of a kind that is not modelled.
+        InertiaError: a mass or an inertia is no finite number.
+    """
+    _refuse_xacro(root, label)
+    document = Element("robot", name=root.get("name") or "robot")
+    for link in root.findall("link"):
+        _copy(document, link, _LINK_PARTS, f"{label}: link {_name(link, label)!r}")
+    for joint in root.findall("joint"):
+        _copy_joint(document, joint, label)
+    robot = yourdfpy.URDF.load(
+        io.BytesIO(tostring(document, encoding="utf-8")), build_scene_graph=False, load_meshes=False
+    ).robot
+    return Tree(
+        name=robot.name,
+        label=label,
+        links=tuple(Link(link.name, _inertial(link)) for link in robot.links),
+        joints=tuple(_joint(joint, f"{label}: joint {joint.name!r}") for joint in robot.joints),
+    )
+
+
+def _refuse_xacro(root: Element, label: str) -> None:
+    if any("xacro" in element.tag for element in root.iter()):
+        raise RobotFileError(
+            f"{label}: the file has xacro macros",
+            expected="plain URDF",
+            got="a xacro file",
+            hint="expand it first: xacro in.urdf.xacro > out.urdf",
+        )
+
+
+def _name(element: Element, label: str) -> str:
+    name = element.get("name")
+    if not name or not name.isprintable() or len(name) > 200:
+        raise RobotFileError(
+            f"{label}: a <{element.tag}> has no usable name",
+            expected="name=... of 1 to 200 printable characters",
+            got=repr(name and name[:40]),
+        )
+    return name
+
+
+def _copy_joint(document: Element, joint: Element, label: str) -> None:
+    where = f"{label}: joint {_name(joint, label)!r}"
+    kind = joint.get("type")
+    if kind is None:
+        raise RobotFileError(f"{where} has no type", expected="type=revolute, prismatic, ...")
+    if kind not in (*_MOVING, "fixed"):
+        raise UnsupportedRobotError(
+            f"{where} is of type {kind!r}",
+            expected="revolute, continuous, prismatic or fixed",
+            got=kind,
+            hint="attach the robot to the base with a fixed joint" if kind == "floating" else None,
+        )
+    _copy(document, joint, _JOINT_PARTS, where)
+    for part in ("parent", "child"):
+        if joint.find(part) is None:
+            raise RobotFileError(f"{where} has no <{part}>", expected=f'<{part} link="..."/>')
+
+
+def _copy(document: Element, source: Element, parts: tuple[str, ...], where: str) -> None:
+    """Copy what is read of a link or a joint, checked, so that nothing else reaches the parser."""
+    copy = SubElement(document, source.tag, dict(source.attrib))
+    for part in parts:
+        found = source.findall(part)
+        if len(found) > 1:
+            raise RobotFileError(f"{where} has several <{part}>", expected="one", got=len(found))
+        if not found:
+            continue
+        if part == "inertial":
+            _check_inertial(found[0], where)
+            _copy(copy, found[0], ("origin", "mass", "inertia"), where)
+        else:
+            _check_attributes(found[0], where)
+            SubElement(copy, part, dict(found[0].attrib))
+
+
+def _check_inertial(inertial: Element, where: str) -> None:
+    for part in ("mass", "inertia"):
+        if inertial.find(part) is None:
+            raise InertiaError(f"{where} has an <inertial> without <{part}>", expected=f"<{part} .../>")
+
+
+def _check_attributes(element: Element, where: str) -> None:
+    tag = element.tag
+    error = InertiaError if tag in ("mass", "inertia") else RobotFileError
+    for attribute in _NEEDED.get(tag, ()):
+        if not element.get(attribute):
+            raise error(f"{where}: <{tag}> has no {attribute}", expected=f'{attribute}="..."')
+    for attribute, count in _NUMBERS.get(tag, {}).items():
+        text = element.get(attribute)
+        if text is not None:
+            infinite = tag == "limit"
+            parse_numbers(text, f"{where}: {tag} {attribute}", count, infinite=infinite, error=error)
+
+
+def _pose(origin: np.ndarray | None) -> np.ndarray:
+    return np.eye(4) if origin is None else origin
+
+
+def _inertial(link: yourdfpy.Link) -> Inertial | None:
+    body = link.inertial
+    if body is None:
+        return None
+    T = _pose(body.origin)
+    R = T[:3, :3]
+    return Inertial(float(body.mass), T[:3, 3], R @ body.inertia @ R.T)
+
+
+def _joint(joint: yourdfpy.Joint, where: str) -> Joint:
+    placement = _pose(joint.origin)
+    if joint.type == "fixed":
+        return Joint(joint.name, "fixed", joint.parent, joint.child, placement)
+    lower, upper, effort, velocity = _limits(joint, where)
+    # yourdfpy leaves these two as strings.
+    dynamics = joint.dynamics or yourdfpy.Dynamics()
+    damping, friction = float(dynamics.damping or 0.0), float(dynamics.friction or 0.0)
+    if min(damping, friction) < 0.0:
+        raise RobotFileError(
+            f"{where} has negative friction", expected="damping and friction ≥ 0", got=(damping, friction)
+        )
+    return Joint(
+        name=joint.name,
+        kind="prismatic" if joint.type == "prismatic" else "revolute",
+        parent=joint.parent,
+        child=joint.child,
+        placement=placement,
+        axis=unit_axis(joint.axis, where),
+        damping=damping,
+        friction=friction,
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
+        effort=effort,
+        refused=f"mimics joint {joint.mimic.joint!r}" if joint.mimic is not None else "",
+    )
+
+
+def _limits(joint: yourdfpy.Joint, where: str) -> tuple[float, float, float, float]:
+    """Position, effort, velocity limits; files leave out, or set to 0, what they do not limit."""
+    limit = joint.limit or yourdfpy.Limit()
+    effort, velocity = limit.effort or np.inf, limit.velocity or np.inf
+    if min(effort, velocity) < 0.0:
+        raise RobotFileError(
+            f"{where} has a negative limit", expected="effort and velocity ≥ 0", got=(effort, velocity)
+        )
+    if joint.type == "continuous" or (limit.lower is None and limit.upper is None):
+        return -np.inf, np.inf, effort, velocity
+    # The format's default for one that is left out is 0.
+    lower, upper = limit.lower or 0.0, limit.upper or 0.0
+    if lower > upper:
+        raise RobotFileError(
+            f"{where} has its limits the wrong way round", expected="lower ≤ upper", got=(lower, upper)
+        )
+    return lower, upper, effort, velocity
