@@ -1,0 +1,24 @@
+"""Logged motion: the data set and its files, derivatives, noise, selection and splits."""
+
+from forcegp.data.dataset import Dataset, NotLoggedError, RobotMismatchWarning
+from forcegp.data.derivative import SavitzkyGolay
+from forcegp.data.header import DataHeader
+from forcegp.data.noise import with_noise
+from forcegp.data.selection import farthest_points, select_points, standardized_inputs
+from forcegp.data.split import Split, complement, split_by_selection, split_by_stretches
+
+__all__ = [
+    "DataHeader",
+    "Dataset",
+    "NotLoggedError",
+    "RobotMismatchWarning",
+    "SavitzkyGolay",
+    "Split",
+    "complement",
+    "farthest_points",
+    "select_points",
+    "split_by_selection",
+    "split_by_stretches",
+    "standardized_inputs",
+    "with_noise",
+]

@@ -1,0 +1,204 @@
+"""What makes a data set valid, and the messages for what does not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from forcegp.data.columns import JOINT_VECTORS, component_names
+from forcegp.data.header import DataHeader
+from forcegp.errors import DataError
+
+if TYPE_CHECKING:
+    from forcegp.data.dataset import Dataset
+
+
+def _named_columns(data: Dataset) -> list[tuple[str, Tensor]]:
+    """Every floating-point column of the data set but time, by its name on disk, vectors whole."""
+    pairs = [(name, getattr(data, name)) for name in JOINT_VECTORS] + list(data.extras.items())
+    for name, group in data.contact_extras.items():
+        pairs += [(f"{name}.{contact}", value) for contact, value in group.items()]
+    return pairs
+
+
+def check_layout(data: Dataset) -> None:
+    """Check shapes, types and device of the columns, and the names of joints and contacts."""
+    n, nq = len(data.t) if data.t.ndim == 1 else -1, len(data.joint_names)
+    if n < 0:
+        raise DataError("column 't' has the wrong shape", expected="(n,)", got=tuple(data.t.shape))
+    if nq == 0 or len(set(data.joint_names)) < nq:
+        raise DataError(
+            "the joint names are not valid", expected="one or more distinct", got=data.joint_names
+        )
+    shared = sorted(set(data.joint_names) & set(data.contact))
+    if shared:
+        raise DataError(f"{shared[0]!r} is the name of a joint and of a contact", hint="rename the contact")
+    for name, value in (("t", data.t), *_named_columns(data)):
+        _check_type(name, value, data.t)
+    for name in (*JOINT_VECTORS, *data.extras):
+        _check_shape(name, getattr(data, name), (n, nq), f"{n} samples of {nq} joints")
+    for name, value in (("segment", data.segment), *data.contact.items()):
+        _check_shape(name, value, (n,), f"{n} samples")
+    for name, group in data.contact_extras.items():
+        for contact, value in group.items():
+            if contact not in data.contact:
+                raise DataError(
+                    f"{name!r} is logged of contact {contact!r}, whose state is not logged",
+                    expected=f"a contact column for one of {', '.join(data.contact) or 'no contacts'}",
+                )
+            if value.shape != (n, 3):
+                _check_shape(f"{name}.{contact}", value, (n,), f"{n} samples")
+    for name, value in data.contact.items():
+        if value.dtype != torch.bool:
+            raise DataError(f"column 'contact.{name}' has the wrong type", expected="bool", got=value.dtype)
+    if data.segment.dtype != torch.int64:
+        raise DataError("column 'segment' has the wrong type", expected="int64", got=data.segment.dtype)
+
+
+def _check_type(name: str, value: Tensor, like: Tensor) -> None:
+    if not value.is_floating_point() or value.dtype != like.dtype or value.device != like.device:
+        raise DataError(
+            f"column {name!r} is of another type or on another device than 't'",
+            expected=f"{like.dtype} on {like.device}"
+            if like.is_floating_point()
+            else "a floating-point type",
+            got=f"{value.dtype} on {value.device}",
+        )
+
+
+def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str) -> None:
+    if tuple(value.shape) != shape:
+        raise DataError(
+            f"column {name!r} has the wrong shape", expected=f"{shape}, {meaning}", got=tuple(value.shape)
+        )
+
+
+def check_values(data: Dataset) -> None:
+    """Check that every number is finite, and that time increases within each segment."""
+    for name, value in (("t", data.t), *_named_columns(data)):
+        if not bool(torch.isfinite(value).all()):
+            _report_not_finite(data, name, value)
+    if data.header.ordered:
+        check_time(data)
+
+
+def _report_not_finite(data: Dataset, name: str, value: Tensor) -> None:
+    place = torch.nonzero(~torch.isfinite(value))[0].tolist()
+    count = int((~torch.isfinite(value)).sum())
+    column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]
+    raise DataError(
+        f"column {column!r} holds {value[tuple(place)].item()} in row {place[0]}",
+        expected="a finite number in every row",
+        got=f"{count} values in {name!r} that are not",
+        hint="drop or repair these rows before using the log",
+    )
+
+
+def check_time(data: Dataset) -> None:
+    """Check that rows of a segment are together, and that time increases strictly within each.
+
+    Raises:
+        DataError: they are not; the message names the row.
+    """
+    t, segment = data.t, data.segment
+    same = segment[1:] == segment[:-1]
+    back = same & (t[1:] <= t[:-1])
+    if bool(back.any()):
+        row = int(torch.nonzero(back)[0]) + 1
+        raise DataError(
+            f"column 't' does not increase in row {row}",
+            expected=f"more than {t[row - 1].item():.9g} s",
+            got=f"{t[row].item():.9g} s",
+            hint="sort the log by time, or number its trajectories in a column 'segment'",
+        )
+    runs = segment[torch.cat([same.new_ones(min(len(segment), 1)), ~same])]
+    if len(runs.unique()) < len(runs):
+        seen, values = set(), runs.tolist()
+        twice = next(value for value in values if value in seen or seen.add(value))
+        raise DataError(
+            f"the rows of segment {twice} are not together", hint="sort the log by 'segment' and 't'"
+        )
+
+
+def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
+    """Row numbers `(k,)` of a slice, mask or list of indices, negative ones counted from the end.
+
+    Raises:
+        DataError: a mask of another length, or an index that does not exist.
+    """
+    if isinstance(rows, slice):
+        return torch.arange(n, device=device)[rows]
+    index = torch.as_tensor(rows, device=device)
+    if index.ndim != 1 or (index.is_floating_point() and len(index)):
+        raise DataError(
+            "rows are chosen by a slice, a mask or a list of row numbers",
+            got=f"a tensor of shape {tuple(index.shape)} and type {index.dtype}",
+        )
+    if index.dtype == torch.bool:
+        if len(index) != n:
+            raise DataError("the mask has another length than the data set", expected=n, got=len(index))
+        return torch.nonzero(index)[:, 0]
+    outside = (index < -n) | (index >= n)
+    if bool(outside.any()):
+        raise DataError("there is no such row", expected=f"0 to {n - 1}", got=int(index[outside][0]))
+    return torch.where(index < 0, index + n, index).to(torch.int64)
+
+
+def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
+    """Check that the joints of a log are those of a robot, in its order."""
+    if tuple(have) == tuple(want):
+        return
+    missing = [joint for joint in want if joint not in have]
+    if not missing:
+        raise DataError(
+            f"the joints of the data are not those of robot {robot!r} in its order",
+            expected=", ".join(want),
+            got=", ".join(have),
+            hint="call data.select(robot.joint_names)",
+        )
+    near = get_close_matches(missing[0], [joint for joint in have if joint not in want], n=1)
+    raise DataError(
+        f"joint {missing[0]!r} of robot {robot!r} is not in the data",
+        expected=", ".join(want),
+        got=", ".join(have),
+        hint=f"is {near[0]!r} in the data the same joint? Rename its columns" if near else None,
+    )
+
+
+def check_alike(parts: Sequence[Dataset]) -> None:
+    """Check that data sets hold the same columns, so that they can be put one after another."""
+    if not parts:
+        raise DataError("there is nothing to concatenate", expected="one or more data sets")
+
+    def layout(data: Dataset) -> dict[str, object]:
+        return {
+            "joints": data.joint_names,
+            "contacts": tuple(data.contact),
+            "extras": sorted(data.extras),
+            "contact extras": sorted((name, *sorted(group)) for name, group in data.contact_extras.items()),
+            "types": (data.dtype, data.device),
+        }
+
+    first = layout(parts[0])
+    for number, part in enumerate(parts[1:], start=1):
+        for what, value in layout(part).items():
+            if value != first[what]:
+                raise DataError(
+                    f"the {what} of data set {number} differ from those of data set 0",
+                    expected=first[what],
+                    got=value,
+                )
+
+
+def common_header(headers: Sequence[DataHeader]) -> DataHeader:
+    """What headers agree on; a field on which they differ says nothing."""
+    first = headers[0].model_dump()
+    agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
+    steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))
+    agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
+    agreed["ordered"] = all(header.ordered for header in headers)
+    return DataHeader(**agreed)

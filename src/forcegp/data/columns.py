@@ -1,0 +1,189 @@
+"""The meaning of the columns of a log: `t`, `q.<joint>`, `contact.<name>`, `multiplier.<contact>`, …"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from forcegp.data.derivative import SavitzkyGolay, differentiate
+from forcegp.data.header import DataHeader
+from forcegp.data.table import Columns, IgnoredColumnsWarning
+from forcegp.errors import DataError
+
+if TYPE_CHECKING:
+    from forcegp.data.dataset import Dataset
+
+JOINT_VECTORS = ("q", "qd", "tau", "qdd")
+"""The joint vectors that every data set holds."""
+AXES = ("x", "y", "z")
+"""Components of a Cartesian vector logged of a contact."""
+
+Fields = dict[str, Any]
+
+
+def component_names(name: str, value: Tensor, joint_names: Sequence[str]) -> list[str]:
+    """Names on disk of the columns of a joint vector, a contact's scalar or its Cartesian vector."""
+    if value.ndim == 1:
+        return [name]
+    return [f"{name}.{part}" for part in (AXES if "." in name else joint_names)]
+
+
+def unparse(data: Dataset) -> tuple[Columns, DataHeader]:
+    """Columns and header of a data set, as they are written."""
+    named: dict[str, Tensor] = {name: getattr(data, name) for name in JOINT_VECTORS} | dict(data.extras)
+    for name, group in data.contact_extras.items():
+        named |= {f"{name}.{contact}": value for contact, value in group.items()}
+    columns: dict[str, Tensor] = {"t": data.t, "segment": data.segment}
+    columns |= {f"contact.{name}": value for name, value in data.contact.items()}
+    for name, value in named.items():
+        parts = component_names(name, value, data.joint_names)
+        columns |= dict(zip(parts, value.reshape(len(data), len(parts)).unbind(-1), strict=True))
+    header = data.header.model_copy(
+        update={"joint_names": data.joint_names, "contact_names": tuple(data.contact)}
+    )
+    return {name: value.detach().cpu().numpy() for name, value in columns.items()}, header
+
+
+def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Fields:
+    """Arrays of a data set from the columns of a file.
+
+    Raises:
+        DataError: a column is missing, incomplete or of the wrong kind; the hint has the nearest name.
+    """
+    joints = header.joint_names or tuple(name[2:] for name in raw if name.startswith("q."))
+    if not joints:
+        raise DataError(f"{source}: no column 'q.<joint>'", expected="one a joint", got=_listing(raw))
+    contacts = header.contact_names or tuple(name[8:] for name in raw if name.startswith("contact."))
+    left = dict(raw)
+    fields: Fields = {"t": _take(source, left, "t").astype(float), "joint_names": joints}
+    absent = {name for name in ("qd", "qdd") if not any(f"{name}.{joint}" in left for joint in joints)}
+    for name in JOINT_VECTORS:
+        if not (method and name in absent):
+            fields[name] = _joint_vector(source, left, name, joints)
+    fields["contact"] = {name: _contact(source, left, f"contact.{name}") for name in contacts}
+    fields["segment"] = _segment(source, left, len(fields["t"]))
+    fields["extras"], fields["contact_extras"] = _extras(source, left, joints, contacts)
+    if left:
+        warnings.warn(
+            f"{source}: columns of unknown meaning are left out: {', '.join(left)}",
+            IgnoredColumnsWarning,
+            stacklevel=4,
+        )
+    if method and absent:
+        header = _fill_in(source, fields, absent, method, header)
+    # What a file without a header does not say, its columns do.
+    fields["header"] = header.model_copy(update={"joint_names": joints, "contact_names": contacts})
+    return fields
+
+
+def as_tensors(fields: Fields, dtype: torch.dtype, device: torch.device) -> Fields:
+    """The arrays of `parse` as tensors, real numbers in the precision asked for."""
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: convert(item) for name, item in value.items()}
+        if not isinstance(value, np.ndarray):
+            return value
+        kind = dtype if value.dtype.kind == "f" else None
+        return torch.tensor(value, dtype=kind, device=device)
+
+    return {name: convert(value) for name, value in fields.items()}
+
+
+def _listing(names: Sequence[str] | Columns) -> str:
+    shown = list(names)
+    return ", ".join(shown[:12]) + (f", … ({len(shown)} columns)" if len(shown) > 12 else "")
+
+
+def _take(source: str, left: Columns, name: str, remedy: str | None = None) -> NDArray[np.generic]:
+    if name in left:
+        return left.pop(name)
+    near = get_close_matches(name, list(left), n=1, cutoff=0.75)
+    raise DataError(
+        f"{source}: column {name!r} is missing",
+        expected=name,
+        got=_listing(left),
+        hint=remedy or (f"is {near[0]!r} the column that is meant?" if near else None),
+    )
+
+
+def _joint_vector(source: str, left: Columns, name: str, joints: Sequence[str]) -> NDArray[np.float64]:
+    remedy = None
+    if name in ("qd", "qdd") and not any(f"{name}.{joint}" in left for joint in joints):
+        remedy = f"compute {name} from the log with differentiate=SavitzkyGolay(...), or --differentiate"
+    parts = [_take(source, left, f"{name}.{joint}", remedy) for joint in joints]
+    return np.stack(parts, axis=-1).astype(float)
+
+
+def _contact(source: str, left: Columns, name: str) -> NDArray[np.bool_]:
+    values = _take(source, left, name)
+    wrong = np.flatnonzero((values != 0) & (values != 1))
+    if len(wrong):
+        raise DataError(
+            f"{source}: column {name!r} is no flag in row {wrong[0]}",
+            expected="true or false, or 1 or 0",
+            got=values[wrong[0]],
+        )
+    return values.astype(bool)
+
+
+def _segment(source: str, left: Columns, n: int) -> NDArray[np.int64]:
+    values = left.pop("segment", np.zeros(n, np.int64))
+    wrong = np.flatnonzero(~(np.asarray(values, float) % 1 == 0))
+    if len(wrong):
+        raise DataError(
+            f"{source}: column 'segment' is no number of a trajectory in row {wrong[0]}",
+            expected="an integer",
+            got=values[wrong[0]],
+        )
+    return values.astype(np.int64)
+
+
+def _extras(
+    source: str, left: Columns, joints: Sequence[str], contacts: Sequence[str]
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, dict[str, NDArray[np.float64]]]]:
+    """Joint vectors and contact quantities among the columns that are left; takes them out."""
+    extras: dict[str, NDArray[np.float64]] = {}
+    contact_extras: dict[str, dict[str, NDArray[np.float64]]] = {}
+    names = dict.fromkeys(column.split(".", 1)[0] for column in left if "." in column)
+    for name in names:
+        if any(f"{name}.{joint}" in left for joint in joints):
+            extras[name] = _joint_vector(source, left, name, joints)
+        for contact in contacts:
+            column = f"{name}.{contact}"
+            if column in left:
+                contact_extras.setdefault(name, {})[contact] = left.pop(column).astype(float)
+            elif any(f"{column}.{axis}" in left for axis in AXES):
+                parts = [_take(source, left, f"{column}.{axis}") for axis in AXES]
+                contact_extras.setdefault(name, {})[contact] = np.stack(parts, axis=-1).astype(float)
+    return extras, contact_extras
+
+
+def _fill_in(
+    source: str, fields: Fields, absent: set[str], method: SavitzkyGolay, header: DataHeader
+) -> DataHeader:
+    """Compute the absent `qd` and `qdd`, and log how uncertain the computed q̈ is."""
+    of, order = ("q", 2) if "qd" in absent else ("qd", 1)
+
+    def derive(name: str, degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return differentiate(fields["t"], fields[name], fields["segment"], method, degree)
+
+    try:
+        if "qd" in absent:
+            fields["qd"], _ = derive("q", 1)
+        if "qdd" in absent:
+            fields["qdd"], fields["extras"]["qdd_std"] = derive(of, order)
+    except DataError as error:
+        raise DataError.at(source, error) from None
+    step = f"computed {' and '.join(sorted(absent))} from the log by {method}"
+    if "qdd" not in absent:
+        return header.with_step(step)
+    noise = float(np.sqrt(np.mean(fields["extras"]["qdd_std"] ** 2)))
+    return header.with_step(step, noise_std=noise)

@@ -1,0 +1,257 @@
+"""The logged motion of a robot: states, torques, accelerations and contacts, one row a sample."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from forcegp.data import check, columns, table
+from forcegp.data.derivative import SavitzkyGolay
+from forcegp.data.header import DataHeader
+from forcegp.errors import DataError, UnknownNameError
+from forcegp.robot.model import RobotModel
+
+Rows = slice | Tensor | Sequence[int] | Sequence[bool]
+
+
+class RobotMismatchWarning(UserWarning):
+    """The data were logged on a robot with other figures than the one they are used with."""
+
+
+class NotLoggedError(DataError, AttributeError):
+    """A quantity that the data set does not hold."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Logged motion of a robot with `nq` joints, `n` samples; SI units, radians.
+
+    Args:
+        t: `(n,)` time [s], strictly increasing within a segment unless `header.ordered` is false.
+        q, qd, qdd: `(n, nq)` joint positions, velocities, accelerations.
+        tau: `(n, nq)` motor torque Q_u [N m, N].
+        joint_names: the joints, in the order of the columns.
+        contact: name → `(n,)` bool, whether the contact is closed.
+        extras: name → `(n, nq)` further logged joint vectors: `qdd_clean`, `Q`, `Q_z`, `Q_I`, …
+        contact_extras: name → contact → `(n,)` or `(n, 3)`: `multiplier`, `F_I`, …
+        segment: `(n,)` number of the trajectory that a row belongs to; default one trajectory.
+        header: noise, sampling period, robot, seed and provenance.
+
+    Extras are attributes too: `data.Q_z`, `data.multiplier["table"]`.
+
+    Raises:
+        DataError: a shape, type, value or time does not fit; the message names column and row.
+    """
+
+    t: Float[Tensor, " n"]
+    q: Float[Tensor, "n nq"]
+    qd: Float[Tensor, "n nq"]
+    tau: Float[Tensor, "n nq"]
+    qdd: Float[Tensor, "n nq"]
+    joint_names: tuple[str, ...]
+    contact: Mapping[str, Tensor] = field(default_factory=dict)
+    extras: Mapping[str, Tensor] = field(default_factory=dict)
+    contact_extras: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
+    segment: Int[Tensor, " n"] = None  # pyright: ignore[reportAssignmentType]  # filled in below
+    header: DataHeader = field(default_factory=DataHeader)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "joint_names", tuple(self.joint_names))
+        if self.segment is None:
+            zero = torch.zeros(self.t.shape, dtype=torch.int64, device=self.t.device)
+            object.__setattr__(self, "segment", zero)
+        check.check_layout(self)
+        check.check_values(self)
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return self.t.shape[0]
+
+    def __getattr__(self, name: str) -> Tensor:
+        extras, contact_extras = self.__dict__.get("extras", {}), self.__dict__.get("contact_extras", {})
+        if name in extras:
+            return extras[name]
+        if name in contact_extras:
+            return contact_extras[name]
+        if name.startswith("_"):
+            raise AttributeError(name)
+        raise NotLoggedError(
+            f"{name!r} is not logged in this data set",
+            expected="one of " + ", ".join([*columns.JOINT_VECTORS, *extras, *contact_extras]),
+        )
+
+    def __getitem__(self, rows: Rows) -> Dataset:
+        """The data set of some rows, given as a slice, a mask `(n,)` or indices in any order.
+
+        Raises:
+            DataError: a mask of another length, or an index that does not exist.
+        """
+        index = check.row_indices(rows, len(self), self.t.device)
+        ordered = self.header.ordered and bool((index[1:] > index[:-1]).all())
+        header = self.header.model_copy(update={"ordered": ordered})
+        return self._map(lambda value: value[index], header=header)
+
+    @property
+    def nq(self) -> int:
+        """Number of joints."""
+        return self.q.shape[1]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating-point type of the columns."""
+        return self.q.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the columns."""
+        return self.q.device
+
+    @property
+    def contact_names(self) -> tuple[str, ...]:
+        """The contacts, in order."""
+        return tuple(self.contact)
+
+    def active(self, contacts: Sequence[str]) -> Tensor:
+        """`(n, len(contacts))` bool: which of the named contacts are closed.
+
+        Raises:
+            UnknownNameError: a contact is not in the data set.
+        """
+        for name in contacts:
+            if name not in self.contact:
+                raise UnknownNameError("contact of the data set", name, self.contact)
+        columns_ = [self.contact[name] for name in contacts]
+        return torch.stack(columns_, dim=-1) if columns_ else self.segment.new_zeros(len(self), 0).bool()
+
+    def replace(self, **fields: object) -> Dataset:
+        """A data set with some fields changed."""
+        return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Dataset:
+        """The same data on another device or in another precision."""
+        return self._map(
+            lambda value: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+        )
+
+    def select(self, joints: Sequence[str]) -> Dataset:
+        """The data set with its joints reordered, or only some of them.
+
+        Args:
+            joints: the joints wanted, such as `robot.joint_names`.
+
+        Raises:
+            UnknownNameError: a joint is not in the data set; the message has the nearest name.
+        """
+        for joint in joints:
+            if joint not in self.joint_names:
+                raise UnknownNameError("joint of the data set", joint, self.joint_names)
+        order = [self.joint_names.index(joint) for joint in joints]
+        fields = {name: getattr(self, name)[:, order] for name in columns.JOINT_VECTORS}
+        extras = {name: value[:, order] for name, value in self.extras.items()}
+        header = self.header.model_copy(update={"joint_names": tuple(joints)})
+        return self.replace(**fields, extras=extras, joint_names=tuple(joints), header=header)
+
+    def check_robot(self, robot: RobotModel) -> None:
+        """Check that the columns are the robot's joints, in its order.
+
+        Warns:
+            RobotMismatchWarning: the robot has other figures than the one that was logged.
+
+        Raises:
+            DataError: joints are missing, unknown or in another order; the hint says what to call.
+        """
+        check.check_joints(self.joint_names, robot.joint_names, robot.name)
+        logged = self.header.robot_fingerprint
+        if logged is not None and logged != robot.fingerprint:
+            warnings.warn(
+                f"the data were logged on robot {self.header.robot!r} (fingerprint {logged}) and are used on "
+                f"{robot.name!r} ({robot.fingerprint}): inertia, kinematics, base or gravity differ",
+                RobotMismatchWarning,
+                stacklevel=2,
+            )
+
+    def _map(self, change: Callable[[Tensor], Tensor], **fields: object) -> Dataset:
+        """The data set with every column changed alike."""
+        vectors = {name: change(getattr(self, name)) for name in ("t", "segment", *columns.JOINT_VECTORS)}
+        return self.replace(
+            **vectors,
+            contact={name: change(value) for name, value in self.contact.items()},
+            extras={name: change(value) for name, value in self.extras.items()},
+            contact_extras={
+                name: {contact: change(value) for contact, value in group.items()}
+                for name, group in self.contact_extras.items()
+            },
+            **fields,
+        )
+
+    @staticmethod
+    def concatenate(parts: Sequence[Dataset]) -> Dataset:
+        """Data sets one after another, each with segments of its own; what not all of them log is an error.
+
+        Raises:
+            DataError: no parts, or their joints, contacts, extras, precision or device differ.
+        """
+        check.check_alike(parts)
+        first = parts[0]
+        segments, start = [], 0
+        for part in parts:
+            _, own = torch.unique_consecutive(part.segment, return_inverse=True)
+            segments.append(own + start)
+            start += int(own.max()) + 1 if len(part) else 0
+        header = check.common_header([part.header for part in parts])
+        return Dataset(
+            **{name: torch.cat([getattr(p, name) for p in parts]) for name in ("t", *columns.JOINT_VECTORS)},
+            joint_names=first.joint_names,
+            contact={name: torch.cat([p.contact[name] for p in parts]) for name in first.contact},
+            extras={name: torch.cat([p.extras[name] for p in parts]) for name in first.extras},
+            contact_extras={
+                name: {c: torch.cat([p.contact_extras[name][c] for p in parts]) for c in group}
+                for name, group in first.contact_extras.items()
+            },
+            segment=torch.cat(segments),
+            header=header,
+        )
+
+    @classmethod
+    def read(
+        cls,
+        path: str | Path,
+        *,
+        differentiate: SavitzkyGolay | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> Dataset:
+        """Read a data set from Parquet or CSV (columns as in docs/formats.md).
+
+        Args:
+            path: the file.
+            differentiate: how to compute the columns `qd` and `qdd` where the log has none.
+            dtype, device: of the tensors.
+
+        Raises:
+            DataError: the file is damaged, or not a valid log; names file, column and row.
+        """
+        raw, header = table.read_table(path)
+        fields = columns.parse(str(path), raw, header, differentiate)
+        try:
+            return cls(**columns.as_tensors(fields, dtype, torch.device(device)))
+        except DataError as error:
+            raise DataError.at(str(path), error) from None
+
+    def write(self, path: str | Path) -> None:
+        """Write to a Parquet file, whole or not at all.
+
+        Raises:
+            DataError: the name does not end in `.parquet`.
+            OSError: the place cannot be written.
+        """
+        if Path(path).suffix.lower() != ".parquet":
+            raise DataError(f"{path}: data sets are written as Parquet", hint="end the name in .parquet")
+        table.write_parquet(path, *columns.unparse(self))

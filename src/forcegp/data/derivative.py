@@ -1,0 +1,119 @@
+"""Velocities and accelerations from logged positions or velocities, with the noise they inherit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forcegp.errors import DataError
+
+UNIFORM_TOLERANCE = 0.02
+"""Largest departure of a time step from the median step, as a fraction: clocks jitter, gaps do not pass."""
+MAD_TO_STD = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
+
+
+@dataclass(frozen=True)
+class SavitzkyGolay:
+    """Differentiation of the polynomial fitted by least squares to a moving window.
+
+    A wider window means less noise and more bias; a higher order the reverse. The noise of neighbouring
+    results is correlated over about one window, which a likelihood with white noise does not know.
+
+    Args:
+        window: number of samples, odd.
+        order: degree of the polynomial, at least 2 and less than `window`.
+
+    Raises:
+        DataError: a parameter is out of range.
+    """
+
+    window: int = 11
+    order: int = 3
+
+    def __post_init__(self) -> None:
+        if self.window % 2 == 0 or not 2 <= self.order < self.window:
+            raise DataError(
+                "the Savitzky-Golay filter is not defined",
+                expected="an odd window, and 2 ≤ order < window",
+                got=f"window {self.window}, order {self.order}",
+            )
+
+
+def differentiate(
+    t: NDArray[np.float64],
+    x: NDArray[np.float64],
+    segment: NDArray[np.int64],
+    method: SavitzkyGolay,
+    degree: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The `degree`-th time derivative of x, and the standard deviation of its noise.
+
+    The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x becomes σ |w|. σ is
+    estimated, one a column, from the residuals of the fit, whose deviation is σ √(1 − h) with h the
+    weight of a sample in its own fit; the median absolute deviation keeps corners of the motion out of it.
+    The first and last half window of each segment are read off the outermost fits, with their larger noise.
+
+    Args:
+        t: `(n,)` time [s], evenly spaced within each segment.
+        x: `(n, d)` logged values.
+        segment: `(n,)` trajectory of each row; no window reaches across two.
+        method: the filter.
+        degree: 1 or 2.
+
+    Returns:
+        Derivative and standard deviation, `(n, d)` each.
+
+    Raises:
+        DataError: a segment is shorter than the window, or its time steps are uneven.
+    """
+    from scipy.signal import savgol_coeffs, savgol_filter
+
+    window, order = method.window, method.order
+    result, gain = np.empty_like(x), np.empty((len(x), 1))
+    half, residuals = window // 2, []
+    # Norm of the weights at each position of the window, per unit time step.
+    norms = [np.linalg.norm(savgol_coeffs(window, order, deriv=degree, pos=place)) for place in range(window)]
+    for rows in _runs(segment):
+        dt = _time_step(t, rows, window)
+        own = x[rows]
+        result[rows] = savgol_filter(own, window, order, deriv=degree, delta=dt, axis=0, mode="interp")
+        places = np.full(len(own), half)
+        places[:half], places[-half:] = np.arange(half), np.arange(half + 1, window)
+        gain[rows, 0] = np.take(norms, places) / dt**degree
+        smooth = np.asarray(savgol_filter(own, window, order, axis=0))
+        residuals.append((own - smooth)[half:-half])
+    own_weight = savgol_coeffs(window, order)[half]
+    spread = MAD_TO_STD * np.median(np.abs(np.concatenate(residuals)), axis=0)
+    return result, gain * (spread / np.sqrt(1.0 - own_weight))
+
+
+def _runs(segment: NDArray[np.int64]) -> list[slice]:
+    """Stretches of rows with the same segment number."""
+    cuts = np.flatnonzero(np.diff(segment)) + 1
+    edges = [0, *cuts.tolist(), len(segment)]
+    return [slice(a, b) for a, b in pairwise(edges)]
+
+
+def _time_step(t: NDArray[np.float64], rows: slice, window: int) -> float:
+    steps = np.diff(t[rows])
+    if len(steps) + 1 < window:
+        raise DataError(
+            f"the trajectory in rows {rows.start} to {rows.stop - 1} is too short to differentiate",
+            expected=f"at least {window} samples, the filter's window",
+            got=f"{len(steps) + 1}",
+        )
+    dt = float(np.median(steps))
+    uneven = np.flatnonzero(~(np.abs(steps - dt) <= UNIFORM_TOLERANCE * dt))
+    if len(uneven) or not dt > 0.0:
+        row = rows.start + int(uneven[0] if len(uneven) else 0) + 1
+        raise DataError(
+            f"the time steps are uneven in row {row} and cannot be differentiated",
+            expected=f"steps of {dt:.6g} s",
+            got=f"{t[row] - t[row - 1]:.6g} s",
+            hint="resample the log, or number its unbroken stretches in a column 'segment'",
+        )
+    return dt

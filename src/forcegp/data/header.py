@@ -1,0 +1,39 @@
+"""What a data set says about itself."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from forcegp.files import Header
+
+
+class DataHeader(Header):
+    """Header of a data set; every field is optional, so that a foreign log can be read.
+
+    Attributes:
+        dt: sampling period [s].
+        noise_std: standard deviation of the noise on q̈ [rad/s²].
+        robot: name of the robot.
+        robot_fingerprint: `RobotModel.fingerprint` of the robot that moved.
+        seed: seed of the random numbers that went into the data.
+        ordered: rows follow time within each segment (not so for points in order of selection).
+        provenance: what was done to the data, oldest first, one line a step.
+        joint_names, contact_names: in the order of the columns; empty where a log does not say.
+    """
+
+    FORMAT: ClassVar[str] = "forcegp-dataset"
+    VERSION: ClassVar[int] = 1
+
+    dt: float | None = None
+    noise_std: float | None = None
+    robot: str | None = None
+    robot_fingerprint: str | None = None
+    seed: int | None = None
+    ordered: bool = True
+    provenance: tuple[str, ...] = ()
+    joint_names: tuple[str, ...] = ()
+    contact_names: tuple[str, ...] = ()
+
+    def with_step(self, step: str, **fields: object) -> DataHeader:
+        """The header with fields changed and one more line of provenance."""
+        return self.model_copy(update={"provenance": (*self.provenance, step), **fields})
