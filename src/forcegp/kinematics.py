@@ -190,6 +190,11 @@ def point_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tenso
     return batch_first(_point(robot, poses, index, point), poses.batch)
 
 
+def rotation_of_poses(robot: RobotModel, poses: LinkPoses, index: int) -> Rotation:
+    """Axes of a frame in the world `(*batch, 3, 3)`."""
+    return batch_first(_frame_in_base(robot, poses, index)[0], poses.batch)
+
+
 def as_point(robot: RobotModel, point: object) -> Vector3:
     """A point `(3,)` given as a tuple or tensor, in the robot's precision and on its device."""
     return torch.as_tensor(point, dtype=robot.dtype, device=robot.device)

@@ -1,0 +1,178 @@
+"""Task-space inverse dynamics control with null-space control of the remaining freedom.
+
+The task is the pose of the tool: 3D position and 3D orientation. A redundant arm moves its elbow in the
+null space of the task's Jacobian, which leaves the error dynamics of the task untouched
+(Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forcegp import kinematics
+from forcegp.errors import NumericalError
+from forcegp.robot.model import RobotModel
+from forcegp.types import JointVector, Rotation, Vector3
+
+SINGULAR = 1e-3
+"""Below this smallest pivot of √(J Jᵀ) the task asks for joint speeds a thousand times its own."""
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Feedback gains of the controller, as stiffness k_P [1/s²] and damping k_D [1/s] of each error.
+
+    Critical damping is k_D = 2 √k_P.
+
+    Args:
+        position_stiffness, position_damping: of the tool's position.
+        orientation_stiffness, orientation_damping: of the tool's orientation.
+        posture_stiffness, posture_damping: of the joints, in the null space of the task.
+    """
+
+    position_stiffness: float = 100.0
+    position_damping: float = 20.0
+    orientation_stiffness: float = 100.0
+    orientation_damping: float = 20.0
+    posture_stiffness: float = 10.0
+    posture_damping: float = 6.0
+
+
+class ToolMotion(NamedTuple):
+    """The tool at a state (q, q̇).
+
+    Attributes:
+        rotation: `(*batch, 3, 3)` axes of the tool's frame in the world.
+        position: `(*batch, 3)` of the tool point in the world [m].
+        twist: `(*batch, 6)` [ω; ṗ] [rad/s], [m/s].
+        jacobian: J `(*batch, 6, nq)` with [ω; ṗ] = J q̇.
+        bias: J̇ q̇ `(*batch, 6)`.
+    """
+
+    rotation: Tensor
+    position: Tensor
+    twist: Tensor
+    jacobian: Tensor
+    bias: Tensor
+
+
+class Target(NamedTuple):
+    """What the controller is to reach at an instant.
+
+    Attributes:
+        position, velocity, acceleration: `(*batch, 3)` of the tool point [m], [m/s], [m/s²].
+        rotation: `(*batch, 3, 3)` constant axes of the tool's frame.
+        posture: `(*batch, nq)` joint positions that the null space leans to [rad].
+        push: `(*batch, 3)` force that the tool is to exert on what it touches, in the world [N].
+    """
+
+    position: Vector3
+    velocity: Vector3
+    acceleration: Vector3
+    rotation: Rotation
+    posture: JointVector
+    push: Vector3
+
+
+def tool_motion(
+    robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: Sequence[float]
+) -> ToolMotion:
+    """Pose, twist, Jacobian and bias acceleration of the tool point, from one pass over the links.
+
+    Raises:
+        UnknownNameError: no such frame.
+        ShapeError: q or qd does not fit the robot.
+    """
+    robot.check_state(qd=qd)
+    index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
+    poses = kinematics.link_poses(robot, q)
+    motion = kinematics.link_motion(robot, poses, qd)
+    J = kinematics.jacobian_of_poses(robot, poses, index, x)
+    return ToolMotion(
+        rotation=kinematics.rotation_of_poses(robot, poses, index),
+        position=kinematics.point_of_poses(robot, poses, index, x) + robot.base_position,
+        twist=(J @ qd[..., None])[..., 0],
+        jacobian=J,
+        bias=kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x),
+    )
+
+
+def orientation_error(rotation: Rotation, target: Rotation) -> Vector3:
+    """e_O = ½ Σᵢ rᵢ × rᵢᵈ over the axes, sin(angle) times the axis that turns the one onto the other.
+
+    Source: Siciliano et al., eq. 3.98.
+    """
+    return 0.5 * torch.linalg.cross(rotation, target, dim=-2).sum(-1)
+
+
+def task_acceleration(tool: ToolMotion, target: Target, gains: Gains) -> Tensor:
+    """[ω̇; p̈] `(*batch, 6)` that makes both errors damped oscillators, ë + k_D ė + k_P e = 0."""
+    omega, velocity = tool.twist.split(3, dim=-1)
+    turning = (
+        gains.orientation_stiffness * orientation_error(tool.rotation, target.rotation)
+        - gains.orientation_damping * omega
+    )
+    moving = (
+        target.acceleration
+        + gains.position_damping * (target.velocity - velocity)
+        + gains.position_stiffness * (target.position - tool.position)
+    )
+    return torch.cat([turning, moving], dim=-1)
+
+
+def joint_acceleration(tool: ToolMotion, task: Tensor, posture: JointVector) -> JointVector:
+    """y = J⁺(a − J̇q̇) + (I − J⁺J) y₀: the task's acceleration, and the posture's in its null space.
+
+    Args:
+        tool: the tool at the state.
+        task: a `(*batch, 6)` wanted acceleration of the tool.
+        posture: y₀ `(*batch, nq)` wanted acceleration of the joints, as far as the task leaves it free.
+
+    Raises:
+        NumericalError: the arm is singular, so that the task cannot be reached.
+    """
+    J = tool.jacobian
+    factor, failed = torch.linalg.cholesky_ex(J @ J.mT)
+    if bool(failed.any()) or float(factor.diagonal(dim1=-2, dim2=-1).min()) < SINGULAR:
+        raise NumericalError(
+            "the arm is singular: its joints cannot give the tool every velocity",
+            hint="a smaller rectangle, or one nearer to the middle of the workspace",
+        )
+    missing = task - tool.bias - (J @ posture[..., None])[..., 0]
+    return posture + (J.mT @ torch.cholesky_solve(missing[..., None], factor))[..., 0]
+
+
+def control_torque(
+    tool: ToolMotion,
+    M: Tensor,
+    Q_K: JointVector,
+    q: JointVector,
+    qd: JointVector,
+    target: Target,
+    gains: Gains,
+) -> JointVector:
+    """Motor torque Q_u = M y − Q_K + J_Eᵀ F of task-space inverse dynamics control, before any limit.
+
+    Args:
+        tool: the tool at the state.
+        M: `(*batch, nq, nq)` mass matrix.
+        Q_K: `(*batch, nq)` known joint force Q_C + Q_G + Q_D [N m].
+        q, qd: `(*batch, nq)` the state.
+        target: what is to be reached; F is its `push`.
+        gains: feedback gains.
+
+    Returns:
+        `(*batch, nq)` [N m].
+
+    Raises:
+        NumericalError: the arm is singular.
+    """
+    posture = gains.posture_stiffness * (target.posture - q) - gains.posture_damping * qd
+    y = joint_acceleration(tool, task_acceleration(tool, target, gains), posture)
+    push = (tool.jacobian[..., 3:, :].mT @ target.push[..., None])[..., 0]
+    return (M @ y[..., None])[..., 0] - Q_K + push

@@ -1,0 +1,221 @@
+"""Reference motions of the end-effector: random points joined by straight lines (section 5.2 of the paper).
+
+Points are drawn in a chart (u, v, h): u and v along the sides of a rectangle that touches the surface in
+its centre, h the height above the surface. A line of the chart is run through with a trapezoidal velocity
+profile (Siciliano et al., *Robotics*, section 4.2.1) and then laid onto the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints.surface import Surface
+from forcegp.errors import ForceGPError
+
+PROJECTION_STEPS = 8
+"""Newton steps onto a surface; one is exact for a signed distance, each further one doubles the digits."""
+
+
+class Trapezoid(NamedTuple):
+    """Trapezoidal velocity profiles, one a segment, at rest at both ends.
+
+    Attributes:
+        length: `(*batch,)` distance travelled [m].
+        travel_time: `(*batch,)` [s].
+        blend_time: `(*batch,)` time of speeding up, and of slowing down [s].
+        acceleration: `(*batch,)` during the blends [m/s²].
+    """
+
+    length: Tensor
+    travel_time: Tensor
+    blend_time: Tensor
+    acceleration: Tensor
+
+    def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Distance, speed and acceleration at time t since the start of the segment (held after its end)."""
+        t = torch.minimum(t.clamp(min=0.0), self.travel_time)
+        left = self.travel_time - t
+        a, blend = self.acceleration, self.blend_time
+        starting, stopping = t < blend, left < blend
+        cruise = a * blend
+        distance = torch.where(
+            starting, 0.5 * a * t**2, torch.where(stopping, self.length - 0.5 * a * left**2, cruise * (t - 0.5 * blend))
+        )
+        speed = torch.where(starting, a * t, torch.where(stopping, a * left, cruise))
+        rate = torch.where(starting, a, torch.where(stopping, -a, 0.0))
+        return distance, speed, rate
+
+
+def trapezoid(length: Tensor, travel_time: float, max_acceleration: float) -> Trapezoid:
+    """Profiles of given length and travel time that accelerate with the maximum acceleration.
+
+    The blend time is t_c = T/2 − ½ √(T² − 4 d/a). Where the acceleration cannot cover the distance in the
+    travel time, T is lengthened to 2 √(d/a); the result's `travel_time` tells.
+
+    Args:
+        length: `(*batch,)` distances d ≥ 0 [m].
+        travel_time: T > 0 [s].
+        max_acceleration: a > 0 [m/s²].
+
+    Raises:
+        ForceGPError: the time or the acceleration is not positive.
+
+    Source: Siciliano et al., *Robotics: Modelling, Planning and Control*, eqs. 4.7 and 4.8.
+    """
+    for name, value in (("travel_time", travel_time), ("max_acceleration", max_acceleration)):
+        if not 0.0 < value < float("inf"):
+            raise ForceGPError(f"{name} must be positive", expected="a positive finite number", got=value)
+    needed = length / max_acceleration
+    T = torch.maximum(torch.full_like(length, travel_time), 2.0 * needed.sqrt())
+    blend = 0.5 * (T - (T**2 - 4.0 * needed).clamp(min=0.0).sqrt())
+    return Trapezoid(length, T, blend, torch.full_like(length, max_acceleration))
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Coordinates (u, v, h) about a place: along the surface, across it, and above it.
+
+    Args:
+        center: `(3,)` origin, on the surface where there is one [m].
+        axes: `(3, 3)` rows: directions of u, v, and the normal at the centre.
+        surface: what u and v are laid onto; `None` is free space, where the chart is linear.
+    """
+
+    center: Tensor
+    axes: Tensor
+    surface: Surface | None
+
+    @staticmethod
+    def about(center: Tensor, surface: Surface | None) -> Chart:
+        """The chart about the point of the surface next to `center`; u points along the world's x axis.
+
+        In free space the normal is the world's z axis.
+        """
+        normal = torch.eye(3, dtype=center.dtype)[2]
+        if surface is not None:
+            center = project(surface, center)
+            normal = torch.nn.functional.normalize(surface.gradient(center), dim=-1)
+        ahead = torch.eye(3, dtype=center.dtype)[int(normal[0].abs() > 0.9)]
+        u = torch.nn.functional.normalize(ahead - (ahead @ normal) * normal, dim=-1)
+        return Chart(center, torch.stack([u, torch.linalg.cross(normal, u), normal]), surface)
+
+    def point(self, w: Tensor) -> Tensor:
+        """World position `(*batch, 3)` of chart coordinates w `(*batch, 3)`."""
+        if self.surface is None:
+            return self.center + w @ self.axes
+        foot = project(self.surface, self.center + w[..., :2] @ self.axes[:2])
+        normal = torch.nn.functional.normalize(self.surface.gradient(foot), dim=-1)
+        return foot + w[..., 2:] * normal
+
+    def motion(self, w: Tensor, wd: Tensor, wdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Position, velocity and acceleration in the world of a motion of the chart, `(n, 3)` each."""
+
+        def at(s: Tensor) -> Tensor:
+            return self.point(w + s * wd + 0.5 * s**2 * wdd)
+
+        def rate(s: Tensor) -> tuple[Tensor, Tensor]:
+            return torch.func.jvp(at, (s,), (torch.ones_like(s),))
+
+        now = torch.zeros(len(w), 1, dtype=w.dtype)
+        (position, velocity), (_, acceleration) = torch.func.jvp(rate, (now,), (torch.ones_like(now),))
+        return position, velocity, acceleration
+
+
+def project(surface: Surface, p: Tensor) -> Tensor:
+    """The point of a surface reached from p `(*batch, 3)` along the gradient, p ← p − c ∇c/|∇c|²."""
+    for _ in range(PROJECTION_STEPS):
+        gradient = surface.gradient(p)
+        p = p - (surface.value(p) / (gradient * gradient).sum(-1))[..., None] * gradient
+    return p
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A sampled reference motion of the end-effector.
+
+    Attributes:
+        t: `(n,)` [s].
+        position, velocity, acceleration: `(n, 3)` in the world [m], [m/s], [m/s²].
+        segment: `(n,)` index of the line that is run through.
+        on_surface: `(n,)` bool, whether that line lies on the surface.
+        waypoints: `(segments + 1, 3)` the points that the lines join, in the world [m].
+        travel_time: `(segments,)` [s].
+        lengthened: number of segments whose travel time the maximum acceleration made longer.
+    """
+
+    t: Tensor
+    position: Tensor
+    velocity: Tensor
+    acceleration: Tensor
+    segment: Tensor
+    on_surface: Tensor
+    waypoints: Tensor
+    travel_time: Tensor
+    lengthened: int
+
+
+def draw_waypoints(
+    count: int,
+    size: tuple[float, float],
+    lift_height: tuple[float, float],
+    lift_probability: float,
+    generator: torch.Generator,
+) -> Tensor:
+    """Chart coordinates `(count, 3)`: uniform in the rectangle, lifted off the surface now and then.
+
+    Args:
+        count: number of points.
+        size: sides of the rectangle [m].
+        lift_height: range of the uniform height of lifted points [m].
+        lift_probability: chance of each point to be lifted; 0 stays on the surface.
+        generator: source of the random numbers.
+    """
+    draws = torch.rand(count, 4, dtype=torch.float64, generator=generator)
+    across = (draws[:, :2] - 0.5) * torch.tensor(size, dtype=torch.float64)
+    low, high = lift_height
+    height = (low + (high - low) * draws[:, 2]) * (draws[:, 3] < lift_probability)
+    return torch.cat([across, height[:, None]], dim=-1)
+
+
+def straight_lines(
+    chart: Chart, waypoints: Tensor, t: Tensor, travel_time: float, max_acceleration: float
+) -> Reference:
+    """Lines between successive waypoints, each with a trapezoidal velocity profile, sampled at times t.
+
+    Speed and acceleration are those of the chart; on a plane and in free space, of the end-effector too.
+
+    Args:
+        chart: where the lines lie.
+        waypoints: `(k, 3)` chart coordinates, k ≥ 2.
+        t: `(n,)` sample times from 0 on; the last waypoint is held after the end [s].
+        travel_time, max_acceleration: see `trapezoid`.
+
+    Returns:
+        The reference; all its samples are computed at once.
+    """
+    lines = waypoints.diff(dim=0)
+    length = torch.linalg.vector_norm(lines, dim=-1)
+    profile = trapezoid(length, travel_time, max_acceleration)
+    ends = profile.travel_time.cumsum(0)
+    segment = torch.searchsorted(ends, t, right=True).clamp(max=len(lines) - 1)
+    since = t - (ends - profile.travel_time)[segment]
+    direction = torch.nn.functional.normalize(lines, dim=-1)[segment]
+    s, sd, sdd = Trapezoid(*(x[segment] for x in profile)).at(since)
+    w = waypoints[segment] + s[:, None] * direction
+    position, velocity, acceleration = chart.motion(w, sd[:, None] * direction, sdd[:, None] * direction)
+    resting = (waypoints[:-1, 2] == 0.0) & (waypoints[1:, 2] == 0.0)
+    return Reference(
+        t=t,
+        position=position,
+        velocity=velocity,
+        acceleration=acceleration,
+        segment=segment,
+        on_surface=resting[segment],
+        waypoints=chart.point(waypoints),
+        travel_time=profile.travel_time,
+        lengthened=int((profile.travel_time > travel_time).sum()),
+    )

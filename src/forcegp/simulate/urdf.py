@@ -1,0 +1,82 @@
+"""A robot model written as URDF, so that every physics engine is given the very same figures."""
+
+from __future__ import annotations
+
+import math
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+import torch
+from torch import Tensor
+
+from forcegp.robot.model import BASE, RobotModel
+
+WORLD = "world"
+GIMBAL = 1e-12
+"""Below this cosine of the pitch, roll and yaw turn about the same axis and the roll is set to zero."""
+
+
+def write_urdf(robot: RobotModel) -> str:
+    """The robot as URDF text: inertial figures and joints only, mounted in the world at its base pose.
+
+    Shapes, joint limits, damping and friction are left out on purpose: an engine that reads the file can
+    add no force of its own, and every force is one that the caller applies.
+
+    Args:
+        robot: the robot.
+
+    Returns:
+        The text of the file; its joints carry the robot's joint names.
+    """
+    root = Element("robot", name=robot.name)
+    _link(root, WORLD, 1.0, torch.zeros(3), torch.eye(3), torch.ones(3))
+    for i, joint in enumerate(robot.joint_names):
+        moments, axes = torch.linalg.eigh(robot.inertia[i])
+        axes = axes * torch.linalg.det(axes).sign()
+        _link(root, _link_name(robot, i), float(robot.mass[i]), robot.com[i], axes, moments)
+        _joint(root, robot, i, joint)
+    indent(root)
+    return tostring(root, encoding="unicode")
+
+
+def _link_name(robot: RobotModel, index: int) -> str:
+    return WORLD if index == BASE else f"link_of_{robot.joint_names[index]}"
+
+
+def _link(root: Element, name: str, mass: float, com: Tensor, axes: Tensor, moments: Tensor) -> None:
+    """A link whose inertia is written in principal axes, so that no engine has to diagonalize it."""
+    inertial = SubElement(SubElement(root, "link", name=name), "inertial")
+    SubElement(inertial, "origin", xyz=_numbers(com), rpy=_numbers(_roll_pitch_yaw(axes)))
+    SubElement(inertial, "mass", value=repr(mass))
+    ixx, iyy, izz = (repr(value) for value in moments.tolist())
+    SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy="0", ixz="0", iyz="0")
+
+
+def _joint(root: Element, robot: RobotModel, i: int, name: str) -> None:
+    parent = robot.parents[i]
+    rotation, position = robot.placement_rotation[i], robot.placement_position[i]
+    if parent == BASE:
+        position = robot.base_rotation @ position + robot.base_position
+        rotation = robot.base_rotation @ rotation
+    slides = robot.joint_types[i] == "prismatic"
+    joint = SubElement(root, "joint", name=name, type="prismatic" if slides else "continuous")
+    SubElement(joint, "origin", xyz=_numbers(position), rpy=_numbers(_roll_pitch_yaw(rotation)))
+    SubElement(joint, "parent", link=_link_name(robot, parent))
+    SubElement(joint, "child", link=_link_name(robot, i))
+    SubElement(joint, "axis", xyz=_numbers(robot.axis[i]))
+    if slides:
+        SubElement(joint, "limit", lower="-1e6", upper="1e6", effort="1e9", velocity="1e9")
+
+
+def _roll_pitch_yaw(rotation: Tensor) -> list[float]:
+    """Angles about the fixed axes x, y, z, as URDF has them."""
+    (r00, r01, _), (r10, r11, _), (r20, r21, r22) = rotation.tolist()
+    cosine = math.hypot(r00, r10)
+    pitch = math.atan2(-r20, cosine)
+    if cosine < GIMBAL:
+        return [0.0, pitch, math.atan2(-r01, r11)]
+    return [math.atan2(r21, r22), pitch, math.atan2(r10, r00)]
+
+
+def _numbers(values: Tensor | list[float]) -> str:
+    numbers = values.tolist() if isinstance(values, Tensor) else values
+    return " ".join(repr(float(value)) for value in numbers)
