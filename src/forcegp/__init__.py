@@ -1,29 +1,72 @@
-"""Forward dynamics of robot arms, free or in contact, with Gaussian-process priors on the unknown forces."""
+"""Forward dynamics of robot arms, free or in contact, with Gaussian-process priors on the unknown forces.
 
-from forcegp import dynamics, kinematics
-from forcegp.constraints import (
-    Baumgarte,
-    ConstrainedSystem,
-    Cylinder,
-    ImplicitSurface,
-    Plane,
-    PointConnection,
-    Sphere,
-    SurfaceContact,
-)
-from forcegp.robot import RobotModel, load_robot
+Public names are imported when they are first used: `import forcegp` alone loads no PyTorch, so that the
+command line answers at once.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from forcegp import dynamics, kinematics
+    from forcegp.constraints import (
+        Baumgarte,
+        ConstrainedSystem,
+        Cylinder,
+        ImplicitSurface,
+        Plane,
+        PointConnection,
+        Sphere,
+        SurfaceContact,
+    )
+    from forcegp.data import Dataset, SavitzkyGolay
+    from forcegp.robot import RobotModel, load_robot
+
+_HOME = {
+    "Baumgarte": "constraints",
+    "ConstrainedSystem": "constraints",
+    "Cylinder": "constraints",
+    "Dataset": "data",
+    "ImplicitSurface": "constraints",
+    "Plane": "constraints",
+    "PointConnection": "constraints",
+    "RobotModel": "robot",
+    "SavitzkyGolay": "data",
+    "Sphere": "constraints",
+    "SurfaceContact": "constraints",
+    "dynamics": "",
+    "kinematics": "",
+    "load_robot": "robot",
+}
+"""The subpackage of each public name; empty where the name is a module itself."""
 
 __all__ = [
     "Baumgarte",
     "ConstrainedSystem",
     "Cylinder",
+    "Dataset",
     "ImplicitSurface",
     "Plane",
     "PointConnection",
     "RobotModel",
+    "SavitzkyGolay",
     "Sphere",
     "SurfaceContact",
     "dynamics",
     "kinematics",
     "load_robot",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module 'forcegp' has no attribute {name!r}")
+    if not _HOME[name]:
+        return import_module(f"forcegp.{name}")
+    value = getattr(import_module(f"forcegp.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__
