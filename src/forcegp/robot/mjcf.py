@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, tostring
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +15,8 @@ from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
 from forcegp.robot.mjcf_reduce import reduce_mjcf
 from forcegp.robot.tree import Inertial, Joint, JointKind, Link, Site, Tree, joint_motion, transform
 
+# The compiled parts of MuJoCo carry no types.
+mujoco: Any = import_module("mujoco")
 _KINDS: dict[int, JointKind] = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "revolute",
     int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic",

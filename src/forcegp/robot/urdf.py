@@ -141,11 +141,11 @@ def _pose(origin: np.ndarray | None) -> np.ndarray:
 
 def _inertial(link: yourdfpy.Link) -> Inertial | None:
     body = link.inertial
-    if body is None:
+    if body is None or body.mass is None or body.inertia is None:
         return None
     T = _pose(body.origin)
     R = T[:3, :3]
-    return Inertial(float(body.mass), T[:3, 3], R @ body.inertia @ R.T)
+    return Inertial(body.mass, T[:3, 3], R @ body.inertia @ R.T)
 
 
 def _joint(joint: yourdfpy.Joint, where: str) -> Joint:
