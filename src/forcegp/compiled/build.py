@@ -1,0 +1,125 @@
+"""From source text to a callable kernel: the system's C++ compiler and a cache on disk, or NVRTC."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from forcegp.compiled.source import CUDA_THREADS
+from forcegp.errors import MissingDependencyError
+from forcegp.files import atomic_file
+
+Kernel = Callable[[Sequence[Tensor], Tensor], None]
+"""Reads contiguous arrays `(B, nq)` and fills the contiguous result `(B, …)`."""
+
+FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-w", "-shared", "-fPIC")
+SAMPLES_PER_THREAD = 512
+"""A thread is started for no fewer samples than take longer than starting it."""
+
+
+def cache_directory() -> Path:
+    """Where compiled kernels are kept: `$FORCEGP_CACHE`, or `forcegp` in the user's cache folder."""
+    chosen = os.environ.get("FORCEGP_CACHE")
+    if chosen:
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "forcegp"
+
+
+def find_compiler() -> str:
+    """Path of the C++ compiler: `$CXX`, or the first of c++, g++ and clang++ on the PATH.
+
+    Raises:
+        MissingDependencyError: there is none.
+    """
+    wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
+    for name in wanted:
+        if found := shutil.which(name):
+            return found
+    raise MissingDependencyError(
+        "the compiled dynamics need a C++ compiler and none was found",
+        expected=" or ".join(wanted) + " on the PATH",
+        hint="install one (for example: apt install g++), set CXX, or use forcegp.dynamics, which needs none",
+    )
+
+
+def _machine() -> str:
+    """What `-march=native` depends on."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return platform.processor() + platform.machine()
+    keys = ("model name", "flags", "cpu family", "model\t", "Features", "CPU part")
+    return "\n".join(sorted({line for line in text.splitlines() if line.startswith(keys)}))
+
+
+def _compile(text: str) -> Path:
+    """The shared library of a source text, compiled unless the cache has it.
+
+    Raises:
+        MissingDependencyError: no compiler, or it failed.
+    """
+    compiler = find_compiler()
+    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    key = hashlib.sha256("\0".join([text, version, _machine(), *FLAGS]).encode()).hexdigest()[:32]
+    library = cache_directory() / f"{key}.so"
+    if library.exists():
+        return library
+    library.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with atomic_file(library) as temporary:
+        command = [compiler, *FLAGS, "-x", "c++", "-", "-o", str(temporary), "-pthread"]
+        done = subprocess.run(command, input=text, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise MissingDependencyError(
+                f"the C++ compiler {compiler} could not build the kernel",
+                got=done.stderr.strip()[-2000:],
+                hint="set CXX to GCC 9 or Clang 12 or newer, or use forcegp.dynamics, which needs no compiler",
+            )
+    return library
+
+
+def cpu_kernel(text: str) -> Kernel:
+    """The kernel of a `cpu_source`, run on as many threads as `torch.get_num_threads()`."""
+    function = ctypes.CDLL(str(_compile(text))).kernel
+    function.restype = None
+    function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_long, ctypes.c_long]
+
+    def run(arrays: Sequence[Tensor], out: Tensor) -> None:
+        batch = out.shape[0]
+        threads = max(1, min(torch.get_num_threads(), batch // SAMPLES_PER_THREAD))
+        pointers = (ctypes.c_void_p * len(arrays))(*[x.data_ptr() for x in arrays])
+        function(pointers, out.data_ptr(), batch, threads)
+
+    return run
+
+
+def cuda_kernel(text: str) -> Kernel:
+    """The kernel of a `cuda_source`, compiled by NVRTC.
+
+    Raises:
+        MissingDependencyError: this PyTorch cannot compile a CUDA kernel at run time.
+    """
+    compile_kernel = getattr(torch.cuda, "_compile_kernel", None)
+    if compile_kernel is None or not torch.cuda.is_available():
+        raise MissingDependencyError(
+            "the compiled dynamics cannot be built for CUDA here",
+            expected="a CUDA device and PyTorch 2.9 or newer",
+            got=f"PyTorch {torch.__version__}",
+            hint="use forcegp.dynamics, which runs on CUDA as it is",
+        )
+    function = compile_kernel(text, "kernel")
+
+    def run(arrays: Sequence[Tensor], out: Tensor) -> None:
+        batch = out.shape[0]
+        blocks = (batch + CUDA_THREADS - 1) // CUDA_THREADS
+        function(grid=(blocks, 1, 1), block=(CUDA_THREADS, 1, 1), args=[*arrays, out, batch])
+
+    return run

@@ -1,0 +1,137 @@
+"""Scalar expressions that fold constants and share equal subexpressions as they are built.
+
+Written for numpy object arrays: an algorithm on arrays of `Scalar` reads as the same algorithm on numbers
+and records a straight-line program.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Node = tuple[str, object, object]
+"""Operation and operands: ("const", value, None), ("input", name, index), (op, left, right) by position."""
+
+
+@dataclass
+class Graph:
+    """The nodes of a program, each one once, operands before their use."""
+
+    nodes: list[Node] = field(default_factory=list)
+    _positions: dict[Node, int] = field(default_factory=dict)
+
+    def scalar(self, node: Node) -> Scalar:
+        """The scalar that a node computes; an equal node is used again."""
+        position = self._positions.setdefault(node, len(self.nodes))
+        if position == len(self.nodes):
+            self.nodes.append(node)
+        return Scalar(self, position)
+
+    def constant(self, value: float) -> Scalar:
+        """A number."""
+        # −0.0 and 0.0 are one key; the sign of a zero never matters here.
+        return self.scalar(("const", float(value) + 0.0, None))
+
+    def constants(self, values: object) -> np.ndarray:
+        """An array of numbers."""
+        array = np.asarray(values, dtype=float)
+        return np.array([self.constant(x) for x in array.flat], dtype=object).reshape(array.shape)
+
+    def input(self, name: str, index: int) -> Scalar:
+        """Entry of an argument of the program."""
+        return self.scalar(("input", name, index))
+
+    def live(self, outputs: list[Scalar]) -> list[int]:
+        """Positions of the nodes that the outputs depend on, in order of computation."""
+        needed, open_ = set(), [x.position for x in outputs]
+        while open_:
+            position = open_.pop()
+            if position not in needed:
+                needed.add(position)
+                op, left, right = self.nodes[position]
+                if op not in ("const", "input"):
+                    open_ += [x for x in (left, right) if isinstance(x, int)]
+        return sorted(needed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scalar:
+    """One number of a program: a position in its graph, with the arithmetic of numbers."""
+
+    graph: Graph
+    position: int
+
+    @property
+    def value(self) -> float | None:
+        """The number, where it is a constant."""
+        op, value, _ = self.graph.nodes[self.position]
+        return value if op == "const" else None  # pyright: ignore[reportReturnType]
+
+    @property
+    def negated(self) -> Scalar | None:
+        """x, where this is −x."""
+        op, operand, _ = self.graph.nodes[self.position]
+        return Scalar(self.graph, operand) if op == "neg" else None  # pyright: ignore[reportArgumentType]
+
+    def _lift(self, other: Scalar | float) -> Scalar:
+        return other if isinstance(other, Scalar) else self.graph.constant(other)
+
+    def _node(self, op: str, other: Scalar) -> Scalar:
+        return self.graph.scalar((op, self.position, other.position))
+
+    def __neg__(self) -> Scalar:
+        if self.value is not None:
+            return self.graph.constant(-self.value)
+        return self.negated or self.graph.scalar(("neg", self.position, None))
+
+    def __add__(self, other: Scalar | float) -> Scalar:
+        a, b = self, self._lift(other)
+        if a.value is not None and b.value is not None:
+            return a.graph.constant(a.value + b.value)
+        if a.value == 0.0 or b.value == 0.0:
+            return b if a.value == 0.0 else a
+        if b.negated is not None:
+            return a - b.negated
+        if a.negated is not None:
+            return b - a.negated
+        return a._node("+", b) if a.position <= b.position else b._node("+", a)
+
+    def __sub__(self, other: Scalar | float) -> Scalar:
+        a, b = self, self._lift(other)
+        if a.value is not None and b.value is not None:
+            return a.graph.constant(a.value - b.value)
+        if a.position == b.position:
+            return a.graph.constant(0.0)
+        if a.value == 0.0 or b.value == 0.0:
+            return -b if a.value == 0.0 else a
+        if b.negated is not None:
+            return a + b.negated
+        return a._node("-", b)
+
+    def __mul__(self, other: Scalar | float) -> Scalar:
+        a, b = self, self._lift(other)
+        if a.value is not None and b.value is not None:
+            return a.graph.constant(a.value * b.value)
+        for x, y in ((a, b), (b, a)):
+            if x.value in (0.0, 1.0):
+                return y if x.value == 1.0 else x
+            if x.value is not None and x.value < 0.0:
+                return -(y * -x.value)
+            if x.negated is not None:
+                return -(x.negated * y)
+        return a._node("*", b) if a.position <= b.position else b._node("*", a)
+
+    def __truediv__(self, other: Scalar | float) -> Scalar:
+        a, b = self, self._lift(other)
+        if a.value is not None and b.value is not None:
+            return a.graph.constant(a.value / b.value)
+        return a if a.value == 0.0 else a._node("/", b)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __rsub__(self, other: float) -> Scalar:
+        return self._lift(other) - self
+
+    def __rtruediv__(self, other: float) -> Scalar:
+        return self._lift(other) / self

@@ -1,0 +1,146 @@
+"""C++ and CUDA source text of a straight-line program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from forcegp.compiled.program import Program
+
+LANES_BYTES = 64
+"""Width of the vectors that a CPU kernel computes on; the compiler splits them where the machine's are narrower."""
+CUDA_THREADS = 128
+
+_CPU = """\
+#include <thread>
+#include <vector>
+typedef {type} T;
+typedef T V __attribute__((vector_size({bytes})));
+constexpr long W = {bytes} / sizeof(T);
+
+static void block(const T* const* in, T* out, long valid) {{
+  alignas({bytes}) T entry[{inputs}][W];
+  alignas({bytes}) T result[{outputs}][W];
+  for (long lane = 0; lane < W; ++lane) {{
+    const long row = lane < valid ? lane : valid - 1;
+{load}
+  }}
+{body}
+  for (long lane = 0; lane < valid; ++lane)
+    for (long k = 0; k < {outputs}; ++k) out[lane * {outputs} + k] = result[k][lane];
+}}
+
+static void range(const T* const* in, T* out, long begin, long end) {{
+  for (long start = begin; start < end; start += W) {{
+    const T* at[] = {{{shifted}}};
+    block(at, out + start * {outputs}, end - start < W ? end - start : W);
+  }}
+}}
+
+extern "C" void kernel(const T* const* in, T* out, long batch, long threads) {{
+  const long share = ((batch + threads - 1) / threads + W - 1) / W * W;
+  std::vector<std::thread> others;
+  for (long begin = share; begin < batch; begin += share)
+    others.emplace_back(range, in, out, begin, begin + share < batch ? begin + share : batch);
+  range(in, out, 0, share < batch ? share : batch);
+  for (std::thread& other : others) other.join();
+}}
+"""
+
+_CUDA = """\
+typedef {type} T;
+typedef T V;
+
+extern "C" __global__ void kernel({parameters}, T* out, long long batch) {{
+  const long long row = (long long)blockIdx.x * blockDim.x + threadIdx.x;
+  if (row >= batch) return;
+{body}
+}}
+"""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Source text and the arrays that its kernel reads.
+
+    Attributes:
+        text: the source.
+        arrays: names of the arrays, in the order of the kernel's arguments: an argument of the
+            quantity, or "sin" or "cos" of q.
+    """
+
+    text: str
+    arrays: tuple[str, ...]
+
+
+def _statements(program: Program, load: dict[tuple[str, int], str], store: str) -> str:
+    """One statement a live node, then the stores."""
+    nodes, lines = program.graph.nodes, []
+    name: dict[int, str] = {}
+    for position in program.graph.live(program.outputs):
+        op, left, right = nodes[position]
+        if op == "const":
+            # A scalar operand is spread over the lanes by the compiler; hexadecimal keeps every bit.
+            name[position] = f"T({float(left).hex()})"  # pyright: ignore[reportArgumentType]
+            continue
+        name[position] = f"x{position}"
+        if op == "input":
+            value = load[left, right]  # pyright: ignore[reportArgumentType]
+        elif op == "neg":
+            value = f"-{name[left]}"  # pyright: ignore[reportArgumentType]
+        else:
+            value = f"{name[left]} {op} {name[right]}"  # pyright: ignore[reportArgumentType]
+        lines.append(f"  const V x{position} = {value};")
+    for k, output in enumerate(program.outputs):
+        lines.append("  " + store.format(k=k, value=f"V{{}} + {name[output.position]}"))
+    return "\n".join(lines)
+
+
+def _inputs(program: Program) -> tuple[tuple[str, ...], list[tuple[str, int]]]:
+    """The arrays that are read, and their entries that are used."""
+    nodes = (program.graph.nodes[i] for i in program.graph.live(program.outputs))
+    entries = sorted((str(name), int(index)) for op, name, index in nodes if op == "input")  # pyright: ignore[reportArgumentType]
+    return tuple(sorted({name for name, _ in entries})), entries
+
+
+def _type(dtype: torch.dtype) -> str:
+    return {torch.float64: "double", torch.float32: "float"}[dtype]
+
+
+def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
+    """C++ that computes a vector of samples at a time and shares the batch among threads."""
+    arrays, entries = _inputs(program)
+    load = "\n".join(
+        f"    entry[{k}][lane] = in[{arrays.index(name)}][row * {nq} + {index}];"
+        for k, (name, index) in enumerate(entries)
+    )
+    text = _CPU.format(
+        type=_type(dtype),
+        bytes=LANES_BYTES,
+        inputs=len(entries),
+        outputs=len(program.outputs),
+        load=load,
+        body=_statements(
+            program,
+            {entry: f"*(const V*)entry[{k}]" for k, entry in enumerate(entries)},
+            "*(V*)result[{k}] = {value};",
+        ),
+        shifted=", ".join(f"in[{k}] + start * {nq}" for k in range(len(arrays))),
+    )
+    return Source(text, arrays)
+
+
+def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
+    """CUDA C++ that computes one sample a thread."""
+    arrays, entries = _inputs(program)
+    text = _CUDA.format(
+        type=_type(dtype),
+        parameters=", ".join(f"const T* in_{name}" for name in arrays),
+        body=_statements(
+            program,
+            {(name, index): f"in_{name}[row * {nq} + {index}]" for name, index in entries},
+            f"out[row * {len(program.outputs)} + {{k}}] = {{value}};",
+        ),
+    )
+    return Source(text, arrays)
