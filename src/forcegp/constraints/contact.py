@@ -18,20 +18,6 @@ from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
 
 
-class ConstraintTerms(NamedTuple):
-    """A constraint at a state.
-
-    Attributes:
-        c: `(*batch, rows)` position-level error.
-        A: `(*batch, rows, nq)` Jacobian of c.
-        b: `(*batch, rows)` with A q̈ = b, no stabilization.
-    """
-
-    c: Tensor
-    A: Tensor
-    b: Tensor
-
-
 class ContactPoint(NamedTuple):
     """The point of the robot that touches a surface.
 
@@ -47,6 +33,22 @@ class ContactPoint(NamedTuple):
     bias: Tensor
     jacobian: Tensor
     normal: Tensor
+
+
+class ConstraintTerms(NamedTuple):
+    """A constraint at a state.
+
+    Attributes:
+        c: `(*batch, rows)` position-level error.
+        A: `(*batch, rows, nq)` Jacobian of c.
+        b: `(*batch, rows)` with A q̈ = b, no stabilization.
+        point: the touching point, for a contact with a surface.
+    """
+
+    c: Tensor
+    A: Tensor
+    b: Tensor
+    point: ContactPoint | None = None
 
 
 class Constraint(ABC):
@@ -108,7 +110,7 @@ class SurfaceContact(Constraint):
         at = self.contact_point(robot, poses, motion, qd)
         A = at.normal[..., None, :] @ at.jacobian
         b = -((at.normal * at.bias).sum(-1) + self.surface.curvature(at.position, at.velocity))
-        return ConstraintTerms(self.surface.value(at.position)[..., None], A, b[..., None])
+        return ConstraintTerms(self.surface.value(at.position)[..., None], A, b[..., None], at)
 
 
 @dataclass(frozen=True)

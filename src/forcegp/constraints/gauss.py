@@ -15,8 +15,9 @@ from torch import Tensor
 
 from forcegp import dynamics, kinematics
 from forcegp.constraints.baumgarte import Baumgarte
-from forcegp.constraints.contact import Constraint, ContactPoint, SurfaceContact
+from forcegp.constraints.contact import Constraint, ContactPoint
 from forcegp.errors import ForceGPError, ShapeError, UnknownNameError
+from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector, JointMatrix, JointVector
 
@@ -35,6 +36,7 @@ class Equations:
         c, cd: `(*batch, m)` constraint error and its rate, of all contacts, active or not.
         Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
         contact_points: the touching point of each surface contact, by name.
+        poses, motion: the links at the states, for whoever needs more of the kinematics.
     """
 
     M: JointMatrix
@@ -46,6 +48,8 @@ class Equations:
     Q_G: JointVector
     Q_D: JointVector
     contact_points: dict[str, ContactPoint]
+    poses: LinkPoses
+    motion: LinkMotion
 
     @cached_property
     def M_cholesky(self) -> JointMatrix:
@@ -214,7 +218,8 @@ class ConstrainedSystem:
         poses = kinematics.link_poses(robot, q)
         motion = kinematics.link_motion(robot, poses, qd)
         links = dynamics.link_inertia(robot, poses)
-        c, A, b = self._stack(q, [contact.terms(robot, poses, motion, qd) for contact in self.contacts])
+        terms = {contact.name: contact.terms(robot, poses, motion, qd) for contact in self.contacts}
+        c, A, b = self._stack(q, list(terms.values()))
         cd = (A @ qd[..., None])[..., 0]
         if self.baumgarte is not None:
             b = self.baumgarte.stabilized(b, c, cd)
@@ -228,11 +233,9 @@ class ConstrainedSystem:
             Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
             Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
             Q_D=dynamics.damping_force(robot, qd),
-            contact_points={
-                contact.name: contact.contact_point(robot, poses, motion, qd)
-                for contact in self.contacts
-                if isinstance(contact, SurfaceContact)
-            },
+            contact_points={name: term.point for name, term in terms.items() if term.point is not None},
+            poses=poses,
+            motion=motion,
         )
 
     def _stack(self, q: Tensor, terms: list) -> tuple[Tensor, Tensor, Tensor]:

@@ -40,7 +40,9 @@ def _vector(values: Sequence[float], like: Tensor) -> Tensor:
 def _unit(values: Sequence[float], what: str) -> tuple[float, ...]:
     length = sum(float(x) ** 2 for x in values) ** 0.5
     if len(values) != 3 or not 0.0 < length < float("inf"):
-        raise ForceGPError(f"{what} gives no direction", expected="three finite numbers, not all zero", got=values)
+        raise ForceGPError(
+            f"{what} gives no direction", expected="three finite numbers, not all zero", got=values
+        )
     return tuple(float(x) / length for x in values)
 
 
@@ -162,7 +164,7 @@ class ImplicitSurface(Surface):
 
     def curvature(self, p: Vector3, v: Vector3) -> Scalars:
         def along(point: Tensor, direction: Tensor) -> Tensor:
-            _, change = torch.func.jvp(torch.func.grad(self.function), (point,), (direction,))
+            change = torch.func.jvp(torch.func.grad(self.function), (point,), (direction,))[1]
             return (change * direction).sum()
 
         flat = torch.func.vmap(along)(p.reshape(-1, 3), v.expand_as(p).reshape(-1, 3))

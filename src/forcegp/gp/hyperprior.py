@@ -1,0 +1,64 @@
+"""Initial values, bounds and weak priors of the hyperparameters.
+
+Inputs are standardized, so a length-scale of the order of the square root of their number relates
+typical samples. A log-normal prior around that start, two and a half e-folds wide, keeps the length-scales
+of inputs that do not matter from drifting to infinity without deciding those that do. The scale of a
+force starts at the root mean square of the force that explains the training residuals by least squares.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from forcegp.gp.gram import Block
+from forcegp.gp.kernels import Parameters
+from forcegp.gp.priors import ForcePrior
+
+LOG_LENGTHSCALE_BOUNDS = (math.log(0.03), math.log(3e3))
+LOG_STD_BOUNDS = (math.log(1e-6), math.log(1e6))
+LOG_NOISE_BOUNDS = (math.log(1e-6), math.log(1e4))
+WIDTH = {"log_lengthscale": 2.5, "log_noise_std": 5.0}
+"""Standard deviation of the log-normal priors, in e-folds; 3 where not named."""
+
+
+def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block]) -> dict[str, Tensor]:
+    """Where learning starts, by `<prior>.<name>`."""
+    params: dict[str, Tensor] = {}
+    like = blocks[0].target
+    for p, prior in enumerate(priors):
+        widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
+        scale = _force_scale(p, blocks)
+        for name, value in prior.kernel.initial(len(scale), widths).items():
+            value = value.to(like)
+            if name.endswith("_std"):
+                value = value + scale.log().reshape(-1, *[1] * (value.ndim - 1))
+            params[f"{prior.name}.{name}"] = value
+    return params
+
+
+def _force_scale(p: int, blocks: Sequence[Block]) -> Tensor:
+    """Root mean square of the least-squares force of prior p, `(components,)`."""
+    total, count = torch.zeros_like(blocks[0].operators[p][0, 0]), 0
+    for block in blocks:
+        force = (torch.linalg.pinv(block.operators[p], rtol=1e-6) @ block.target[..., None])[..., 0]
+        total, count = total + (force**2).sum(0), count + len(force)
+    return (total / max(count, 1)).sqrt().clamp(1e-3, 1e4)
+
+
+def bounds_of(params: Parameters) -> dict[str, tuple[float, float]]:
+    """Box of each hyperparameter, for the optimiser."""
+    kinds = {"log_lengthscale": LOG_LENGTHSCALE_BOUNDS, "log_noise_std": LOG_NOISE_BOUNDS}
+    return {key: kinds.get(key.rsplit(".", 1)[-1], LOG_STD_BOUNDS) for key in params}
+
+
+def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tensor:
+    """Σ ½ ((θ − θ_start)/width)², the weak prior on log-hyperparameters up to a constant."""
+    terms = [
+        0.5 * (((value - start[key]) / WIDTH.get(key.rsplit(".", 1)[-1], 3.0)) ** 2).sum()
+        for key, value in params.items()
+    ]
+    return torch.stack(terms).sum()

@@ -1,0 +1,291 @@
+"""Covariance functions of independent latent outputs, as frozen descriptions on a dictionary of parameters.
+
+A kernel serves `k` independent outputs at once: its covariance is `(k, n, n')`. Inputs are named
+features, `{"q": (n, w), "qd": (n, w), …}`, already standardized; a kernel reads those named in `inputs`,
+or all. Hyperparameters are logarithms, in a flat dictionary, so that one optimiser serves every kernel.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import UnknownNameError
+
+Features = Mapping[str, Tensor]
+Parameters = Mapping[str, Tensor]
+
+LARGEST_EXPONENT = 300.0
+"""exp(−300) is far below rounding and far above the denormal numbers that slow processors down."""
+
+
+def sub(params: Parameters, prefix: str) -> dict[str, Tensor]:
+    """The entries `prefix.*`, without the prefix."""
+    return {key[len(prefix) + 1 :]: value for key, value in params.items() if key.startswith(prefix + ".")}
+
+
+class Kernel(ABC):
+    """A covariance function of `k` independent outputs."""
+
+    @abstractmethod
+    def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
+        """Initial log-hyperparameters for `outputs` outputs and features of the given widths."""
+
+    @abstractmethod
+    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        """k(x, x′) `(k, n, n')`."""
+
+    @abstractmethod
+    def diagonal(self, params: Parameters, x: Features) -> Tensor:
+        """k(x, x) `(k, n)`."""
+
+    @abstractmethod
+    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+        """Random functions from the prior, as `features` random features an output."""
+
+    def __add__(self, other: Kernel) -> Kernel:
+        return Sum(self, other)
+
+    def __mul__(self, other: Kernel) -> Kernel:
+        return Product(self, other)
+
+
+class FunctionDraw(ABC):
+    """Random functions drawn from a prior; evaluated anywhere."""
+
+    @abstractmethod
+    def basis(self, x: Features) -> Tensor:
+        """φ(x) `(k, n, features)` with E[φ φ′ᵀ] = k(x, x′)."""
+
+
+def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
+    """The named features side by side, `(n, w)`.
+
+    Raises:
+        UnknownNameError: a feature is not given.
+    """
+    names = tuple(x) if inputs is None else inputs
+    for name in names:
+        if name not in x:
+            raise UnknownNameError("kernel input", name, x)
+    return torch.cat([x[name] for name in names], dim=-1)
+
+
+@dataclass(frozen=True)
+class _Stationary(Kernel):
+    """σ² g(r) of the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination)."""
+
+    inputs: tuple[str, ...] | None = None
+
+    def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
+        names = tuple(widths) if self.inputs is None else self.inputs
+        width = sum(widths[name] for name in names)
+        scale = math.log(math.sqrt(width))
+        return {
+            "log_lengthscale": torch.full((outputs, width), scale, dtype=torch.float64),
+            "log_std": torch.zeros(outputs, dtype=torch.float64),
+        }
+
+    @abstractmethod
+    def profile(self, r2: Tensor) -> Tensor:
+        """g as a function of r²."""
+
+    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        inverse = torch.exp(-params["log_lengthscale"])[:, None, :]
+        a = stacked(x1, self.inputs) * inverse
+        b = stacked(x2, self.inputs) * inverse
+        norms = (a * a).sum(-1)[:, :, None] + (b * b).sum(-1)[:, None, :]
+        r2 = torch.baddbmm(norms, a, b.mT, alpha=-2.0)
+        return torch.exp(2.0 * params["log_std"])[:, None, None] * self.profile(r2)
+
+    def diagonal(self, params: Parameters, x: Features) -> Tensor:
+        n = next(iter(x.values())).shape[0]
+        return torch.exp(2.0 * params["log_std"])[:, None].expand(-1, n)
+
+    @abstractmethod
+    def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        """Draws from the spectral density of g at unit length-scales."""
+
+    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+        lengthscale = params["log_lengthscale"].exp()
+        k, width = lengthscale.shape
+        device = lengthscale.device
+        omega = self.frequencies((k, features, width), generator).to(device) / lengthscale[:, None, :]
+        phase = 2.0 * math.pi * torch.rand(k, features, dtype=torch.float64, generator=generator)
+        return _FourierDraw(self.inputs, omega, phase.to(device), params["log_std"].exp())
+
+
+@dataclass(frozen=True)
+class _FourierDraw(FunctionDraw):
+    inputs: tuple[str, ...] | None
+    omega: Tensor
+    phase: Tensor
+    std: Tensor
+
+    def basis(self, x: Features) -> Tensor:
+        angle = stacked(x, self.inputs) @ self.omega.mT + self.phase[:, None, :]
+        scale = self.std * math.sqrt(2.0 / self.phase.shape[-1])
+        return scale[:, None, None] * torch.cos(angle)
+
+
+@dataclass(frozen=True)
+class SquaredExponential(_Stationary):
+    """k = σ² exp(−r²/2), a length-scale for each input and output (eq. 31)."""
+
+    def profile(self, r2: Tensor) -> Tensor:
+        return torch.exp((-0.5 * r2).clamp(-LARGEST_EXPONENT, 0.0))
+
+    def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        return torch.randn(shape, dtype=torch.float64, generator=generator)
+
+
+class _Matern(_Stationary):
+    degrees: int
+
+    @staticmethod
+    def _radius(r2: Tensor, degrees: int) -> Tensor:
+        # The floor keeps the derivative of the square root finite where two inputs coincide.
+        return (degrees * r2.clamp(min=1e-30)).sqrt().clamp(max=LARGEST_EXPONENT)
+
+    def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        normal = torch.randn(shape, dtype=torch.float64, generator=generator)
+        chi2 = torch.randn(*shape[:-1], self.degrees, dtype=torch.float64, generator=generator)
+        return normal / ((chi2**2).sum(-1, keepdim=True) / self.degrees).sqrt()
+
+
+@dataclass(frozen=True)
+class Matern32(_Matern):
+    """k = σ² (1 + √3 r) exp(−√3 r)."""
+
+    degrees = 3
+
+    def profile(self, r2: Tensor) -> Tensor:
+        r = self._radius(r2, 3)
+        return (1.0 + r) * torch.exp(-r)
+
+
+@dataclass(frozen=True)
+class Matern52(_Matern):
+    """k = σ² (1 + √5 r + 5r²/3) exp(−√5 r)."""
+
+    degrees = 5
+
+    def profile(self, r2: Tensor) -> Tensor:
+        r = self._radius(r2, 5)
+        return (1.0 + r + r * r / 3.0) * torch.exp(-r)
+
+
+@dataclass(frozen=True)
+class Linear(Kernel):
+    """k = Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs."""
+
+    inputs: tuple[str, ...] | None = None
+
+    def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
+        names = tuple(widths) if self.inputs is None else self.inputs
+        width = sum(widths[name] for name in names)
+        return {
+            "log_slope_std": torch.zeros(outputs, width, dtype=torch.float64),
+            "log_bias_std": torch.zeros(outputs, dtype=torch.float64),
+        }
+
+    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        slope = params["log_slope_std"].exp()[:, None, :]
+        product = (stacked(x1, self.inputs) * slope) @ (stacked(x2, self.inputs) * slope).mT
+        return product + torch.exp(2.0 * params["log_bias_std"])[:, None, None]
+
+    def diagonal(self, params: Parameters, x: Features) -> Tensor:
+        scaled = stacked(x, self.inputs) * params["log_slope_std"].exp()[:, None, :]
+        return (scaled * scaled).sum(-1) + torch.exp(2.0 * params["log_bias_std"])[:, None]
+
+    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+        return _LinearDraw(self.inputs, params["log_slope_std"].exp(), params["log_bias_std"].exp())
+
+
+@dataclass(frozen=True)
+class _LinearDraw(FunctionDraw):
+    inputs: tuple[str, ...] | None
+    slope: Tensor
+    bias: Tensor
+
+    def basis(self, x: Features) -> Tensor:
+        scaled = stacked(x, self.inputs) * self.slope[:, None, :]
+        return torch.cat([scaled, self.bias[:, None, None].expand(-1, scaled.shape[1], 1)], dim=-1)
+
+
+@dataclass(frozen=True)
+class Sum(Kernel):
+    """k = k_1 + k_2 (remark 3.2)."""
+
+    left: Kernel
+    right: Kernel
+
+    def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
+        sides = {"left": self.left, "right": self.right}
+        return {
+            f"{side}.{key}": value
+            for side, kernel in sides.items()
+            for key, value in kernel.initial(outputs, widths).items()
+        }
+
+    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        left = self.left.covariance(sub(params, "left"), x1, x2)
+        return left + self.right.covariance(sub(params, "right"), x1, x2)
+
+    def diagonal(self, params: Parameters, x: Features) -> Tensor:
+        return self.left.diagonal(sub(params, "left"), x) + self.right.diagonal(sub(params, "right"), x)
+
+    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+        return _SumDraw(
+            self.left.draw(sub(params, "left"), features, generator),
+            self.right.draw(sub(params, "right"), features, generator),
+        )
+
+
+@dataclass(frozen=True)
+class _SumDraw(FunctionDraw):
+    left: FunctionDraw
+    right: FunctionDraw
+
+    def basis(self, x: Features) -> Tensor:
+        return torch.cat([self.left.basis(x), self.right.basis(x)], dim=-1)
+
+
+@dataclass(frozen=True)
+class Product(Sum):
+    """k = k_1 k_2."""
+
+    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        left = self.left.covariance(sub(params, "left"), x1, x2)
+        return left * self.right.covariance(sub(params, "right"), x1, x2)
+
+    def diagonal(self, params: Parameters, x: Features) -> Tensor:
+        return self.left.diagonal(sub(params, "left"), x) * self.right.diagonal(sub(params, "right"), x)
+
+    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+        # Features of the two factors are paired at random, so that their number does not multiply.
+        left = self.left.draw(sub(params, "left"), features, generator)
+        right = self.right.draw(sub(params, "right"), features, generator)
+        return _ProductDraw(left, right, features, int(torch.randint(2**31, (1,), generator=generator)))
+
+
+@dataclass(frozen=True)
+class _ProductDraw(FunctionDraw):
+    left: FunctionDraw
+    right: FunctionDraw
+    features: int
+    seed: int
+
+    def basis(self, x: Features) -> Tensor:
+        left, right = self.left.basis(x), self.right.basis(x)
+        generator = torch.Generator().manual_seed(self.seed)
+        n_left, n_right = left.shape[-1], right.shape[-1]
+        i = torch.randint(n_left, (self.features,), generator=generator).to(left.device)
+        j = torch.randint(n_right, (self.features,), generator=generator).to(left.device)
+        scale = math.sqrt(n_left * n_right / self.features)
+        return scale * left[..., i] * right[..., j]

@@ -1,0 +1,196 @@
+"""Minimising a differentiable objective over named tensors: L-BFGS, or ADAM as in the paper."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import scipy.optimize
+import torch
+from torch import Tensor
+
+from forcegp.errors import NumericalError, UnknownNameError
+
+Objective = Callable[[dict[str, Tensor]], Tensor]
+Progress = Callable[[int, float, dict[str, Tensor]], None]
+"""Called after each evaluation with their number, the objective, and the best tensors so far."""
+
+OPTIMIZERS = ("lbfgs", "adam")
+
+
+@dataclass(frozen=True)
+class LearningOptions:
+    """How to learn.
+
+    Args:
+        optimizer: `"lbfgs"` or `"adam"`.
+        max_evaluations: evaluations of the objective at most.
+        tolerance: relative change of the objective below which L-BFGS stops, and ADAM stops when it
+            has not improved by that much within `patience` evaluations.
+        learning_rate: of ADAM, for the hyperparameters θ_M.
+        analytical_learning_rate: of ADAM, for the analytical parameters θ_A.
+        patience: evaluations without improvement after which ADAM stops.
+    """
+
+    optimizer: Literal["lbfgs", "adam"] = "lbfgs"
+    max_evaluations: int = 300
+    tolerance: float = 1e-6
+    learning_rate: float = 0.2
+    analytical_learning_rate: float = 0.2
+    patience: int = 50
+
+    def __post_init__(self) -> None:
+        if self.optimizer not in OPTIMIZERS:
+            raise UnknownNameError("optimizer", self.optimizer, OPTIMIZERS)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """Where learning ended.
+
+    Attributes:
+        tensors: the best ones seen.
+        value: the objective there.
+        converged: whether the tolerance was reached within the evaluations allowed.
+        evaluations: how many were made.
+        seconds: how long they took.
+        message: why learning stopped.
+        history: the objective at each evaluation.
+    """
+
+    tensors: dict[str, Tensor]
+    value: float
+    converged: bool
+    evaluations: int
+    seconds: float
+    message: str
+    history: list[float] = field(default_factory=list)
+
+
+class _Recorder:
+    """Evaluates the objective with its gradient, and remembers the best point."""
+
+    def __init__(self, objective: Objective, start: Mapping[str, Tensor], progress: Progress | None) -> None:
+        self.objective, self.progress = objective, progress
+        self.best = {key: value.detach().clone() for key, value in start.items()}
+        self.value, self.history = float("inf"), []
+
+    def __call__(self, tensors: dict[str, Tensor]) -> tuple[float, dict[str, Tensor]]:
+        leaves = {key: value.detach().clone().requires_grad_() for key, value in tensors.items()}
+        objective = self.objective(leaves)
+        grads = torch.autograd.grad(objective, list(leaves.values()), allow_unused=True)
+        value = float(objective.detach())
+        self.history.append(value)
+        if value < self.value:
+            self.value, self.best = value, {key: leaf.detach() for key, leaf in leaves.items()}
+        if self.progress is not None:
+            self.progress(len(self.history), value, self.best)
+        zero = (torch.zeros_like(leaf) for leaf in leaves.values())
+        pairs = zip(leaves, grads, zero, strict=True)
+        return value, {key: z if grad is None else grad for key, grad, z in pairs}
+
+
+def minimise(
+    objective: Objective,
+    start: Mapping[str, Tensor],
+    options: LearningOptions,
+    analytical: frozenset[str] = frozenset(),
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    progress: Progress | None = None,
+) -> Learned:
+    """Minimise an objective over tensors.
+
+    Args:
+        objective: maps the tensors to a scalar, differentiably.
+        start: initial tensors by name.
+        options: how to learn.
+        analytical: names of the analytical parameters θ_A, which have an ADAM of their own.
+        bounds: box of each tensor, for L-BFGS.
+        progress: called after each evaluation.
+
+    Raises:
+        NumericalError: the objective is not finite at the start.
+    """
+    began = time.perf_counter()
+    recorder = _Recorder(objective, start, progress)
+    run = _lbfgs if options.optimizer == "lbfgs" else _adam
+    converged, message = run(recorder, start, options, analytical, bounds or {})
+    if not np.isfinite(recorder.value):
+        raise NumericalError("the objective is not finite at the start", got=recorder.history[:1])
+    seconds = time.perf_counter() - began
+    return Learned(
+        recorder.best, recorder.value, converged, len(recorder.history), seconds, message, recorder.history
+    )
+
+
+def _lbfgs(
+    recorder: _Recorder,
+    start: Mapping[str, Tensor],
+    options: LearningOptions,
+    analytical: frozenset[str],
+    bounds: Mapping[str, tuple[float, float]],
+) -> tuple[bool, str]:
+    shapes = {key: value.shape for key, value in start.items()}
+    like = next(iter(start.values()))
+
+    def unflatten(x: np.ndarray) -> dict[str, Tensor]:
+        flat, tensors = torch.as_tensor(x, dtype=like.dtype, device=like.device), {}
+        for key, shape in shapes.items():
+            tensors[key], flat = flat[: shape.numel()].reshape(shape), flat[shape.numel() :]
+        return tensors
+
+    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, grads = recorder(unflatten(x))
+        flat = torch.cat([grads[key].reshape(-1) for key in shapes])
+        return value, flat.to("cpu", torch.float64).numpy()
+
+    box = [bounds.get(key, (None, None)) for key, shape in shapes.items() for _ in range(shape.numel())]
+    result = scipy.optimize.minimize(
+        function,
+        torch.cat([value.detach().reshape(-1) for value in start.values()]).cpu().double().numpy(),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=box,
+        options={
+            "maxfun": options.max_evaluations,
+            "maxiter": options.max_evaluations,
+            "ftol": options.tolerance,
+            "gtol": 1e-5,
+            "maxcor": 30,
+        },
+    )
+    message = result.message if isinstance(result.message, str) else result.message.decode()
+    return bool(result.success), message
+
+
+def _adam(
+    recorder: _Recorder,
+    start: Mapping[str, Tensor],
+    options: LearningOptions,
+    analytical: frozenset[str],
+    bounds: Mapping[str, tuple[float, float]],
+) -> tuple[bool, str]:
+    tensors = {key: value.detach().clone() for key, value in start.items()}
+    optimizers = [
+        torch.optim.Adam([tensors[key] for key in keys], lr=rate)
+        for keys, rate in (
+            ([key for key in tensors if key not in analytical], options.learning_rate),
+            ([key for key in tensors if key in analytical], options.analytical_learning_rate),
+        )
+        if keys
+    ]
+    since = 0
+    for _ in range(options.max_evaluations):
+        best = recorder.value
+        value, grads = recorder(tensors)
+        since = 0 if value < best - options.tolerance * abs(best) or not np.isfinite(best) else since + 1
+        if since >= options.patience:
+            return True, f"no improvement within {options.patience} evaluations"
+        for key, tensor in tensors.items():
+            tensor.grad = grads[key]
+        for optimizer in optimizers:
+            optimizer.step()
+    return False, f"stopped after {options.max_evaluations} evaluations"

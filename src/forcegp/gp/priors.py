@@ -1,0 +1,235 @@
+"""Gaussian-process priors on unknown forces: where a force acts, on what it depends, how it varies."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem, Equations
+from forcegp.constraints.contact import SurfaceContact
+from forcegp.errors import ModelError, UnknownNameError
+from forcegp.gp.kernels import Kernel, SquaredExponential
+from forcegp.robot.model import RobotModel
+
+
+@dataclass(frozen=True)
+class States:
+    """A batch of robot states with what the equations of motion say there.
+
+    Attributes:
+        q, qd, tau: `(n, nq)`.
+        active: `(n, n_contacts)` bool.
+        eom: the equations of motion at these states.
+    """
+
+    q: Tensor
+    qd: Tensor
+    tau: Tensor
+    active: Tensor
+    eom: Equations
+
+
+def states(system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> States:
+    """Evaluate the equations of motion at a batch of states."""
+    return States(q, qd, tau, active, system.equations(q, qd, active))
+
+
+class ForcePrior(ABC):
+    """A zero-mean prior on an unknown force f(x), carried to generalized forces by a known operator E(x).
+
+    The generalized force is E(x) f(x). A prior with `in_contact_only` contributes to Q_z, the others to Q.
+    """
+
+    name: str
+    kernel: Kernel
+    in_contact_only: bool
+
+    @abstractmethod
+    def outputs(self, robot: RobotModel) -> int:
+        """Number of components of f."""
+
+    @abstractmethod
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        """Named inputs of the kernel `(n, w)`, before standardization."""
+
+    @abstractmethod
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        """E(x) `(n, nq, outputs)`."""
+
+    def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
+        """Raise a typed error where the prior does not fit the system."""
+
+
+@dataclass(frozen=True)
+class JointForcePrior(ForcePrior):
+    """An independent process for each joint's force Q_i (eq. 31), E = I.
+
+    Args:
+        kernel: covariance of each component.
+        inputs: which of `q`, `qd`, `tau` the force depends on.
+        periodic: replace the angle of each revolute joint by its sine and cosine.
+        name: prefix of the hyperparameters.
+
+    Raises:
+        UnknownNameError: an input is not one of the three.
+    """
+
+    kernel: Kernel = field(default_factory=SquaredExponential)
+    inputs: tuple[str, ...] = ("q", "qd", "tau")
+    periodic: bool = False
+    name: str = "joint"
+    in_contact_only: bool = False
+
+    def __post_init__(self) -> None:
+        for name in self.inputs:
+            if name not in ("q", "qd", "tau"):
+                raise UnknownNameError("input of a joint force prior", name, ("q", "qd", "tau"))
+
+    def outputs(self, robot: RobotModel) -> int:
+        return robot.nq
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        x = {name: getattr(at, name) for name in self.inputs}
+        if self.periodic and "q" in x:
+            turns = system.robot.revolute.bool()
+            angle = x["q"][:, turns]
+            x["q"] = torch.cat([torch.sin(angle), torch.cos(angle), x["q"][:, ~turns]], dim=-1)
+        return x
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
+
+
+@dataclass(frozen=True)
+class ContactForcePrior(ForcePrior):
+    """A prior on the Cartesian dissipative force F_z at a contact, tangential to the surface.
+
+    E = J_Eᵀ (1 − n nᵀ) where the contact is closed and 0 elsewhere; the inputs are the position and
+    velocity of the touching point.
+
+    Args:
+        contact: name of a surface contact of the system.
+        kernel: covariance of each Cartesian component.
+        inputs: which of `position`, `velocity` the force depends on.
+        name: prefix of the hyperparameters; the contact's name by default.
+    """
+
+    contact: str
+    kernel: Kernel = field(default_factory=SquaredExponential)
+    inputs: tuple[str, ...] = ("position", "velocity")
+    name: str = ""
+    in_contact_only: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or f"contact_{self.contact}")
+        for name in self.inputs:
+            if name not in ("position", "velocity"):
+                raise UnknownNameError("input of a contact force prior", name, ("position", "velocity"))
+
+    def check(self, system: ConstrainedSystem) -> None:
+        if not isinstance(system.contact(self.contact), SurfaceContact):
+            raise ModelError(
+                f"contact {self.contact!r} has no surface, so no tangential force",
+                expected="a SurfaceContact",
+                got=type(system.contact(self.contact)).__name__,
+            )
+
+    def outputs(self, robot: RobotModel) -> int:
+        return 3
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        point = at.eom.contact_points[self.contact]
+        return {name: getattr(point, name) for name in self.inputs}
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        point = at.eom.contact_points[self.contact]
+        n = torch.nn.functional.normalize(point.normal, dim=-1)
+        tangential = point.jacobian - n[..., :, None] * (n[..., None, :] @ point.jacobian)
+        closed = at.active[:, system.contact_names.index(self.contact)]
+        return torch.where(closed[:, None, None], tangential.mT, 0.0)
+
+
+@dataclass(frozen=True)
+class OperatorForcePrior(ForcePrior):
+    """A prior on any force, carried by a user-given operator ("any analytical tensor of appropriate size").
+
+    Args:
+        name: prefix of the hyperparameters.
+        size: number of components of f.
+        operator_function: maps `(system, states)` to E(x) `(n, nq, size)`.
+        feature_function: maps `(system, states)` to named inputs `(n, w)`; q, q̇, τ by default.
+        kernel: covariance of each component.
+        in_contact_only: whether the force belongs to Q_z.
+    """
+
+    name: str
+    size: int
+    operator_function: Callable[[ConstrainedSystem, States], Tensor]
+    feature_function: Callable[[ConstrainedSystem, States], dict[str, Tensor]] | None = None
+    kernel: Kernel = field(default_factory=SquaredExponential)
+    in_contact_only: bool = False
+
+    def outputs(self, robot: RobotModel) -> int:
+        return self.size
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        if self.feature_function is None:
+            return {"q": at.q, "qd": at.qd, "tau": at.tau}
+        return self.feature_function(system, at)
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        E = self.operator_function(system, at)
+        expected = (len(at.q), at.q.shape[-1], self.size)
+        if tuple(E.shape) != expected:
+            raise ModelError(
+                f"the operator of force prior {self.name!r} has the wrong shape",
+                expected=expected,
+                got=tuple(E.shape),
+            )
+        return E
+
+
+def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> None:
+    """Check that priors fit a system and have names of their own.
+
+    Raises:
+        ModelError: no prior is given, or two share a name.
+        UnknownNameError: a prior names a contact that the system has not.
+    """
+    names = [prior.name for prior in priors]
+    if not names or len(set(names)) != len(names):
+        raise ModelError("force priors need distinct names, and one at least", got=names)
+    for prior in priors:
+        prior.check(system)
+
+
+@dataclass(frozen=True)
+class Standardization:
+    """Shift and scale of each named input, x ↦ (x − mean)/std, from training data.
+
+    Inputs that are constant to rounding keep the scale 1, and are listed in `constant`.
+    """
+
+    mean: Mapping[str, Tensor]
+    std: Mapping[str, Tensor]
+    constant: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, features: Mapping[str, Tensor]) -> Standardization:
+        """Mean and standard deviation of each column."""
+        mean = {name: x.mean(0) for name, x in features.items()}
+        std, constant = {}, []
+        for name, x in features.items():
+            spread = x.std(0, correction=0)
+            fixed = spread <= 1e-12 * (1.0 + mean[name].abs())
+            constant += [f"{name}[{i}]" for i in fixed.nonzero()[:, 0].tolist()]
+            std[name] = torch.where(fixed, 1.0, spread)
+        return cls(mean, std, tuple(constant))
+
+    def apply(self, features: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The standardized features."""
+        return {name: (x - self.mean[name]) / self.std[name] for name, x in features.items()}

@@ -1,0 +1,125 @@
+"""Measurements as rows with unit white noise, the noise-free constraint directions projected out.
+
+Where q̈ is measured in contact, A q̈ = b leaves the part of q̈ in the range of Aᵀ without any unknown
+force: it is prior mean plus white noise. With an orthonormal basis U of the null space of A (after
+scaling by the noise), Uᵀ q̈ carries the whole Gaussian process, in nq − rank A rows a sample, and the
+likelihood splits exactly into the two parts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.gp.affine import AffineMap, affine_map
+from forcegp.gp.gram import Block
+from forcegp.gp.priors import ForcePrior, Standardization, States, states
+from forcegp.linalg import RANK_TOLERANCE, null_space_basis
+
+ForceMean = Callable[[ConstrainedSystem, States], Tensor]
+"""Prior mean of the joint force Q at states, `(n, nq)`."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Values of one quantity at states.
+
+    Attributes:
+        quantity: name, as in `QUANTITIES`.
+        q, qd, tau: `(n, nq)` states.
+        active: `(n, n_contacts)` bool.
+        values: `(n, d)`.
+    """
+
+    quantity: str
+    q: Tensor
+    qd: Tensor
+    tau: Tensor
+    active: Tensor
+    values: Tensor
+
+
+@dataclass(frozen=True)
+class WhitenedRows:
+    """The rows of all measurements, and the part of the likelihood that no latent force touches.
+
+    Attributes:
+        blocks: rows that the latent forces explain.
+        constant: negative log likelihood of the rest, with the noise's normalisation.
+    """
+
+    blocks: list[Block]
+    constant: Tensor
+
+
+def prior_operators(
+    priors: Sequence[ForcePrior], system: ConstrainedSystem, at: States, z: AffineMap
+) -> list[Tensor]:
+    """B(x) E(x) of each prior, from its components to the quantity, `(n, d, components)`."""
+    return [(z.B_z if p.in_contact_only else z.B_Q) @ p.operator(system, at) for p in priors]
+
+
+def prior_mean(system: ConstrainedSystem, at: States, z: AffineMap, mean: ForceMean) -> Tensor:
+    """o(x) + B(x) m(x), `(n, d)`."""
+    return z.o + (z.B_Q @ mean(system, at)[..., None])[..., 0]
+
+
+def _split(A: Tensor, rank: int) -> tuple[Tensor, Tensor]:
+    """Null-space basis of A, and A⁺."""
+    return null_space_basis(A, rank), torch.linalg.pinv(A, rtol=RANK_TOLERANCE)
+
+
+def whiten(
+    system: ConstrainedSystem,
+    priors: Sequence[ForcePrior],
+    scales: Sequence[Standardization],
+    mean: ForceMean,
+    measurement: Measurement,
+    noise_std: Tensor,
+) -> WhitenedRows:
+    """Rows of one measurement, divided by its noise, without noise-free directions.
+
+    Args:
+        system: robot and contacts.
+        priors, scales: the force priors and the standardization of their inputs.
+        mean: prior mean of Q.
+        measurement: what was measured.
+        noise_std: `(d,)` standard deviation of each component.
+    """
+    at = states(system, measurement.q, measurement.qd, measurement.tau, measurement.active)
+    z = affine_map(system, at, measurement.quantity)
+    residual = (measurement.values - prior_mean(system, at, z, mean)) / noise_std
+    operators = [W / noise_std[:, None] for W in prior_operators(priors, system, at, z)]
+    features = [scale.apply(prior.features(system, at)) for prior, scale in zip(priors, scales, strict=True)]
+    constant = len(residual) * noise_std.log().sum()
+    if measurement.quantity != "qdd" or system.m == 0:
+        return WhitenedRows([Block(tuple(features), tuple(operators), residual)], constant)
+    A = at.eom.A * noise_std
+    blocks = []
+    rank = at.eom.rank
+    for value in rank.unique().tolist():
+        own = (rank == value).nonzero()[:, 0]
+        U, pinv = _split(A[own], value)
+        violated = ((at.eom.A[own] @ measurement.values[own][..., None])[..., 0] - at.eom.b[own])[..., None]
+        constant = (
+            constant + 0.5 * ((pinv @ violated) ** 2).sum() + 0.5 * value * len(own) * math.log(2 * math.pi)
+        )
+        blocks.append(
+            Block(
+                tuple({name: x[own] for name, x in f.items()} for f in features),
+                tuple(U.mT @ W[own] for W in operators),
+                (U.mT @ residual[own][..., None])[..., 0],
+            )
+        )
+    return WhitenedRows(blocks, constant)
+
+
+def combine(rows: Sequence[WhitenedRows]) -> WhitenedRows:
+    """The rows of several measurements together."""
+    constant = torch.stack([r.constant for r in rows]).sum()
+    return WhitenedRows([block for r in rows for block in r.blocks], constant)

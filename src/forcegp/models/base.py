@@ -1,0 +1,120 @@
+"""What every regression model of the forward dynamics has in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
+from forcegp.errors import ModelError
+
+FitProgress = Callable[[int, int, float], None]
+"""Called with the evaluations made, the most that will be made, and the objective."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A predicted quantity at a batch of states.
+
+    Attributes:
+        mean: `(*batch, d)`.
+        covariance: `(*batch, d, d)` of the noise-free quantity, or `None` where the model gives none
+            or it was not asked for.
+        parts: the slice of each quantity, where several were asked for.
+    """
+
+    mean: Tensor
+    covariance: Tensor | None = None
+    parts: dict[str, slice] = field(default_factory=dict)
+
+    @property
+    def variance(self) -> Tensor | None:
+        """`(*batch, d)`, the diagonal of the covariance."""
+        return None if self.covariance is None else self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)
+
+    @property
+    def std(self) -> Tensor | None:
+        """`(*batch, d)` standard deviation."""
+        variance = self.variance
+        return None if variance is None else variance.sqrt()
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """How a fit went.
+
+    Attributes:
+        converged: whether the optimiser reached its tolerance.
+        evaluations: of the objective.
+        seconds: how long the fit took.
+        objective: final value (mean squared error, or negative log posterior of the hyperparameters).
+        log_marginal_likelihood: of the training data, `None` for models without one.
+        jitter: added to the covariance's diagonal to factorise it, relative to unit noise.
+        constant_inputs: inputs that do not vary in the training data and were left unscaled.
+        message: why the optimiser stopped.
+        history: the objective at each evaluation.
+    """
+
+    converged: bool
+    evaluations: int
+    seconds: float
+    objective: float
+    log_marginal_likelihood: float | None = None
+    jitter: float = 0.0
+    constant_inputs: tuple[str, ...] = ()
+    message: str = ""
+    history: tuple[float, ...] = ()
+
+
+class Model(ABC):
+    """A forward dynamics (q, q̇, τ) ↦ q̈ learned from a data set."""
+
+    kind: str
+    """Name of the class of models in saved files."""
+    system: ConstrainedSystem
+
+    @abstractmethod
+    def fit(self, data: Dataset, *, progress: FitProgress | None = None) -> FitResult:
+        """Learn from a data set."""
+
+    @abstractmethod
+    def predict(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str = "qdd",
+        *,
+        active: Tensor | None = None,
+        covariance: bool = True,
+    ) -> Prediction:
+        """Predict a quantity at states `(*batch, nq)`; `active` `(*batch, n_contacts)` defaults to all."""
+
+    @abstractmethod
+    def save(self, path: str | Path) -> None:
+        """Write the model as a folder of safetensors and versioned JSON."""
+
+
+def only_qdd(model: Model, quantity: object) -> None:
+    """Refuse quantities that a model of accelerations alone cannot give.
+
+    Raises:
+        ModelError: the quantity is not `qdd`.
+    """
+    if quantity != "qdd":
+        raise ModelError(
+            f"a {model.kind!r} model predicts accelerations only",
+            expected="qdd",
+            got=quantity,
+            hint="use StructuredGP for forces and multipliers",
+        )
+
+
+def not_fitted(model: Model) -> ModelError:
+    """The error of a model that is asked for predictions before it has data."""
+    return ModelError(f"this {model.kind!r} model has not been fitted", hint="call model.fit(data) first")
