@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     )
     from forcegp.data import Dataset, SavitzkyGolay
     from forcegp.robot import RobotModel, load_robot
+    from forcegp.scene import Scene, load_scene
 
 _HOME = {
     "Baumgarte": "constraints",
@@ -32,11 +33,13 @@ _HOME = {
     "PointConnection": "constraints",
     "RobotModel": "robot",
     "SavitzkyGolay": "data",
+    "Scene": "scene",
     "Sphere": "constraints",
     "SurfaceContact": "constraints",
     "dynamics": "",
     "kinematics": "",
     "load_robot": "robot",
+    "load_scene": "scene",
 }
 """The subpackage of each public name; empty where the name is a module itself."""
 
@@ -50,11 +53,13 @@ __all__ = [
     "PointConnection",
     "RobotModel",
     "SavitzkyGolay",
+    "Scene",
     "Sphere",
     "SurfaceContact",
     "dynamics",
     "kinematics",
     "load_robot",
+    "load_scene",
 ]
 
 
