@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from forcegp import kinematics
+from forcegp.constraints.gauss import Equations
 from forcegp.errors import NumericalError
+from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointVector, Rotation, Vector3
 
@@ -39,8 +41,8 @@ class Gains:
     position_damping: float = 20.0
     orientation_stiffness: float = 100.0
     orientation_damping: float = 20.0
-    posture_stiffness: float = 10.0
-    posture_damping: float = 6.0
+    posture_stiffness: float = 16.0
+    posture_damping: float = 8.0
 
 
 class ToolMotion(NamedTuple):
@@ -80,18 +82,19 @@ class Target(NamedTuple):
 
 
 def tool_motion(
-    robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: Sequence[float]
+    robot: RobotModel,
+    poses: LinkPoses,
+    motion: LinkMotion,
+    qd: JointVector,
+    frame: str,
+    point: Sequence[float],
 ) -> ToolMotion:
-    """Pose, twist, Jacobian and bias acceleration of the tool point, from one pass over the links.
+    """Pose, twist, Jacobian and bias acceleration of the tool point, from links whose motion is known.
 
     Raises:
         UnknownNameError: no such frame.
-        ShapeError: q or qd does not fit the robot.
     """
-    robot.check_state(qd=qd)
     index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
-    poses = kinematics.link_poses(robot, q)
-    motion = kinematics.link_motion(robot, poses, qd)
     J = kinematics.jacobian_of_poses(robot, poses, index, x)
     return ToolMotion(
         rotation=kinematics.rotation_of_poses(robot, poses, index),
@@ -148,20 +151,13 @@ def joint_acceleration(tool: ToolMotion, task: Tensor, posture: JointVector) -> 
 
 
 def control_torque(
-    tool: ToolMotion,
-    M: Tensor,
-    Q_K: JointVector,
-    q: JointVector,
-    qd: JointVector,
-    target: Target,
-    gains: Gains,
+    tool: ToolMotion, eom: Equations, q: JointVector, qd: JointVector, target: Target, gains: Gains
 ) -> JointVector:
     """Motor torque Q_u = M y − Q_K + J_Eᵀ F of task-space inverse dynamics control, before any limit.
 
     Args:
         tool: the tool at the state.
-        M: `(*batch, nq, nq)` mass matrix.
-        Q_K: `(*batch, nq)` known joint force Q_C + Q_G + Q_D [N m].
+        eom: the equations of motion at the state; M and Q_K = Q_C + Q_G + Q_D are used.
         q, qd: `(*batch, nq)` the state.
         target: what is to be reached; F is its `push`.
         gains: feedback gains.
@@ -175,4 +171,4 @@ def control_torque(
     posture = gains.posture_stiffness * (target.posture - q) - gains.posture_damping * qd
     y = joint_acceleration(tool, task_acceleration(tool, target, gains), posture)
     push = (tool.jacobian[..., 3:, :].mT @ target.push[..., None])[..., 0]
-    return (M @ y[..., None])[..., 0] - Q_K + push
+    return (eom.M @ y[..., None])[..., 0] - eom.Q_K + push

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from torch import Tensor
-
-from forcegp.errors import ForceGPError, MissingDependencyError, UnknownNameError
+from forcegp.errors import MissingDependencyError, UnknownNameError
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointMatrix, JointVector
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,21 +26,17 @@ class MuJoCoEngine:
     """
 
     def __init__(self, robot: RobotModel, dt: float) -> None:
-        try:
-            import mujoco
-        except ImportError:
-            raise MissingDependencyError(
-                "the engine 'mujoco' needs the package mujoco", hint="pip install mujoco"
-            ) from None
-        self._mujoco, self._robot = mujoco, robot
+        self._mujoco = mujoco = _import_mujoco()
+        self._robot = robot
         self._model = model = mujoco.MjModel.from_xml_string(write_urdf(robot))
         model.opt.timestep = dt
         model.opt.gravity[:] = robot.gravity.numpy()
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+        self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
+        model.dof_armature[self._dof] = robot.armature.numpy()
         self._data = mujoco.MjData(model)
         self._scratch = mujoco.MjData(model)
-        self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
 
     @property
     def name(self) -> str:
@@ -83,9 +81,20 @@ class MuJoCoEngine:
     def close(self) -> None:
         """Nothing to give back: MuJoCo holds no process."""
 
-    def _set(self, data: object, q: JointVector, qd: JointVector) -> None:
-        data.qpos[self._dof] = q.numpy()  # pyright: ignore[reportAttributeAccessIssue]
-        data.qvel[self._dof] = qd.numpy()  # pyright: ignore[reportAttributeAccessIssue]
+    def _set(self, data: Any, q: JointVector, qd: JointVector) -> None:
+        data.qpos[self._dof] = q.numpy()
+        data.qvel[self._dof] = qd.numpy()
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.tensor(values, dtype=self._robot.dtype)
+
+
+def _import_mujoco() -> Any:
+    # MuJoCo's classes live in a compiled module that has no stubs.
+    try:
+        import mujoco
+    except ImportError:
+        raise MissingDependencyError(
+            "the engine 'mujoco' needs the package mujoco", hint="pip install mujoco"
+        ) from None
+    return mujoco

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import torch
 
-from forcegp.errors import MissingDependencyError
+from forcegp.errors import MissingDependencyError, UnsupportedRobotError
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.urdf import write_urdf
 from forcegp.types import JointMatrix, JointVector
@@ -27,10 +27,12 @@ class PyBulletEngine:
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
+        UnsupportedRobotError: a drive has inertia of its own, which PyBullet has no place for.
     """
 
     def __init__(self, robot: RobotModel, dt: float) -> None:
         self._bullet = bullet = _import_pybullet()
+        _check_armature(robot)
         self._robot, self._dt = robot, dt
         self._client = bullet.connect(bullet.DIRECT)
         bullet.setTimeStep(dt, physicsClientId=self._client)
@@ -64,7 +66,11 @@ class PyBulletEngine:
         """Advance by dt under the generalized force `(nq,)`."""
         bullet = self._bullet
         bullet.setJointMotorControlArray(
-            self._body, self._joints, bullet.TORQUE_CONTROL, forces=force.tolist(), physicsClientId=self._client
+            self._body,
+            self._joints,
+            bullet.TORQUE_CONTROL,
+            forces=force.tolist(),
+            physicsClientId=self._client,
         )
         bullet.stepSimulation(physicsClientId=self._client)
 
@@ -128,6 +134,17 @@ class PyBulletEngine:
     def _ordered(self, values: JointVector) -> list[float]:
         ordered = sorted(zip(self._joints, values.tolist(), strict=True))
         return [value for _, value in ordered]
+
+
+def _check_armature(robot: RobotModel) -> None:
+    for joint, armature in zip(robot.joint_names, robot.armature.tolist(), strict=True):
+        if armature != 0.0:
+            raise UnsupportedRobotError(
+                f"joint {joint!r} of robot {robot.name!r} has a drive with inertia",
+                expected="armature 0, as PyBullet has no place for it",
+                got=armature,
+                hint='use the engine "mujoco"',
+            )
 
 
 def _import_pybullet() -> ModuleType:

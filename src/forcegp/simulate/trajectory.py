@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forcegp.constraints.surface import Surface
+from forcegp.constraints.surface import Plane, Surface
 from forcegp.errors import ForceGPError
 
 PROJECTION_STEPS = 8
@@ -41,12 +41,14 @@ class Trapezoid(NamedTuple):
         left = self.travel_time - t
         a, blend = self.acceleration, self.blend_time
         starting, stopping = t < blend, left < blend
+
+        def pick(start: Tensor, stop: Tensor, between: Tensor) -> Tensor:
+            return torch.where(starting, start, torch.where(stopping, stop, between))
+
         cruise = a * blend
-        distance = torch.where(
-            starting, 0.5 * a * t**2, torch.where(stopping, self.length - 0.5 * a * left**2, cruise * (t - 0.5 * blend))
-        )
-        speed = torch.where(starting, a * t, torch.where(stopping, a * left, cruise))
-        rate = torch.where(starting, a, torch.where(stopping, -a, 0.0))
+        distance = pick(0.5 * a * t**2, self.length - 0.5 * a * left**2, cruise * (t - 0.5 * blend))
+        speed = pick(a * t, a * left, cruise)
+        rate = pick(a, -a, torch.zeros_like(a))
         return distance, speed, rate
 
 
@@ -82,7 +84,8 @@ class Chart:
     Args:
         center: `(3,)` origin, on the surface where there is one [m].
         axes: `(3, 3)` rows: directions of u, v, and the normal at the centre.
-        surface: what u and v are laid onto; `None` is free space, where the chart is linear.
+        surface: the curved surface that u and v are laid onto; `None` where the chart is linear, on a
+            plane and in free space.
     """
 
     center: Tensor
@@ -101,7 +104,8 @@ class Chart:
             normal = torch.nn.functional.normalize(surface.gradient(center), dim=-1)
         ahead = torch.eye(3, dtype=center.dtype)[int(normal[0].abs() > 0.9)]
         u = torch.nn.functional.normalize(ahead - (ahead @ normal) * normal, dim=-1)
-        return Chart(center, torch.stack([u, torch.linalg.cross(normal, u), normal]), surface)
+        axes = torch.stack([u, torch.linalg.cross(normal, u), normal])
+        return Chart(center, axes, None if isinstance(surface, Plane) else surface)
 
     def point(self, w: Tensor) -> Tensor:
         """World position `(*batch, 3)` of chart coordinates w `(*batch, 3)`."""
@@ -113,15 +117,18 @@ class Chart:
 
     def motion(self, w: Tensor, wd: Tensor, wdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Position, velocity and acceleration in the world of a motion of the chart, `(n, 3)` each."""
+        if self.surface is None:
+            return self.point(w), wd @ self.axes, wdd @ self.axes
 
         def at(s: Tensor) -> Tensor:
             return self.point(w + s * wd + 0.5 * s**2 * wdd)
 
-        def rate(s: Tensor) -> tuple[Tensor, Tensor]:
-            return torch.func.jvp(at, (s,), (torch.ones_like(s),))
+        def rate(s: Tensor) -> Tensor:
+            return torch.func.jvp(at, (s,), (torch.ones_like(s),))[1]
 
         now = torch.zeros(len(w), 1, dtype=w.dtype)
-        (position, velocity), (_, acceleration) = torch.func.jvp(rate, (now,), (torch.ones_like(now),))
+        position = self.point(w)
+        velocity, acceleration = torch.func.jvp(rate, (now,), (torch.ones_like(now),))[:2]
         return position, velocity, acceleration
 
 

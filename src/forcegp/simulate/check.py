@@ -1,0 +1,122 @@
+"""Does an engine obey the same equations of motion as we do?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp import dynamics
+from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.simulate.engine import Engine
+from forcegp.types import JointVector
+
+CHUNK = 8192
+"""States whose equations are held in memory at once."""
+
+
+@dataclass(frozen=True)
+class EngineCheck:
+    """Largest differences between an engine and our library on random states.
+
+    Attributes:
+        engine: name and version.
+        states: number of states compared.
+        mass_matrix: [kg m²].
+        inverse_dynamics: [N m].
+        free_acceleration: of one step under a random force [rad/s²].
+        constrained_acceleration: of one step with the constraint force and joint friction applied [rad/s²].
+    """
+
+    engine: str
+    states: int
+    mass_matrix: float
+    inverse_dynamics: float
+    free_acceleration: float
+    constrained_acceleration: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.engine}, {self.states} random states, largest differences: "
+            f"mass matrix {self.mass_matrix:.1e} kg m², inverse dynamics {self.inverse_dynamics:.1e} N m, "
+            f"free acceleration {self.free_acceleration:.1e} rad/s², "
+            f"constrained acceleration {self.constrained_acceleration:.1e} rad/s²"
+        )
+
+
+def check_engine(
+    system: ConstrainedSystem, engine: Engine, generator: torch.Generator, states: int = 50
+) -> EngineCheck:
+    """Compare an engine with our library on random states.
+
+    Args:
+        system: robot and contacts.
+        engine: holds the same robot.
+        generator: source of the states: angles in ±π, speeds and accelerations of some rad/s and rad/s².
+        states: how many.
+
+    Returns:
+        The largest differences.
+    """
+    robot = system.robot
+
+    def draw(scale: float) -> Tensor:
+        return scale * torch.randn(states, robot.nq, dtype=torch.float64, generator=generator).to(robot.dtype)
+
+    with torch.no_grad():
+        q, qd, qdd, force = draw(1.0).clamp(-1.0, 1.0) * math.pi, draw(1.0), draw(5.0), draw(20.0)
+        eom = system.equations(q, qd)
+        Q_bar = eom.Q_K + force
+        held = force + eom.Q_D + eom.constraint_force(Q_bar)
+        return EngineCheck(
+            engine=engine.name,
+            states=states,
+            mass_matrix=_largest(torch.stack([engine.mass_matrix(x) for x in q]) - eom.M),
+            inverse_dynamics=_largest(
+                torch.stack([engine.inverse_dynamics(*x) for x in zip(q, qd, qdd, strict=True)])
+                - dynamics.inverse_dynamics(robot, q, qd, qdd)
+            ),
+            free_acceleration=_largest(
+                _step(engine, q, qd, force) - dynamics.forward_dynamics(robot, q, qd, force)
+            ),
+            constrained_acceleration=_largest(_step(engine, q, qd, held) - eom.acceleration(Q_bar)),
+        )
+
+
+def acceleration_mismatch(
+    system: ConstrainedSystem,
+    q: JointVector,
+    qd: JointVector,
+    qdd: JointVector,
+    Q_bar: JointVector,
+    active: Tensor,
+) -> float:
+    """Largest difference between logged accelerations and L b + H Q̄ of our equations [rad/s²].
+
+    Args:
+        system: robot and contacts.
+        q, qd, qdd: `(n, nq)` logged motion, without noise.
+        Q_bar: `(n, nq)` impressed forces Q + Q_z.
+        active: `(n, n_contacts)` closed contacts.
+    """
+    worst = 0.0
+    for rows in torch.arange(len(q)).split(CHUNK):
+        ours = system.equations(q[rows], qd[rows], active=active[rows]).acceleration(Q_bar[rows])
+        worst = max(worst, _largest(ours - qdd[rows]))
+    return worst
+
+
+def _step(engine: Engine, q: Tensor, qd: Tensor, force: Tensor) -> Tensor:
+    """Accelerations of one step from each state."""
+    accelerations = []
+    for state in zip(q, qd, force, strict=True):
+        engine.reset(state[0], state[1])
+        engine.step(state[2])
+        accelerations.append((engine.state()[1] - state[1]) / engine.dt)
+    return torch.stack(accelerations)
+
+
+def _largest(difference: Tensor) -> float:
+    return float(difference.abs().max())

@@ -1,0 +1,196 @@
+"""What a simulated run leaves behind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp import kinematics
+from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.data.dataset import Dataset
+from forcegp.data.header import DataHeader
+from forcegp.simulate.check import acceleration_mismatch
+from forcegp.simulate.config import SimulationConfig
+from forcegp.simulate.control import tool_motion
+from forcegp.simulate.plan import Plan
+from forcegp.simulate.touch import Touch
+from forcegp.simulate.trajectory import Reference
+
+
+@dataclass(frozen=True)
+class Log:
+    """What is written down at every step.
+
+    Attributes:
+        q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)`; qdd is the engine's acceleration, without noise.
+        multiplier, c: `(n, m)`.
+        contact: `(n, n_contacts)` bool.
+        saturated: `(n,)` bool, a torque limit was hit.
+    """
+
+    q: Tensor
+    qd: Tensor
+    qdd: Tensor
+    tau: Tensor
+    Q: Tensor
+    Q_I: Tensor
+    Q_z: Tensor
+    multiplier: Tensor
+    c: Tensor
+    contact: Tensor
+    saturated: Tensor
+
+    @staticmethod
+    def empty(steps: int, system: ConstrainedSystem) -> Log:
+        """Room for a number of steps."""
+
+        def columns(width: int, dtype: torch.dtype = system.robot.dtype) -> Tensor:
+            return torch.zeros(steps, width, dtype=dtype)
+
+        nq, m = system.robot.nq, system.m
+        return Log(
+            q=columns(nq),
+            qd=columns(nq),
+            qdd=columns(nq),
+            tau=columns(nq),
+            Q=columns(nq),
+            Q_I=columns(nq),
+            Q_z=columns(nq),
+            multiplier=columns(m),
+            c=columns(m),
+            contact=columns(len(system.contacts), torch.bool),
+            saturated=torch.zeros(steps, dtype=torch.bool),
+        )
+
+    def write(self, k: int, q: Tensor, qd: Tensor, Q_u: Tensor, touch: Touch, *, saturated: bool) -> None:
+        """Write down step k, all but the acceleration, which is known a step later."""
+        self.q[k], self.qd[k], self.tau[k], self.Q[k] = q, qd, Q_u, touch.Q
+        self.Q_I[k], self.Q_z[k], self.multiplier[k] = touch.Q_I, touch.Q_z, touch.multiplier
+        self.c[k], self.contact[k], self.saturated[k] = touch.c, touch.closed, saturated
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """A simulated run.
+
+    Attributes:
+        data: the log as a data set.
+        reference: the planned motion of the tool point.
+        position, velocity, acceleration: `(n, 3)` its actual motion in the world [m], [m/s], [m/s²].
+        c: `(n, m)` constraint error [m].
+        saturated: samples in which a torque limit was hit.
+        beyond_limits: samples in which a joint was outside its limits.
+        acceleration_mismatch: largest difference between the engine's accelerations and ours [rad/s²].
+        engine: name and version of the engine.
+    """
+
+    data: Dataset
+    reference: Reference
+    position: Tensor
+    velocity: Tensor
+    acceleration: Tensor
+    c: Tensor
+    saturated: int
+    beyond_limits: int
+    acceleration_mismatch: float
+    engine: str
+
+    def summary(self) -> dict[str, float | int | str]:
+        """Figures on the run, by name, with their units in the name."""
+        touching = torch.stack(list(self.data.contact.values()), dim=-1) if self.data.contact else None
+        figures: dict[str, float | int | str] = {
+            "engine": self.engine,
+            "samples": len(self.data),
+            "tracking_error_m": float((self.position - self.reference.position).norm(dim=-1).max()),
+            "tool_speed_m_s": float(self.velocity.norm(dim=-1).max()),
+            "torque_Nm": float(self.data.tau.abs().max()),
+            "acceleration_mismatch_rad_s2": self.acceleration_mismatch,
+            "saturated_samples": self.saturated,
+            "beyond_joint_limits_samples": self.beyond_limits,
+            "lengthened_segments": self.reference.lengthened,
+        }
+        if touching is not None and bool(touching.any()):
+            force = torch.stack(list(self.data.contact_extras["multiplier"].values()), dim=-1)[touching]
+            figures |= {
+                "constraint_error_m": float(self.c[touching].abs().max()),
+                "multiplier_min_N": float(force.min()),
+                "multiplier_max_N": float(force.max()),
+                "in_contact_fraction": float(touching.float().mean()),
+            }
+        return figures
+
+
+def make_result(
+    system: ConstrainedSystem,
+    config: SimulationConfig,
+    plan: Plan,
+    log: Log,
+    engine: str,
+    generator: torch.Generator,
+) -> SimulationResult:
+    """The result of a run from its log."""
+    robot = system.robot
+    poses = kinematics.link_poses(robot, log.q)
+    motion = kinematics.link_motion(robot, poses, log.qd)
+    tool = tool_motion(robot, poses, motion, log.qd, plan.frame, plan.point)
+    beyond = ((log.q < robot.lower) | (log.q > robot.upper)).any(-1)
+    return SimulationResult(
+        data=_dataset(system, config, plan, log, engine, generator),
+        reference=plan.reference,
+        position=tool.position,
+        velocity=tool.twist[:, 3:],
+        acceleration=((tool.jacobian @ log.qdd[..., None])[..., 0] + tool.bias)[:, 3:],
+        c=log.c,
+        saturated=int(log.saturated.sum()),
+        beyond_limits=int(beyond.sum()),
+        acceleration_mismatch=acceleration_mismatch(
+            system, log.q, log.qd, log.qdd, log.Q + log.Q_z, log.contact
+        ),
+        engine=engine,
+    )
+
+
+def _dataset(
+    system: ConstrainedSystem,
+    config: SimulationConfig,
+    plan: Plan,
+    log: Log,
+    engine: str,
+    generator: torch.Generator,
+) -> Dataset:
+    robot, names = system.robot, system.contact_names
+    noise = torch.randn(log.qdd.shape, dtype=torch.float64, generator=generator).to(robot.dtype)
+    header = DataHeader(
+        dt=config.dt,
+        noise_std=config.noise_std,
+        robot=robot.name,
+        robot_fingerprint=robot.fingerprint,
+        seed=config.seed,
+        provenance=(f"simulated for {config.duration:g} s with {engine}",),
+        joint_names=robot.joint_names,
+        contact_names=names,
+    )
+    return Dataset(
+        t=plan.reference.t,
+        q=log.q,
+        qd=log.qd,
+        qdd=log.qdd + config.noise_std * noise,
+        tau=log.tau,
+        joint_names=robot.joint_names,
+        contact={name: log.contact[:, i] for i, name in enumerate(names)},
+        extras={"qdd_clean": log.qdd, "Q": log.Q, "Q_z": log.Q_z, "Q_I": log.Q_I},
+        contact_extras=_multipliers(system, log),
+        header=header,
+    )
+
+
+def _multipliers(system: ConstrainedSystem, log: Log) -> dict[str, dict[str, Tensor]]:
+    """λ by contact, for constraints of one row."""
+    if not system.contacts:
+        return {}
+    parts = log.multiplier.split([contact.rows for contact in system.contacts], dim=-1)
+    named = zip(system.contacts, parts, strict=True)
+    single = {contact.name: part[:, 0] for contact, part in named if contact.rows == 1}
+    return {"multiplier": single} if single else {}
