@@ -43,6 +43,13 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
     )
 
 
+def skew(v: Tensor) -> Tensor:
+    """`(3, 3, …)` matrices [v]× with [v]× w = v × w."""
+    x, y, z = v
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).unflatten(0, (3, 3))
+
+
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """Σ_k a_k b_k over the first dimension, broadcasting over the others."""
     total = a[0] * b[0]

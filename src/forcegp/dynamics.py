@@ -50,10 +50,8 @@ def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
 def _mass_matrix(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
     """`mass_matrix_of_poses` with the batch last, `(nq, nq, B)`."""
     E, S, L = robot.ancestors, poses.angular, poses.linear
-    mass, moment = E.mT @ links.mass, sum_over(E.mT, links.moment)
-    inertia = sum_over(E.mT, links.inertia)
-    angular = apply(inertia, S) + cross(moment, L)
-    linear = mass * L - cross(moment, S)
+    whole = LinkInertia(E.mT @ links.mass, sum_over(E.mT, links.moment), sum_over(E.mT, links.inertia))
+    angular, linear = momentum(whole, S, L)
     M = dot(torch.cat([S, L]).unsqueeze(2), torch.cat([angular, linear]).unsqueeze(1))
     strictly = torch.tril(E, -1)
     upper = torch.addcmul(torch.diag(robot.armature)[..., None], M, E.mT[..., None])
@@ -61,7 +59,7 @@ def _mass_matrix(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Ten
 
 
 def mass_matrix_of_poses(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> JointMatrix:
-    """M_ij = s_iᵀ I^c_j s_j for i an ancestor of j, with the composite inertias I^c = Eᵀ I, plus the drives."""
+    """M_ij = s_iᵀ I^c_j s_j for i an ancestor of j, composite inertias I^c = Eᵀ I, plus the drives."""
     return batch_first(_mass_matrix(robot, poses, links), poses.batch)
 
 
@@ -77,24 +75,23 @@ def gravity_force_of_poses(robot: RobotModel, poses: LinkPoses, links: LinkInert
     return batch_first(_gravity_force(robot, poses, links), poses.batch)
 
 
-def _newton_euler(
-    robot: RobotModel,
-    poses: LinkPoses,
-    links: LinkInertia,
-    motion: LinkMotion,
-    alpha: Tensor,
-    acceleration: Tensor,
-) -> Tensor:
-    """Joint forces sᵀ Eᵀ (I a + V ×* I V), `(nq, B)`, that links moving at V with acceleration a need."""
+def momentum(links: LinkInertia, w: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Inertia times a motion vector [w; v], `(3, nq, B)` each: [I w + h × v; m v − h × w]."""
+    return apply(links.inertia, w) + cross(links.moment, v), links.mass * v - cross(links.moment, w)
 
-    def momentum(w: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        turning = apply(links.inertia, w) + cross(links.moment, v)
-        return turning, links.mass * v - cross(links.moment, w)
 
-    n, l = momentum(motion.omega, motion.velocity)
-    torque, force = momentum(alpha, acceleration)
+def link_force(
+    links: LinkInertia, motion: LinkMotion, alpha: Tensor, acceleration: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Torque and force I a + V ×* I V, `(3, nq, B)`, that links moving at V with acceleration a need."""
+    n, l = momentum(links, motion.omega, motion.velocity)
+    torque, force = momentum(links, alpha, acceleration)
     torque = torque + cross(motion.omega, n) + cross(motion.velocity, l)
-    force = force + cross(motion.omega, l)
+    return torque, force + cross(motion.omega, l)
+
+
+def _joint_force(robot: RobotModel, poses: LinkPoses, torque: Tensor, force: Tensor) -> Tensor:
+    """Joint forces sᵀ Eᵀ [torque; force], `(nq, B)`, that hold forces on the links."""
     Et = robot.ancestors.mT
     return dot(poses.angular, sum_over(Et, torque)) + dot(poses.linear, sum_over(Et, force))
 
@@ -103,8 +100,18 @@ def bias_force_of_motion(
     robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion
 ) -> JointVector:
     """Q_C from link motion already known."""
-    force = _newton_euler(robot, poses, links, motion, motion.alpha, motion.acceleration)
-    return batch_first(-force, poses.batch)
+    torque, force = link_force(links, motion, motion.alpha, motion.acceleration)
+    return batch_first(-_joint_force(robot, poses, torque, force), poses.batch)
+
+
+def equation_of_motion(
+    robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion
+) -> tuple[Tensor, Tensor]:
+    """M `(nq, nq, B)` and −(Q_C + Q_G) `(nq, B)` of M q̈ − Q_C − Q_G = force."""
+    # Gravity enters as an acceleration of the base, so one pass gives both forces.
+    lifted = motion.acceleration - robot.gravity[:, None, None]
+    torque, force = link_force(links, motion, motion.alpha, lifted)
+    return _mass_matrix(robot, poses, links), _joint_force(robot, poses, torque, force)
 
 
 def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
@@ -174,8 +181,9 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
     E, a = robot.ancestors, batch_last(qdd, 1)
     alpha = motion.alpha + sum_over(E, poses.angular * a)
     acceleration = motion.acceleration + sum_over(E, poses.linear * a) - robot.gravity[:, None, None]
-    force = _newton_euler(robot, poses, link_inertia(robot, poses), motion, alpha, acceleration)
-    return batch_first(force + robot.armature[:, None] * a, poses.batch)
+    torque, force = link_force(link_inertia(robot, poses), motion, alpha, acceleration)
+    drive = robot.armature[:, None] * a
+    return batch_first(_joint_force(robot, poses, torque, force) + drive, poses.batch)
 
 
 def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector) -> JointVector:
@@ -194,12 +202,9 @@ def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: 
     """
     q, qd, force = common_states(robot, q=q, qd=qd, force=force)
     poses = link_poses(robot, q)
-    links, motion = link_inertia(robot, poses), link_motion(robot, poses, qd)
-    # The force that gravity and motion take at q̈ = 0: gravity enters as an acceleration of the base.
-    lifted = motion.acceleration - robot.gravity[:, None, None]
-    Q = batch_last(force, 1) - _newton_euler(robot, poses, links, motion, motion.alpha, lifted)
-    qdd = batchlast.solve_spd(_mass_matrix(robot, poses, links), Q.unsqueeze(1))
-    return batch_first(qdd.squeeze(1), poses.batch)
+    M, needed = equation_of_motion(robot, poses, link_inertia(robot, poses), link_motion(robot, poses, qd))
+    Q = batch_last(force, 1) - needed
+    return batch_first(batchlast.solve_spd(M, Q.unsqueeze(1)).squeeze(1), poses.batch)
 
 
 def kinetic_energy(robot: RobotModel, q: JointVector, qd: JointVector) -> Tensor:

@@ -9,11 +9,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from forcegp import dynamics
+from forcegp import derivatives, dynamics
 from forcegp.compiled.build import Kernel, cpu_kernel, cuda_kernel
 from forcegp.compiled.program import QUANTITIES, trace
 from forcegp.compiled.source import cpu_source, cuda_source
@@ -24,11 +25,16 @@ from forcegp.robot.model import RobotModel
 __all__ = ["CompiledDynamics", "compile_dynamics"]
 
 
+def _stacked_derivatives(robot: RobotModel, q: Tensor, qd: Tensor, force: Tensor) -> Tensor:
+    return torch.stack(derivatives.forward_dynamics_derivatives(robot, q, qd, force), dim=-3)
+
+
 class CompiledDynamics:
     """One quantity of one robot as a compiled function of the joint-space arguments.
 
-    Call it as the function of the same name in `forcegp.dynamics`, without the robot. Derivatives of any
-    order are those of that function.
+    Call it as the eager function of the same name, without the robot. Its derivatives are those of the
+    eager function, of any order; the first derivatives of the forward dynamics have a kernel of their own,
+    built when they are first asked for.
     """
 
     def __init__(self, robot: RobotModel, quantity: str) -> None:
@@ -38,7 +44,15 @@ class CompiledDynamics:
         source = (cuda_source if on_cuda else cpu_source)(program, robot.nq, robot.dtype)
         self._kernel: Kernel = (cuda_kernel if on_cuda else cpu_kernel)(source.text)
         self._arrays, self._arguments, self._shape = source.arrays, program.arguments, program.shape
-        self._eager: Callable[..., Tensor] = getattr(dynamics, quantity)
+        self._eager: Callable[..., Tensor] = (
+            _stacked_derivatives
+            if quantity == "forward_dynamics_derivatives"
+            else getattr(dynamics, quantity)
+        )
+
+    @cached_property
+    def _jacobians(self) -> CompiledDynamics:
+        return CompiledDynamics(self.robot, "forward_dynamics_derivatives")
 
     def __call__(self, *states: Tensor) -> Tensor:
         """The quantity at states `(*batch, nq)`.
@@ -56,8 +70,15 @@ class CompiledDynamics:
         return _Kernel.apply(self, *common)  # pyright: ignore[reportReturnType]
 
     def eager(self, *states: Tensor) -> Tensor:
-        """The same by `forcegp.dynamics`."""
+        """The same by the eager function."""
         return self._eager(self.robot, *states)
+
+    def pull(self, gradient: Tensor, *states: Tensor) -> tuple[Tensor, ...]:
+        """gradientᵀ times the Jacobian with respect to each state."""
+        if self.quantity == "forward_dynamics" and not torch.is_grad_enabled():
+            jacobians = self._jacobians.run(*states)
+            return (gradient[..., None, None, :] @ jacobians)[..., 0, :].unbind(-2)
+        return torch.func.vjp(self.eager, *states)[1](gradient)
 
     def run(self, *states: Tensor) -> Tensor:
         """Call the kernel on states of one shape, outside of autograd."""
@@ -89,15 +110,15 @@ class _Kernel(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
-        _, pull = torch.func.vjp(ctx.compiled.eager, *ctx.saved_tensors)
-        return None, *pull(gradient)
+        return None, *ctx.compiled.pull(gradient, *ctx.saved_tensors)
 
     @staticmethod
     def jvp(ctx, _, *tangents):  # pyright: ignore[reportIncompatibleMethodOverride]
-        given = tuple(
-            torch.zeros_like(x) if t is None else t for x, t in zip(ctx.saved_tensors, tangents, strict=True)
-        )
-        return torch.func.jvp(ctx.compiled.eager, ctx.saved_tensors, given)[1]
+        states = ctx.saved_tensors
+        given = tuple(torch.zeros_like(x) if t is None else t for x, t in zip(states, tangents, strict=True))
+        # PyTorch does not nest forward mode, so J t is the derivative of Jᵀ u with respect to u.
+        value, pull = torch.func.vjp(ctx.compiled.eager, *states)[:2]
+        return torch.func.vjp(pull, torch.zeros_like(value))[1](given)[0]
 
     @staticmethod
     def vmap(info, in_dims, compiled, *states):  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -109,7 +130,7 @@ class _Kernel(torch.autograd.Function):
 
 
 def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> CompiledDynamics:
-    """Compile a function of `forcegp.dynamics` for one robot.
+    """Compile a function of `forcegp.dynamics` (or its derivatives) for one robot.
 
     The first call on a machine runs its C++ compiler (a few seconds); later ones, in any process, read
     the kernel from the cache (`$FORCEGP_CACHE`, or `forcegp` in the user's cache folder). On a CUDA robot
@@ -117,10 +138,12 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
 
     Args:
         robot: the robot; its figures become constants.
-        quantity: `forward_dynamics`, `inverse_dynamics`, `mass_matrix`, `bias_force` or `gravity_force`.
+        quantity: `forward_dynamics`, `forward_dynamics_derivatives`, `inverse_dynamics`, `mass_matrix`,
+            `bias_force` or `gravity_force`.
 
     Returns:
-        A function of `(q, qd, force)`, `(q, qd, qdd)`, `(q)`, `(q, qd)` or `(q)`.
+        A function of the states that the eager function takes. The derivatives come as one tensor
+        `(*batch, 3, nq, nq)`: with respect to q, q̇ and force.
 
     Raises:
         UnknownNameError: no such quantity.
@@ -138,7 +161,7 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
         raise ModelError(
             "a robot whose figures require a gradient cannot be compiled, as they become constants",
             got=", ".join(learned),
-            hint="use forcegp.dynamics while learning, and compile the robot with detached figures afterwards",
+            hint="use forcegp.dynamics while learning, and compile a robot with detached figures afterwards",
         )
     if robot.dtype not in (torch.float64, torch.float32):
         raise ModelError(

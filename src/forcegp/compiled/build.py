@@ -21,7 +21,16 @@ from forcegp.files import atomic_file
 Kernel = Callable[[Sequence[Tensor], Tensor], None]
 """Reads contiguous arrays `(B, nq)` and fills the contiguous result `(B, …)`."""
 
-FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-w", "-shared", "-fPIC")
+FLAGS = (
+    "-std=c++17",
+    "-O2",
+    "-march=native",
+    "-ffp-contract=fast",
+    "-fno-math-errno",
+    "-w",
+    "-shared",
+    "-fPIC",
+)
 SAMPLES_PER_THREAD = 512
 """A thread is started for no fewer samples than take longer than starting it."""
 
@@ -81,7 +90,7 @@ def _compile(text: str) -> Path:
             raise MissingDependencyError(
                 f"the C++ compiler {compiler} could not build the kernel",
                 got=done.stderr.strip()[-2000:],
-                hint="set CXX to GCC 9 or Clang 12 or newer, or use forcegp.dynamics, which needs no compiler",
+                hint="set CXX to a recent GCC or Clang, or use forcegp.dynamics, which needs no compiler",
             )
     return library
 

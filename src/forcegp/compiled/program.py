@@ -1,17 +1,19 @@
 """The dynamics of one robot written out on scalars: the algorithms of `forcegp.dynamics`, link by link.
 
-World axes about the base origin, as there. The robot's figures are numbers, so products with the zeros
-and ones of joint axes and placements vanish while the program is built.
+The robot's figures are numbers, so products with the zeros and ones of joint axes and placements vanish
+while the program is built.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from forcegp.compiled.expression import Graph, Scalar
+from forcegp.compiled.links import Links, cross, skew
 from forcegp.robot.model import BASE, RobotModel
 
 
@@ -30,148 +32,175 @@ class Program:
     outputs: list[Scalar]
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+_Inertia = tuple[float, np.ndarray, np.ndarray]
+"""Mass, first moment and inertia about the base origin."""
 
 
-def _skew(v: np.ndarray) -> np.ndarray:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+class _Motion(NamedTuple):
+    """Twist [ω; v] and spatial acceleration [α; a] of one link."""
+
+    omega: np.ndarray
+    v: np.ndarray
+    alpha: np.ndarray
+    a: np.ndarray
 
 
-class _Links:
-    """Poses, screws and inertias of all links as scalars."""
-
-    def __init__(self, robot: RobotModel) -> None:
-        self.graph = graph = Graph()
-        self.parents = robot.parents
-        self.gravity, self.armature = graph.constants(_numbers(robot.gravity)), _numbers(robot.armature)
-        self.mass = _numbers(robot.mass)
-        self.R, self.p, self.z, self.l, self.c, self.I = [], [], [], [], [], []
-        for i, parent in enumerate(robot.parents):
-            R, p = (
-                (graph.constants(_numbers(robot.base_rotation)), graph.constants(np.zeros(3)))
-                if parent == BASE
-                else (self.R[parent], self.p[parent])
-            )
-            turn, shift = self._joint(robot, i)
-            self.R.append(R @ turn)
-            self.p.append(p + R @ shift)
-            axis = self.R[i] @ graph.constants(_numbers(robot.axis[i]))
-            revolute = robot.joint_types[i] == "revolute"
-            self.z.append(axis if revolute else graph.constants(np.zeros(3)))
-            self.l.append(_cross(self.p[i], axis) if revolute else axis)
-            self.c.append(self.p[i] + self.R[i] @ graph.constants(_numbers(robot.com[i])))
-            self.I.append(_congruent(self.R[i], graph.constants(_numbers(robot.inertia[i]))))
-
-    def _joint(self, robot: RobotModel, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pose of a link in its parent link (Rodrigues' formula about a constant axis)."""
-        graph, a = self.graph, _numbers(robot.axis[i])
-        P, shift = _numbers(robot.placement_rotation[i]), graph.constants(_numbers(robot.placement_position[i]))
-        if robot.joint_types[i] == "prismatic":
-            return graph.constants(P), shift + graph.constants(P @ a) * graph.input("q", i)
-        along = np.outer(P @ a, a)
-        turn = graph.constants(along) + graph.constants(P @ _skew(a)) * graph.input("sin", i)
-        return turn + graph.constants(P - along) * graph.input("cos", i), shift
-
-    def vector(self, name: str) -> list[Scalar]:
-        return [self.graph.input(name, i) for i in range(len(self.parents))]
-
-    def ancestors(self, i: int) -> list[int]:
-        """The joints that move link i, itself first."""
-        chain = [i]
-        while self.parents[chain[-1]] != BASE:
-            chain.append(self.parents[chain[-1]])
-        return chain
-
-
-def _numbers(x) -> np.ndarray:
-    return x.detach().cpu().double().numpy()
-
-
-def _congruent(R: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """R I Rᵀ with its six different entries computed once."""
-    turned = R @ inertia
-    upper = {(r, c): turned[r] @ R[c] for r in range(3) for c in range(r, 3)}
-    return np.array([[upper[min(r, c), max(r, c)] for c in range(3)] for r in range(3)], dtype=object)
-
-
-def _mass_matrix(links: _Links) -> np.ndarray:
-    """M_ij = s_iᵀ I^c_j s_j with the composite inertias about the base origin (CRBA)."""
-    n, graph = len(links.parents), links.graph
-    M = graph.constants(np.zeros((n, n)))
-    mass = list(links.mass)
-    moment = [links.c[i] * mass[i] for i in range(n)]
-    inertia = []
-    for i in range(n):
-        c, h = links.c[i], moment[i]
-        diagonal = [c[1] * h[1] + c[2] * h[2], c[0] * h[0] + c[2] * h[2], c[0] * h[0] + c[1] * h[1]]
-        shift = [[diagonal[r] if r == s else -(c[min(r, s)] * h[max(r, s)]) for s in range(3)] for r in range(3)]
-        inertia.append(links.I[i] + np.array(shift, dtype=object))
-    for j in reversed(range(n)):
-        parent, z, l = links.parents[j], links.z[j], links.l[j]
-        angular = inertia[j] @ z + _cross(moment[j], l)
-        linear = l * mass[j] - _cross(moment[j], z)
+def _mass_matrix(links: Links) -> np.ndarray:
+    """M_ij = s_iᵀ I^c_j s_j with the composite inertias (composite rigid-body algorithm)."""
+    n = len(links.parents)
+    M = links.graph.constants(np.zeros((n, n)))
+    for j, (angular, linear) in enumerate(_screw_momenta(links)):
         for i in links.ancestors(j):
             M[i, j] = M[j, i] = links.z[i] @ angular + links.l[i] @ linear
         M[j, j] = M[j, j] + links.armature[j]
-        if parent != BASE:
-            mass[parent] += mass[j]
-            moment[parent] = moment[parent] + moment[j]
-            inertia[parent] = inertia[parent] + inertia[j]
     return M
 
 
-def _joint_force(links: _Links, qd: list | None, qdd: list | None, gravity: bool) -> np.ndarray:
-    """M q̈ − Q_C − Q_G, each term where its argument is given (recursive Newton-Euler)."""
-    n, zero = len(links.parents), links.graph.constants(np.zeros(3))
-    rest = (zero, zero, zero, -links.gravity if gravity else zero)
-    motion, forces = [], []
+def _momentum(mass: float, moment: np.ndarray, inertia: np.ndarray, w: np.ndarray, v: np.ndarray) -> tuple:
+    """[I w + h × v; m v − h × w]."""
+    return inertia @ w + cross(moment, v), v * mass - cross(moment, w)
+
+
+def _composites(links: Links) -> list[_Inertia]:
+    """Mass, first moment and inertia of each subtree."""
+    figures = (links.mass, links.moment, links.inertia)
+    return list(zip(*(links.composite(list(x)) for x in figures), strict=True))
+
+
+def _screw_momenta(links: Links) -> list[tuple]:
+    """I^c_j s_j of each joint."""
+    return [_momentum(*I, z, l) for I, z, l in zip(_composites(links), links.z, links.l, strict=True)]
+
+
+def _motion(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> list[_Motion]:
+    """Motion of all links; gravity enters as an acceleration of the base."""
+    zero, motion = links.graph.constants(np.zeros(3)), []
+    rest = _Motion(zero, zero, zero, -links.gravity if gravity else zero)
     for i, parent in enumerate(links.parents):
         omega, v, alpha, a = rest if parent == BASE else motion[parent]
-        z, l, c, I = links.z[i], links.l[i], links.c[i], links.I[i]
+        z, l = links.z[i], links.l[i]
         if qd is not None:
             omega, v = omega + z * qd[i], v + l * qd[i]
-            alpha = alpha + _cross(omega, z) * qd[i]
-            a = a + (_cross(omega, l) + _cross(v, z)) * qd[i]
+            alpha = alpha + cross(omega, z) * qd[i]
+            a = a + (cross(omega, l) + cross(v, z)) * qd[i]
         if qdd is not None:
             alpha, a = alpha + z * qdd[i], a + l * qdd[i]
-        motion.append((omega, v, alpha, a))
-        force = (a + _cross(alpha, c) + _cross(omega, v + _cross(omega, c))) * links.mass[i]
-        forces.append((I @ alpha + _cross(omega, I @ omega) + _cross(c, force), force))
-    result = links.graph.constants(np.zeros(n))
-    for i in reversed(range(n)):
-        torque, force = forces[i]
-        result[i] = links.z[i] @ torque + links.l[i] @ force
-        if qdd is not None:
-            result[i] = result[i] + qdd[i] * links.armature[i]
-        if (parent := links.parents[i]) != BASE:
-            forces[parent] = (forces[parent][0] + torque, forces[parent][1] + force)
-    return result
+        motion.append(_Motion(omega, v, alpha, a))
+    return motion
 
 
-def _solve(M: np.ndarray, rhs: np.ndarray) -> list[Scalar]:
+def _link_forces(links: Links, motion: list[_Motion]) -> tuple[list, list]:
+    """Torque and force on the subtree of each joint, by Newton and Euler about the centres of mass."""
+    torques, forces = [], []
+    for (omega, v, alpha, a), c, I, mass in zip(motion, links.c, links.I, links.mass, strict=True):
+        force = (a + cross(alpha, c) + cross(omega, v + cross(omega, c))) * mass
+        torques.append(I @ alpha + cross(omega, I @ omega) + cross(c, force))
+        forces.append(force)
+    return links.composite(torques), links.composite(forces)
+
+
+def _joint_force(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> np.ndarray:
+    """M q̈ − Q_C − Q_G, each term where its argument is given (recursive Newton-Euler)."""
+    torques, forces = _link_forces(links, _motion(links, qd, qdd, gravity))
+    result = [z @ t + l @ f for z, l, t, f in zip(links.z, links.l, torques, forces, strict=True)]
+    if qdd is not None:
+        result = [r + a * m for r, a, m in zip(result, qdd, links.armature, strict=True)]
+    return np.array(result, dtype=object)
+
+
+def _solve(M: np.ndarray, rhs: np.ndarray) -> np.ndarray:
     """M⁻¹ rhs, eliminated from the leaves so that the zeros of branched trees stay (Featherstone, §6.5)."""
     M, x, n = M.copy(), rhs.copy(), len(rhs)
-    inverse = [M[0, 0]] * n
+    inverse = [1.0 / M[0, 0]] * n
     for k in reversed(range(n)):
         inverse[k] = 1.0 / M[k, k]
         for i in range(k):
             factor = M[k, i] * inverse[k]
-            x[i] = x[i] - factor * x[k]
+            x[i] = x[i] - x[k] * factor
             for j in range(i + 1):
                 M[i, j] = M[i, j] - factor * M[k, j]
     for k in range(n):
-        x[k] = (x[k] - M[k, :k] @ x[:k]) * inverse[k] if k else x[k] * inverse[k]
-    return list(x)
+        for i in range(k):
+            x[k] = x[k] - x[i] * M[k, i]
+        x[k] = x[k] * inverse[k]
+    return x
 
 
-def _forward_dynamics(links: _Links) -> np.ndarray:
+def _forward_dynamics(links: Links) -> np.ndarray:
     needed = _joint_force(links, links.vector("qd"), None, gravity=True)
-    return np.array(_solve(_mass_matrix(links), np.array(links.vector("force")) - needed))
+    return _solve(_mass_matrix(links), np.array(links.vector("force"), dtype=object) - needed)
 
 
-QUANTITIES: dict[str, tuple[tuple[str, ...], Callable[[_Links], np.ndarray]]] = {
+def _inverse_dynamics_derivatives(links: Links, qd: list, qdd: list) -> tuple[np.ndarray, np.ndarray]:
+    """∂ID/∂q and ∂ID/∂q̇; the formulas are those of `forcegp.derivatives`."""
+    motion = _motion(links, qd, qdd, gravity=True)
+    torques, forces = _link_forces(links, motion)
+    spin, momenta = [], []
+    for (omega, v, _, _), m, h, I in zip(motion, links.mass, links.moment, links.inertia, strict=True):
+        w = skew(omega)
+        spin.append((w @ I - skew(h) @ skew(v)) * 2.0 - w * (I[0, 0] + I[1, 1] + I[2, 2]))
+        momenta.append(v * m - cross(h, omega))
+    spin, momenta, composites = links.composite(spin), links.composite(momenta), _composites(links)
+
+    n = len(motion)
+    dq, dqd = (links.graph.constants(np.zeros((n, n))) for _ in range(2))
+    screws = list(zip(links.z, links.l, strict=True))
+    rates = [
+        (cross(m.omega, z), cross(m.omega, l) + cross(m.v, z))
+        for m, (z, l) in zip(motion, screws, strict=True)
+    ]
+    for i in range(n):
+        z, l = screws[i]
+        row, weight = spin[i].T @ z + cross(momenta[i], l) * 2.0, _momentum(*composites[i], z, l)
+        column_q, column_v = _columns(motion[i], screws[i], rates[i], spin[i], momenta[i], composites[i])
+        carried = cross(z, torques[i]) + cross(l, forces[i]), cross(z, forces[i])
+        for j in links.ancestors(i):
+            bend = _bend(motion[j], screws[j], rates[j])
+            dq[i, j] = row @ rates[j][0] + _pair(weight, bend)
+            dqd[i, j] = row @ screws[j][0] + _pair(weight, rates[j]) * 2.0
+            if j != i:
+                dq[j, i] = _pair(screws[j], column_q) + _pair(screws[j], carried)
+                dqd[j, i] = _pair(screws[j], column_v)
+    return dq, dqd
+
+
+def _pair(force: tuple, motion: tuple) -> Scalar:
+    return force[0] @ motion[0] + force[1] @ motion[1]
+
+
+def _bend(motion: _Motion, screw: tuple, rate: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """S̈ = a × S + V × Ṡ of one joint."""
+    (omega, v, alpha, a), (z, l) = motion, screw
+    return (
+        cross(alpha, z) + cross(omega, rate[0]),
+        cross(alpha, l) + cross(a, z) + cross(omega, rate[1]) + cross(v, rate[0]),
+    )
+
+
+def _columns(
+    motion: _Motion, screw: tuple, rate: tuple, spin, momentum, composite: _Inertia
+) -> tuple[tuple, tuple]:
+    """2B Ṡ + I S̈ and 2B S + 2 I Ṡ of one joint and its subtree."""
+    bent, turned = _momentum(*composite, *_bend(motion, screw, rate)), _momentum(*composite, *rate)
+    return (
+        (spin @ rate[0] + bent[0], cross(rate[0], momentum) * 2.0 + bent[1]),
+        (spin @ screw[0] + turned[0] * 2.0, (cross(screw[0], momentum) + turned[1]) * 2.0),
+    )
+
+
+def _forward_dynamics_derivatives(links: Links) -> np.ndarray:
+    """∂q̈/∂q, ∂q̈/∂q̇ and M⁻¹, `(3, nq, nq)`."""
+    qd, n = links.vector("qd"), len(links.parents)
+    inverse = _solve(_mass_matrix(links), links.graph.constants(np.eye(n)))
+    needed = _joint_force(links, qd, None, gravity=True)
+    qdd = inverse @ (np.array(links.vector("force"), dtype=object) - needed)
+    dq, dqd = _inverse_dynamics_derivatives(links, qd, list(qdd))
+    return np.array([-(inverse @ dq), -(inverse @ dqd), inverse], dtype=object)
+
+
+QUANTITIES: dict[str, tuple[tuple[str, ...], Callable[[Links], np.ndarray]]] = {
     "forward_dynamics": (("q", "qd", "force"), _forward_dynamics),
+    "forward_dynamics_derivatives": (("q", "qd", "force"), _forward_dynamics_derivatives),
     "inverse_dynamics": (
         ("q", "qd", "qdd"),
         lambda links: _joint_force(links, links.vector("qd"), links.vector("qdd"), gravity=True),
@@ -180,12 +209,12 @@ QUANTITIES: dict[str, tuple[tuple[str, ...], Callable[[_Links], np.ndarray]]] = 
     "bias_force": (("q", "qd"), lambda links: -_joint_force(links, links.vector("qd"), None, gravity=False)),
     "gravity_force": (("q",), lambda links: -_joint_force(links, None, None, gravity=True)),
 }
-"""Arguments and algorithm of each quantity that can be compiled; the names are those of `forcegp.dynamics`."""
+"""Arguments and algorithm of each quantity that can be compiled."""
 
 
 def trace(robot: RobotModel, quantity: str) -> Program:
     """The program of one quantity of `QUANTITIES` for one robot."""
     arguments, algorithm = QUANTITIES[quantity]
-    links = _Links(robot)
+    links = Links(robot)
     result = algorithm(links)
     return Program(arguments, result.shape, links.graph, list(result.flat))

@@ -9,7 +9,7 @@ import torch
 from forcegp.compiled.program import Program
 
 LANES_BYTES = 64
-"""Width of the vectors that a CPU kernel computes on; the compiler splits them where the machine's are narrower."""
+"""Width of the vectors of a CPU kernel; the compiler splits them where the machine's are narrower."""
 CUDA_THREADS = 128
 
 _CPU = """\

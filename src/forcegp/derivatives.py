@@ -1,0 +1,147 @@
+"""Closed-form derivatives of inverse and forward dynamics with respect to the state and the force.
+
+Differentiating M q̈ − Q_C − Q_G = τ at constant τ gives ∂q̈ = M⁻¹(∂τ − ∂ID) (Carpentier & Mansard,
+*Analytical derivatives of rigid body dynamics algorithms*, RSS 2018); ∂ID follows in world axes from
+composite quantities of the subtrees (Singh, Russell & Wensing, *Efficient analytical derivatives of
+rigid-body dynamics using spatial vector algebra*, RA-L 2022).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forcegp import batchlast, dynamics
+from forcegp.batchlast import apply, batch_first, batch_last, cross, dot, sum_over
+from forcegp.kinematics import LinkMotion, LinkPoses, common_states, link_motion, link_poses
+from forcegp.robot.model import RobotModel
+from forcegp.types import JointMatrix, JointVector
+
+
+class InverseDynamicsDerivatives(NamedTuple):
+    """∂ID/∂q, ∂ID/∂q̇ and ∂ID/∂q̈ = M, each `(*batch, nq, nq)`, row = component of the force."""
+
+    dq: JointMatrix
+    dqd: JointMatrix
+    dqdd: JointMatrix
+
+
+class ForwardDynamicsDerivatives(NamedTuple):
+    """∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂force = M⁻¹, each `(*batch, nq, nq)`, row = component of q̈."""
+
+    dq: JointMatrix
+    dqd: JointMatrix
+    dforce: JointMatrix
+
+
+def _pairs(robot: RobotModel, own: Tensor, down: Tensor) -> Tensor:
+    """D with D_ij = own_ij where joint j moves link i, and down_ij where joint i moves link j."""
+    E = robot.ancestors[..., None]
+    strictly = torch.tril(robot.ancestors, -1).mT[..., None]
+    return own * E + down * strictly
+
+
+def _inverse_derivatives(
+    robot: RobotModel, poses: LinkPoses, links: dynamics.LinkInertia, motion: LinkMotion, qdd: Tensor
+) -> tuple[Tensor, Tensor]:
+    """∂ID/∂q and ∂ID/∂q̇ with the batch last, `(nq, nq, B)`.
+
+    With the composite inertia I and the composite 2B = [[N, 0], [−2 l×, 0]] of the subtree of joint i,
+    N = 2 ω×I − tr(I) ω× − 2 h×v×, l its linear momentum, F its force, and for each joint Ṡ = V×S,
+    S̈ = a×S + V×Ṡ:
+    ∂τ_i/∂q_j = S_i·(2B Ṡ_j + I S̈_j) for j that moves i, S_i·(2B Ṡ_j + I S̈_j + S_j ×* F) of subtree j
+    for i that moves j; ∂τ/∂q̇ has S and 2 Ṡ in place of Ṡ and S̈, and no F.
+    """
+    E, Et = robot.ancestors, robot.ancestors.mT
+    z, l, omega, v = poses.angular, poses.linear, motion.omega, motion.velocity
+    alpha = motion.alpha + sum_over(E, z * qdd)
+    a = motion.acceleration + sum_over(E, l * qdd) - robot.gravity[:, None, None]
+    torque, force = dynamics.link_force(links, motion, alpha, a)
+
+    w = batchlast.skew(omega)
+    trace = links.inertia.diagonal(dim1=0, dim2=1).sum(-1)
+    N = 2.0 * batchlast.product(w, links.inertia) - trace * w
+    N = N - 2.0 * batchlast.product(batchlast.skew(links.moment), batchlast.skew(v))
+    momentum = links.mass * v - cross(links.moment, omega)
+
+    N, momentum = sum_over(Et, N), sum_over(Et, momentum)
+    torque, force = sum_over(Et, torque), sum_over(Et, force)
+    whole = dynamics.LinkInertia(Et @ links.mass, sum_over(Et, links.moment), sum_over(Et, links.inertia))
+
+    def weigh(angular: Tensor, linear: Tensor) -> Tensor:
+        return torch.cat(dynamics.momentum(whole, angular, linear))
+
+    rate = torch.cat([cross(omega, z), cross(omega, l) + cross(v, z)])
+    bend = torch.cat(
+        [
+            cross(alpha, z) + cross(omega, rate[:3]),
+            cross(alpha, l) + cross(a, z) + cross(omega, rate[3:]) + cross(v, rate[:3]),
+        ]
+    )
+    S = torch.cat([z, l])
+    row = apply(N.transpose(0, 1), z) + 2.0 * cross(momentum, l)
+    weight = weigh(z, l)
+
+    def turned(x: Tensor) -> Tensor:
+        return torch.cat([apply(N, x), 2.0 * cross(x, momentum)])
+
+    carried = torch.cat([cross(z, torque) + cross(l, force), cross(z, force)])
+    column_q = turned(rate[:3]) + weigh(bend[:3], bend[3:]) + carried
+    column_v = turned(z) + 2.0 * weigh(rate[:3], rate[3:])
+
+    def each(left: Tensor, right: Tensor) -> Tensor:
+        return dot(left.unsqueeze(2), right.unsqueeze(1))
+
+    dq = _pairs(robot, each(row, rate[:3]) + each(weight, bend), each(S, column_q))
+    dqd = _pairs(robot, each(row, z) + 2.0 * each(weight, rate), each(S, column_v))
+    return dq, dqd
+
+
+def inverse_dynamics_derivatives(
+    robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector
+) -> InverseDynamicsDerivatives:
+    """Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈.
+
+    Args:
+        robot: the robot.
+        q, qd, qdd: `(*batch, nq)` joint positions, velocities, accelerations.
+
+    Raises:
+        ShapeError: an argument does not fit the robot.
+    """
+    q, qd, qdd = common_states(robot, q=q, qd=qd, qdd=qdd)
+    poses = link_poses(robot, q)
+    links, motion = dynamics.link_inertia(robot, poses), link_motion(robot, poses, qd)
+    dq, dqd = _inverse_derivatives(robot, poses, links, motion, batch_last(qdd, 1))
+    M = dynamics.mass_matrix_of_poses(robot, poses, links)
+    return InverseDynamicsDerivatives(batch_first(dq, poses.batch), batch_first(dqd, poses.batch), M)
+
+
+def forward_dynamics_derivatives(
+    robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector
+) -> ForwardDynamicsDerivatives:
+    """Jacobians of `forward_dynamics`: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹, at its q̈.
+
+    Args:
+        robot: the robot.
+        q, qd: `(*batch, nq)` joint positions and velocities.
+        force: `(*batch, nq)` generalized force [N m, N].
+
+    Raises:
+        ShapeError: an argument does not fit the robot.
+    """
+    q, qd, force = common_states(robot, q=q, qd=qd, force=force)
+    poses = link_poses(robot, q)
+    links, motion = dynamics.link_inertia(robot, poses), link_motion(robot, poses, qd)
+    M, needed = dynamics.equation_of_motion(robot, poses, links, motion)
+    eye = torch.eye(robot.nq, dtype=q.dtype, device=q.device)[..., None]
+    inverse = batchlast.solve_spd(M, eye.expand_as(M))
+    qdd = apply(inverse, batch_last(force, 1) - needed)
+    dq, dqd = _inverse_derivatives(robot, poses, links, motion, qdd)
+    return ForwardDynamicsDerivatives(
+        batch_first(-batchlast.product(inverse, dq), poses.batch),
+        batch_first(-batchlast.product(inverse, dqd), poses.batch),
+        batch_first(inverse, poses.batch),
+    )
