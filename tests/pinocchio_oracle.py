@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from robots import Arm
 
 from forcegp.robot.model import RobotModel
+from robots import Arm
 
 
 class Oracle:

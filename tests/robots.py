@@ -1,4 +1,4 @@
-"""The arms that tests run on: bundled ones, and every one of example-robot-data that has only supported joints."""
+"""The arms that tests run on: bundled ones, and those of example-robot-data with supported joints."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ ARMS = (
     _example("kinova", "kinova_description/robots/kinova.urdf"),
     _example("double_pendulum_data", "double_pendulum_description/urdf/double_pendulum.urdf"),
     _example("double_pendulum_simple", "double_pendulum_description/urdf/double_pendulum_simple.urdf"),
-    _example("double_pendulum_continuous", "double_pendulum_description/urdf/double_pendulum_continuous.urdf"),
+    _example("pendulum_continuous", "double_pendulum_description/urdf/double_pendulum_continuous.urdf"),
     _example("two_dof", "asr_twodof_description/urdf/TwoDofs.urdf"),
     _example("so100", "so_arm_description/urdf/so100.urdf"),
     _example("so101", "so_arm_description/urdf/so101.urdf"),

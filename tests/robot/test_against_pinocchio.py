@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from pinocchio_oracle import Oracle
-from robots import ARMS, Arm, random_states
 
 from forcegp import dynamics, kinematics
+from pinocchio_oracle import Oracle
+from robots import ARMS, Arm, random_states
 
 RELATIVE = 1e-10  # of the largest entry: double precision over some hundred operations, with a wide margin
 SAMPLES = 3

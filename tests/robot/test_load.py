@@ -1,0 +1,331 @@
+"""Robot files that are wrong: one typed error that names the file, the link or joint, and the remedy."""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import forcegp
+from forcegp import dynamics, kinematics
+from forcegp.errors import (
+    InertiaError,
+    RobotFileError,
+    RobotFileWarning,
+    ShapeError,
+    UnknownNameError,
+    UnsupportedRobotError,
+)
+from forcegp.robot.load import BUNDLED
+from forcegp.robot.safety import MAX_BYTES, MAX_ELEMENTS
+from robots import ARMS, example_data
+
+SECONDS = 2.0  # what the requirements allow for any file
+LINK = '<link name="{0}"><inertial><mass value="1"/>{1}</inertial></link>'
+BALL = '<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/>'
+JOINT = '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/>{4}</joint>'
+
+
+def link(name: str, inertia: str = BALL) -> str:
+    return LINK.format(name, inertia)
+
+
+def joint(name: str, parent: str, child: str, rest: str = "", kind: str = "revolute") -> str:
+    return JOINT.format(name, kind, parent, child, rest)
+
+
+def write(folder: Path, *parts: str) -> Path:
+    path = folder / "robot.urdf"
+    path.write_text('<robot name="r">' + "".join(parts) + "</robot>")
+    return path
+
+
+def arm(folder: Path, rest: str = "", kind: str = "revolute", inertia: str = BALL) -> Path:
+    return write(folder, '<link name="base"/>', link("hand", inertia), joint("j", "base", "hand", rest, kind))
+
+
+def test_bundled_robots_load_without_remarks() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RobotFileWarning)
+        robots = {name: forcegp.load_robot(name) for name in BUNDLED}
+    assert {name: robot.nq for name, robot in robots.items()} == {
+        "double_pendulum": 2,
+        "franka_panda": 7,
+        "kuka_iiwa": 7,
+    }
+    assert all(robot.name == name for name, robot in robots.items())
+
+
+def test_bundled_panda_equals_the_published_figures() -> None:
+    """Against the arm of example-robot-data, which carries the same identified figures and a hand."""
+    published = next(arm for arm in ARMS if arm.name == "panda").load()
+    ours = forcegp.load_robot("franka_panda")
+    assert ours.joint_names == published.joint_names
+    for field in ("placement_rotation", "placement_position", "axis", "lower", "upper", "effort_limit"):
+        torch.testing.assert_close(getattr(ours, field), getattr(published, field), rtol=0, atol=1e-12)
+    for field in ("mass", "com", "inertia"):
+        torch.testing.assert_close(
+            getattr(ours, field)[:6], getattr(published, field)[:6], rtol=1e-12, atol=0
+        )
+
+
+def test_bundled_double_pendulum_equals_the_textbook() -> None:
+    robot = forcegp.load_robot("double_pendulum")
+    q, qd = torch.tensor([0.4, -0.9], dtype=torch.float64), torch.tensor([1.1, 0.7], dtype=torch.float64)
+    m, l, r, g = 1.0, 1.0, 0.02, 9.81
+    I = m * (3 * r**2 + l**2) / 12
+    c, s = np.cos(-0.9), np.sin(-0.9)
+    M11, M12 = 2 * I + 1.5 * m * l**2 + m * l**2 * c, I + 0.25 * m * l**2 + 0.5 * m * l**2 * c
+    expected = [[M11, M12], [M12, I + 0.25 * m * l**2]]
+    np.testing.assert_allclose(dynamics.mass_matrix(robot, q), expected, rtol=1e-12)
+    h = 0.5 * m * l**2 * s
+    np.testing.assert_allclose(
+        dynamics.bias_force(robot, q, qd), [h * (2 * 1.1 * 0.7 + 0.7**2), -h * 1.1**2], rtol=1e-12
+    )
+    both = -0.5 * m * g * l * np.sin(0.4 - 0.9)
+    np.testing.assert_allclose(
+        dynamics.gravity_force(robot, q), [both - 1.5 * m * g * l * np.sin(0.4), both], rtol=1e-12
+    )
+
+
+def test_unknown_robot_names_the_nearest() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown robot 'kuka_iwa'(.|\n)*did you mean 'kuka_iiwa'"):
+        forcegp.load_robot("kuka_iwa")
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "empty.urdf").touch()
+    (tmp_path / "binary.urdf").write_bytes(bytes(range(256)) * 50)
+    os.mkfifo(tmp_path / "pipe.urdf")
+    (tmp_path / "html.xml").write_text("<html/>")
+    cases = {
+        tmp_path / "missing.urdf": "got: no such file",
+        tmp_path: "got: a folder",
+        tmp_path / "pipe.urdf": "got: something else",
+        tmp_path / "empty.urdf": "no element found",
+        tmp_path / "binary.urdf": "not (well-formed|readable)",
+        tmp_path / "html.xml": "neither URDF nor MJCF(.|\n)*<html>",
+        tmp_path / "nul\0.urdf": "cannot be read",
+    }
+    for path, message in cases.items():
+        with pytest.raises(RobotFileError, match=message):
+            forcegp.load_robot(path)
+
+
+def test_every_truncation_is_refused(tmp_path: Path) -> None:
+    data = next(arm for arm in ARMS if arm.name == "kuka_iiwa").path.read_bytes().rstrip()
+    path = tmp_path / "robot.urdf"
+    for length in range(0, len(data), 97):
+        path.write_bytes(data[:length])
+        with pytest.raises(RobotFileError, match=r"robot\.urdf: not well-formed XML"):
+            forcegp.load_robot(path)
+
+
+def _laughs() -> str:
+    entities = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "lol"}">' for i in range(10))
+    return f'<!DOCTYPE robot [{entities}]><robot name="r">&e9;</robot>'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (_laughs, "document types and entities are refused"),
+        (
+            lambda: '<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="r">&x;</robot>',
+            "document types and entities are refused",
+        ),
+        (lambda: '<!DOCTYPE r SYSTEM "http://localhost/r.dtd"><robot name="r"/>', "document types"),
+        (lambda: "<robot name='r'>" + "<link name='l'/>" * (MAX_ELEMENTS + 1), "too many elements"),
+        (lambda: "<robot name='r'>" + "".join(f"<link name='{i}'/>" for i in range(1_000_000)), "too large"),
+        (lambda: "<robot name='r'>" + "<link>" * 500, "nested too deeply"),
+        (lambda: "<mujoco><worldbody>" + "<body>" * 500, "nested too deeply"),
+        (lambda: "<robot name='" + "r" * MAX_BYTES + "'/>", "too large"),
+        (lambda: '<robot name="r"><link a="' + "1 " * 4_000_000 + '"/></robot>', "<link> has no usable name"),
+    ],
+)
+def test_hostile_files_are_refused_in_time(tmp_path: Path, text: Callable[[], str], message: str) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text(text())
+    start = time.perf_counter()
+    with pytest.raises(RobotFileError, match=message):
+        forcegp.load_robot(path)
+    assert time.perf_counter() - start < SECONDS
+
+
+def test_a_chain_as_long_as_allowed_loads_and_a_longer_one_is_refused(tmp_path: Path) -> None:
+    def chain(count: int, kind: str) -> Path:
+        links = [link(f"l{i}") for i in range(count + 1)]
+        joints = [joint(f"j{i}", f"l{i}", f"l{i + 1}", kind=kind) for i in range(count)]
+        return write(tmp_path, *links, *joints, link("tip"), joint("last", f"l{count}", "tip"))
+
+    start = time.perf_counter()
+    assert forcegp.load_robot(chain(400, "revolute")).nq == 401
+    # Fixed joints fold away, however many there are: two thousand, beyond Python's recursion limit.
+    assert forcegp.load_robot(chain(2000, "fixed")).nq == 1
+    with pytest.raises(RobotFileError, match="1 to 500 moving joints"):
+        forcegp.load_robot(chain(1500, "revolute"))
+    assert time.perf_counter() - start < 3 * SECONDS
+
+
+TWO = ('<link name="base"/>', link("a"), link("b"))
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ((), "the file has no links"),
+        (TWO[:1], r"1 to 500 moving joints(.|\n)*got: 0"),
+        ((*TWO, link("a"), joint("j", "base", "a")), "link name 'a' is not unique"),
+        ((*TWO, joint("j", "base", "a"), joint("j", "a", "b")), "joint name 'j' is not unique"),
+        ((*TWO, joint("j", "bsae", "a")), r"'j' has an unknown parent link 'bsae'(.|\n)*did you mean 'base'"),
+        ((*TWO, joint("j", "base", "c")), "'j' has an unknown child link 'c'"),
+        ((*TWO, joint("j", "base", "a")), r"form several trees(.|\n)*got: base, b"),
+        ((*TWO, joint("j", "a", "b"), joint("k", "b", "a")), "joint 'j' is part of a cycle"),
+        ((*TWO[1:], joint("j", "a", "b"), joint("k", "b", "a")), "joint 'j' is part of a cycle"),
+        (
+            (*TWO, joint("j", "base", "a"), joint("k", "a", "b"), joint("l", "base", "b")),
+            "'b' is the child of several joints",
+        ),
+        (('<link name="base"/>', "<link/>"), "a <link> has no usable name"),
+        ((*TWO, '<joint type="fixed"/>'), "a <joint> has no usable name"),
+        ((*TWO, '<joint name="j"/>'), "joint 'j' has no type"),
+        ((*TWO, '<joint name="j" type="fixed"><parent link="a"/></joint>'), "joint 'j' has no <child>"),
+        ((*TWO, '<joint name="j" type="fixed"><parent/></joint>'), "joint 'j': <parent> has no link"),
+        (
+            (*TWO, '<joint name="j" type="fixed"><parent link="a"/><parent link="b"/></joint>'),
+            "'j' has several <parent>",
+        ),
+        (('<xacro:macro xmlns:xacro="http://www.ros.org/wiki/xacro"/>',), "xacro macros"),
+    ],
+)
+def test_structure_is_checked(tmp_path: Path, parts: tuple[str, ...], message: str) -> None:
+    with pytest.raises(RobotFileError, match=r"robot\.urdf: (.|\n)*" + message):
+        forcegp.load_robot(write(tmp_path, *parts))
+
+
+@pytest.mark.parametrize(
+    ("rest", "message"),
+    [
+        ('<axis xyz="0 0 0"/>', "joint 'j' has an axis of length zero"),
+        ('<axis xyz="0 nan 1"/>', "joint 'j': axis xyz is not valid"),
+        ('<axis xyz="0 1"/>', r"joint 'j': axis xyz is not valid(.|\n)*expected: 3 finite(.|\n)*got: '0 1'"),
+        ('<origin xyz="0 0 1e400"/>', "joint 'j': origin xyz is not valid"),
+        ('<origin rpy="a b c"/>', "joint 'j': origin rpy is not valid"),
+        ('<limit lower="1" upper="-1"/>', r"limits the wrong way round(.|\n)*got: \(1.0, -1.0\)"),
+        ('<limit upper="nan"/>', "joint 'j': limit upper is not valid"),
+        ('<limit effort="-3"/>', "joint 'j' has a negative limit"),
+        ('<dynamics damping="-0.1"/>', "joint 'j' has negative friction"),
+        ('<dynamics friction="much"/>', "joint 'j': dynamics friction is not valid"),
+    ],
+)
+def test_joint_figures_are_checked(tmp_path: Path, rest: str, message: str) -> None:
+    with pytest.raises(RobotFileError, match=message):
+        forcegp.load_robot(arm(tmp_path, rest))
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar", "ball", "spherical"])
+def test_unsupported_joints_are_refused_by_name(tmp_path: Path, kind: str) -> None:
+    with pytest.raises(UnsupportedRobotError, match=rf"joint 'j' is of type '{kind}'"):
+        forcegp.load_robot(arm(tmp_path, kind=kind))
+
+
+def test_mimic_joint_is_refused_unless_locked(tmp_path: Path) -> None:
+    mimic = '<mimic joint="i"/><axis xyz="0 0 2"/><origin xyz="0 0 1"/>'
+    path = write(tmp_path, *TWO, joint("i", "base", "a"), joint("j", "a", "b", mimic))
+    with pytest.raises(UnsupportedRobotError, match=r"'j' mimics joint 'i'(.|\n)*locked_joints={'j': 0.0}"):
+        forcegp.load_robot(path)
+    with pytest.raises(UnknownNameError, match=r"unknown joint of .*robot\.urdf to lock 'jj'"):
+        forcegp.load_robot(path, locked_joints={"jj": 0.0})
+    with pytest.raises(RobotFileError, match="'j' cannot be locked"):
+        forcegp.load_robot(path, locked_joints={"j": float("nan")})
+    robot = forcegp.load_robot(path, locked_joints={"j": 0.7})
+    rotation, position = kinematics.frame_pose(robot, torch.zeros(1, dtype=robot.dtype), "b")
+    np.testing.assert_allclose(rotation, Rotation.from_rotvec([0, 0, 0.7]).as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(position, [0, 0, 1])
+
+
+def _inertia(*moments: object) -> str:
+    return '<inertia ixx="{}" ixy="{}" ixz="{}" iyy="{}" iyz="{}" izz="{}"/>'.format(*moments)
+
+
+@pytest.mark.parametrize(
+    ("inertia", "message"),
+    [
+        (
+            _inertia(-0.1, 0, 0, 0.1, 0, 0.1),
+            "link 'hand' is not physical(.|\n)*a principal moment is -0.1 kg",
+        ),
+        (
+            _inertia(0.1, 0.2, 0, 0.1, 0, 0.1),
+            "link 'hand' is not physical(.|\n)*a principal moment is -0.1 kg",
+        ),
+        (_inertia("nan", 0, 0, 0.1, 0, 0.1), "link 'hand': inertia ixx is not valid"),
+        ('<inertia ixx="1"/>', "link 'hand': <inertia> has no ixy"),
+        ("", "link 'hand' has an <inertial> without <inertia>"),
+        (_inertia(0, 0, 0, 0, 0, 0), "link 'hand' of joint 'j' moves without inertia"),
+    ],
+)
+def test_unphysical_inertia_is_refused(tmp_path: Path, inertia: str, message: str) -> None:
+    with pytest.raises(InertiaError, match=message):
+        forcegp.load_robot(arm(tmp_path, inertia=inertia))
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [("-2", "the mass -2 kg is negative"), ("inf", "mass value is not valid"), ("", "<mass> has no value")],
+)
+def test_unphysical_mass_is_refused(tmp_path: Path, value: str, message: str) -> None:
+    path = arm(tmp_path)
+    path.write_text(path.read_text().replace('mass value="1"', f'mass value="{value}"'))
+    with pytest.raises(InertiaError, match=message):
+        forcegp.load_robot(path)
+
+
+def test_singular_mass_matrix_is_refused_by_link(tmp_path: Path) -> None:
+    """A massless link between two hinges on one axis spins freely; on two axes it does not."""
+    parts = '<link name="base"/>', '<link name="loose"/>', link("hand")
+    joints = joint("i", "base", "loose"), joint("j", "loose", "hand", '<axis xyz="{}"/>')
+    with pytest.raises(InertiaError, match=r"link '(loose|hand)' of joint '(i|j)' moves without inertia"):
+        forcegp.load_robot(write(tmp_path, *parts, *joints[:1], joints[1].format("1 0 0")))
+    assert forcegp.load_robot(write(tmp_path, *parts, *joints[:1], joints[1].format("0 1 0"))).nq == 2
+
+
+def test_doubtful_inertia_of_published_files_is_remarked_on(tmp_path: Path) -> None:
+    path = example_data() / "allegro_hand_description/urdf/allegro_right_hand.urdf"
+    with pytest.warns(RobotFileWarning, match=r"'link_3.0' is not physical: .* triangle inequality"):
+        robot = forcegp.load_robot(path)
+    assert len(robot.remarks) == 4
+    path = arm(tmp_path)
+    path.write_text(path.read_text().replace('mass value="1"', 'mass value="0"'))
+    with pytest.warns(
+        RobotFileWarning, match="'hand' is not physical: it has a rotational inertia .* no mass"
+    ):
+        forcegp.load_robot(path)
+
+
+def test_joint_figures_are_read(tmp_path: Path) -> None:
+    rest = (
+        '<axis xyz="0 3 4"/><limit lower="-0.5" upper="inf" effort="7" velocity="3"/>'
+        '<dynamics damping="0.2" friction="0.4"/>'
+    )
+    robot = forcegp.load_robot(arm(tmp_path, rest, kind="prismatic"), dtype=torch.float32)
+    assert robot.dtype == torch.float32
+    assert robot.joint_types == ("prismatic",)
+    assert robot.axis[0].tolist() == pytest.approx([0.0, 0.6, 0.8])
+    fields = "lower", "upper", "effort_limit", "velocity_limit", "damping", "friction"
+    values = [getattr(robot, field).item() for field in fields]
+    assert values == pytest.approx([-0.5, np.inf, 7.0, 3.0, 0.2, 0.4])
+
+
+@pytest.mark.parametrize("name", ["base_position", "base_rpy", "gravity"])
+@pytest.mark.parametrize("value", [(1, 2), (0, 0, float("nan")), "abc", None])
+def test_options_are_checked(name: str, value: object) -> None:
+    with pytest.raises(ShapeError, match=f"{name} is not valid"):
+        forcegp.load_robot("kuka_iiwa", **{name: value})  # type: ignore[arg-type]
