@@ -122,17 +122,25 @@ class Dataset:
         """`(n, len(contacts))` bool: which of the named contacts are closed.
 
         Raises:
-            UnknownNameError: a contact is not in the data set.
+            DataError: whether a contact is closed is not logged.
         """
         for name in contacts:
             if name not in self.contact:
-                raise UnknownNameError("contact of the data set", name, self.contact)
+                raise DataError(
+                    f"column 'contact.{name}' is missing",
+                    expected=f"contact.{name}, 1 where the contact is closed and 0 elsewhere",
+                    got=", ".join(f"contact.{c}" for c in self.contact) or "no contact column",
+                )
         columns_ = [self.contact[name] for name in contacts]
         return torch.stack(columns_, dim=-1) if columns_ else self.segment.new_zeros(len(self), 0).bool()
 
     def replace(self, **fields: object) -> Dataset:
         """A data set with some fields changed."""
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
+
+    def with_step(self, step: str) -> Dataset:
+        """The same data with one more line of provenance in the header."""
+        return self.replace(header=self.header.with_step(step))
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Dataset:
         """The same data on another device or in another precision."""

@@ -1,0 +1,99 @@
+"""What several commands share: options, progress bars, results, and reading data for a robot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Protocol
+
+import typer
+
+if TYPE_CHECKING:
+    from forcegp.data import Dataset
+    from forcegp.robot import RobotModel
+    from forcegp.scene import Scene
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+SceneName = Annotated[
+    str, typer.Option("--scene", "-s", help="Scene file, or the name of a bundled one: [b]kuka_plane[/b].")
+]
+ModelFolder = Annotated[Path, typer.Option("--model", "-m", help="Folder of a fitted model.")]
+DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
+Differentiate = Annotated[
+    int | None,
+    typer.Option(
+        metavar="WINDOW",
+        help="Compute velocities and accelerations that the log lacks by a Savitzky-Golay filter over an odd "
+        "number of samples.",
+    ),
+]
+
+
+class Advance(Protocol):
+    """Moves a progress bar."""
+
+    def __call__(self, done: int, total: int | None = None) -> None: ...
+
+
+@contextmanager
+def progress_bar(description: str, total: int) -> Iterator[Advance]:
+    """A progress bar on stderr.
+
+    Yields:
+        A function to call with the number of steps done so far, and their total where it has changed.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    times = (TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, *times, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(description, total=total)
+        yield lambda done, total=None: bar.update(task, completed=done, total=total)
+
+
+def show(result: Mapping[str, object], as_json: bool) -> None:
+    """Print the result of a command, one line a figure, or as JSON."""
+    if as_json:
+        typer.echo(json.dumps(dict(result), default=str))
+        return
+    width = max(len(name) for name in result)
+    for name, value in result.items():
+        text = f"{value:.6g}" if isinstance(value, float) else str(value)
+        typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
+
+
+def read_data(path: Path, differentiate: int | None = None) -> Dataset:
+    """Read a data set, computing derivatives that it lacks where a window is given."""
+    from forcegp.data import Dataset, SavitzkyGolay
+
+    method = SavitzkyGolay(window=differentiate) if differentiate is not None else None
+    return Dataset.read(path, differentiate=method)
+
+
+def data_of_robot(data: Dataset, robot: RobotModel) -> Dataset:
+    """The data with the robot's joints in the robot's order; further logged joints are left out."""
+    if set(robot.joint_names) <= set(data.joint_names):
+        data = data.select(robot.joint_names)
+    data.check_robot(robot)
+    return data
+
+
+def noise_std_of(option: float | None, scene: Scene, data: Dataset) -> float:
+    """The noise on q̈ that a model is told: the option, else the scene's, else what the data say.
+
+    Raises:
+        DataError: nobody says.
+    """
+    from forcegp.errors import DataError
+
+    for value in (option, scene.noise_std, data.header.noise_std):
+        if value is not None:
+            return value
+    raise DataError(
+        "the noise of the accelerations is not known",
+        expected="a standard deviation [rad/s²]",
+        hint="pass --noise-std, or set noise_std under [model] in the scene",
+    )

@@ -1,0 +1,40 @@
+"""`forcegp simulate`: a log of a simulated motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from forcegp.cli.common import AsJson, SceneName, progress_bar, show
+
+
+def simulate(
+    scene: SceneName,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Where the log goes (.parquet).")],
+    duration: Annotated[
+        float | None, typer.Option(help="Simulated time in seconds; default: the scene's.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of motion and noise; default: the scene's.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate the robot of a scene as it slides over its surface, and log the motion.
+
+    [bold]Examples[/bold]
+
+    forcegp simulate --scene kuka_plane --out run.parquet
+
+    forcegp simulate --scene my_scene.toml --duration 10 --seed 3 --out run.parquet
+    """
+    from forcegp.scene import load_scene
+    from forcegp.simulate import simulate as run
+
+    read = load_scene(scene)
+    changes = {"duration": duration, "seed": seed}
+    config = replace(read.simulation, **{name: v for name, v in changes.items() if v is not None})
+    with progress_bar("simulating", config.steps) as progress:
+        result = run(read.system(), config, progress=lambda done, _: progress(done))
+    result.data.write(out)
+    show({**result.summary(), "file": str(out)}, as_json)
