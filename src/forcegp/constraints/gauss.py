@@ -200,7 +200,7 @@ class ConstrainedSystem:
                 expected=f"shape (*batch, {n})",
                 got=tuple(active.shape),
             )
-        repeats = torch.tensor([contact.rows for contact in self.contacts], device=device)
+        repeats = torch.tensor([contact.rows for contact in self.contacts], dtype=torch.int64, device=device)
         return active.repeat_interleave(repeats, dim=-1).expand(*batch, self.m)
 
     def equations(self, q: JointVector, qd: JointVector, active: Tensor | None = None) -> Equations:
