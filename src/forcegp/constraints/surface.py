@@ -43,7 +43,9 @@ def _unit(values: Sequence[float], what: str) -> tuple[float, ...]:
         raise ForceGPError(
             f"{what} gives no direction", expected="three finite numbers, not all zero", got=values
         )
-    return tuple(float(x) / length for x in values)
+    # A unit vector is kept as it is, so that a surface that was saved is read back bit for bit.
+    scale = 1.0 if abs(length - 1.0) <= 1e-15 else length
+    return tuple(float(x) / scale for x in values)
 
 
 def _positive(value: float, what: str) -> None:
