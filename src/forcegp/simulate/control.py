@@ -19,7 +19,7 @@ from forcegp.constraints.gauss import Equations
 from forcegp.errors import NumericalError
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
-from forcegp.types import JointVector, Rotation, Vector3
+from forcegp.types import JointVector, Rotation, Scalars, Vector3
 
 SINGULAR = 1e-3
 """Below this smallest pivot of √(J Jᵀ) the task asks for joint speeds a thousand times its own."""
@@ -70,7 +70,7 @@ class Target(NamedTuple):
         position, velocity, acceleration: `(*batch, 3)` of the tool point [m], [m/s], [m/s²].
         rotation: `(*batch, 3, 3)` constant axes of the tool's frame.
         posture: `(*batch, nq)` joint positions that the null space leans to [rad].
-        push: `(*batch, 3)` force that the tool is to exert on what it touches, in the world [N].
+        push: `(*batch,)` force that the tool is to exert on the surface it touches, along its normal [N].
     """
 
     position: Vector3
@@ -78,7 +78,7 @@ class Target(NamedTuple):
     acceleration: Vector3
     rotation: Rotation
     posture: JointVector
-    push: Vector3
+    push: Scalars
 
 
 def tool_motion(
@@ -151,15 +151,23 @@ def joint_acceleration(tool: ToolMotion, task: Tensor, posture: JointVector) -> 
 
 
 def control_torque(
-    tool: ToolMotion, eom: Equations, q: JointVector, qd: JointVector, target: Target, gains: Gains
+    tool: ToolMotion,
+    eom: Equations,
+    q: JointVector,
+    qd: JointVector,
+    target: Target,
+    normal: Vector3,
+    gains: Gains,
 ) -> JointVector:
-    """Motor torque Q_u = M y − Q_K + J_Eᵀ F of task-space inverse dynamics control, before any limit.
+    """Motor torque Q_u = M y − Q_K − J_Eᵀ n F of task-space inverse dynamics control, before any limit.
 
     Args:
         tool: the tool at the state.
         eom: the equations of motion at the state; M and Q_K = Q_C + Q_G + Q_D are used.
         q, qd: `(*batch, nq)` the state.
         target: what is to be reached; F is its `push`.
+        normal: n `(*batch, 3)` where the tool is; along that of the reference, the push would drive the
+            tool away from it on a convex surface.
         gains: feedback gains.
 
     Returns:
@@ -170,5 +178,6 @@ def control_torque(
     """
     posture = gains.posture_stiffness * (target.posture - q) - gains.posture_damping * qd
     y = joint_acceleration(tool, task_acceleration(tool, target, gains), posture)
-    push = (tool.jacobian[..., 3:, :].mT @ target.push[..., None])[..., 0]
+    force = -target.push[..., None] * normal
+    push = (tool.jacobian[..., 3:, :].mT @ force[..., None])[..., 0]
     return (eom.M @ y[..., None])[..., 0] - eom.Q_K + push

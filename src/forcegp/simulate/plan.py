@@ -30,12 +30,14 @@ class Plan:
     """All that the controller is to follow.
 
     Attributes:
+        contact: name of the contact that the tool has, `None` in free space.
         frame, point: the tool point.
         reference: the motion of the tool point.
         targets: the controller's targets, `(n, …)`, one a sample.
         start: `(nq,)` joint positions at the first waypoint.
     """
 
+    contact: str | None
     frame: str
     point: Sequence[float]
     reference: Reference
@@ -80,9 +82,9 @@ def make_plan(system: ConstrainedSystem, config: SimulationConfig, generator: to
         reference.acceleration,
         rotation.expand(config.steps, 3, 3),
         postures[reference.segment],
-        _draw_push(contact, reference, config, generator),
+        _draw_push(reference, config, generator),
     )
-    return Plan(frame, point, reference, targets, start)
+    return Plan(contact.name if contact else None, frame, point, reference, targets, start)
 
 
 def _check_joints(robot: RobotModel) -> None:
@@ -126,14 +128,8 @@ def _draw_postures(
     return home + config.elbow_swing * swing.to(robot.dtype) @ free
 
 
-def _draw_push(
-    contact: SurfaceContact | None, reference: Reference, config: SimulationConfig, generator: torch.Generator
-) -> Tensor:
-    """`(n, 3)` force into the surface, one draw a line, none on lines off the surface."""
-    if contact is None:
-        return torch.zeros_like(reference.position)
+def _draw_push(reference: Reference, config: SimulationConfig, generator: torch.Generator) -> Tensor:
+    """`(n,)` force into the surface, one draw a line, none on lines off the surface."""
     low, high = config.pressing_force
     draws = torch.rand(len(reference.travel_time), dtype=torch.float64, generator=generator)
-    force = (low + (high - low) * draws).to(reference.t.dtype)[reference.segment] * reference.on_surface
-    normal = torch.nn.functional.normalize(contact.surface.gradient(reference.position), dim=-1)
-    return -force[:, None] * normal
+    return (low + (high - low) * draws).to(reference.t.dtype)[reference.segment] * reference.on_surface

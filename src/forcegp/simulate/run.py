@@ -8,7 +8,7 @@ from contextlib import closing
 import torch
 from torch import Tensor
 
-from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.constraints.gauss import ConstrainedSystem, Equations
 from forcegp.errors import NumericalError
 from forcegp.simulate.config import SimulationConfig
 from forcegp.simulate.control import control_torque, tool_motion
@@ -75,8 +75,9 @@ def _follow(
         if landing.impact:
             qd = landing.qd
             engine.reset(q, qd)
-        tool = tool_motion(system.robot, landing.eom.poses, landing.eom.motion, qd, plan.frame, plan.point)
-        wanted = control_torque(tool, landing.eom, q, qd, plan.target(k), config.gains)
+        eom, target = landing.eom, plan.target(k)
+        tool = tool_motion(system.robot, eom.poses, eom.motion, qd, plan.frame, plan.point)
+        wanted = control_torque(tool, eom, q, qd, target, _normal(eom, plan), config.gains)
         Q_u = wanted.clamp(-limit, limit)
         touch = contact_forces(system, q, qd, landing, Q_u, config.viscous_friction)
         engine.step(Q_u + touch.Q_D + touch.Q_I + touch.Q_z)
@@ -87,6 +88,13 @@ def _follow(
         if progress is not None:
             progress(k + 1, config.steps)
     return log
+
+
+def _normal(eom: Equations, plan: Plan) -> Tensor:
+    """Unit normal of the surface below the tool; zero in free space, where there is nothing to push."""
+    if plan.contact is None:
+        return torch.zeros_like(plan.targets.position[0])
+    return torch.nn.functional.normalize(eom.contact_points[plan.contact].normal, dim=-1)
 
 
 def _torque_limit(system: ConstrainedSystem, config: SimulationConfig) -> Tensor:
