@@ -1,0 +1,243 @@
+"""Identification of inertial parameters: inverse dynamics is linear in them, τ = Y(q, q̇, q̈) π.
+
+Sources: Atkeson, An, Hollerbach, *Estimation of inertial parameters of manipulator loads and links*
+(IJRR 1986); Gautier, *Numerical calculation of the base inertial parameters of robots* (J. Robotic
+Systems 1991). Only the base parameters β = B π, r of them, act on the motion and can be identified.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.linalg import qr, solve_triangular
+from torch import Tensor
+
+from forcegp.batchlast import batch_first
+from forcegp.errors import DataError
+from forcegp.kinematics import cross, link_motion, link_poses, skew
+from forcegp.robot.inertia import inertial_parameters
+from forcegp.robot.model import RobotModel
+from forcegp.types import JointVector
+
+Regressor = Float[Tensor, "*batch nq p"]
+RANK = 1e-9
+"""Share of the largest pivot of the scaled regressor below which a direction does not act on the motion."""
+PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+
+
+def _inertia_columns(w: Tensor) -> Tensor:
+    """L(w) with I w = L(w) (I_xx, I_xy, I_xz, I_yy, I_yz, I_zz), `(..., 3, 6)`."""
+    x, y, z = w.unbind(-1)
+    o = torch.zeros_like(x)
+    rows = ((x, y, z, o, o, o), (o, x, o, y, z, o), (o, o, x, o, y, z))
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> Regressor:
+    """Y with Y π = M q̈ − Q_C − Q_G for links without drives, π as in `parameter_vector`.
+
+    In link axes at the link origin, with acceleration a less gravity and h = m c:
+    f = m a + (α× + ω×ω×) h,  n = h × a + I α + ω × I ω.
+
+    Args:
+        robot: the robot; only its kinematics and gravity enter.
+        q, qd, qdd: `(*batch, nq)` joint positions, velocities, accelerations.
+
+    Returns:
+        `(*batch, nq, 10 nq)`.
+
+    Raises:
+        ShapeError: an argument does not fit the robot.
+    """
+    robot.check_state(qd=qd, qdd=qdd)
+    poses = link_poses(robot, q)
+    batch, E = poses.batch, robot.ancestors
+    motion = link_motion(robot, poses, qd)
+    R, p = poses.rotation, poses.position
+    angular, linear = (batch_first(x, batch).mT for x in (poses.angular, poses.linear))
+    omega, velocity, alpha, acceleration = (
+        batch_first(x, batch).mT for x in (motion.omega, motion.velocity, motion.alpha, motion.acceleration)
+    )
+    alpha = alpha + E @ (angular * qdd[..., None])
+    acceleration = acceleration + E @ (linear * qdd[..., None]) - robot.gravity
+    at_link = acceleration + cross(alpha, p) + cross(omega, velocity + cross(omega, p))
+    w, dw, a = ((R.mT @ x[..., None])[..., 0] for x in (omega, alpha, at_link))
+    W = skew(w)
+    force = torch.cat([a[..., None], skew(dw) + W @ W, torch.zeros_like(_inertia_columns(w))], dim=-1)
+    torque = torch.cat(
+        [torch.zeros_like(a)[..., None], -skew(a), _inertia_columns(dw) + W @ _inertia_columns(w)], dim=-1
+    )
+    force = R @ force
+    torque = R @ torque + skew(p) @ force
+    Y = torch.einsum("...jc,...icp->...jip", angular, torque)
+    Y = Y + torch.einsum("...jc,...icp->...jip", linear, force)
+    return (Y * E.mT[..., None]).flatten(-2)
+
+
+def parameter_vector(robot: RobotModel) -> Float[Tensor, " p"]:
+    """π `(10 nq,)`: m, m c and the inertia about the link origin of each link in turn."""
+    return inertial_parameters(robot.mass, robot.com, robot.inertia).flatten()
+
+
+@dataclass(frozen=True)
+class BaseParameters:
+    """The combinations β = B π that act on the motion.
+
+    Attributes:
+        columns: indices in π of the r independent parameters that lead the combinations.
+        combination: B `(r, 10 nq)`, the identity in these columns.
+        names: of the combinations, such as `"Izz[joint_1] + 3 more"`.
+    """
+
+    columns: tuple[int, ...]
+    combination: np.ndarray
+    names: tuple[str, ...]
+
+    @property
+    def rank(self) -> int:
+        """Number r of base parameters."""
+        return len(self.columns)
+
+    def of(self, robot: RobotModel) -> np.ndarray:
+        """β of a robot with the same kinematics, `(r,)`."""
+        return self.combination @ parameter_vector(robot).detach().cpu().numpy()
+
+
+def base_parameters(robot: RobotModel, samples: int = 400, seed: int = 0) -> BaseParameters:
+    """Base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
+
+    Args:
+        robot: the robot.
+        samples: number of random states.
+        seed: of the random states.
+    """
+    random = np.random.default_rng(seed)
+    q, qd, qdd = (
+        torch.as_tensor(random.uniform(-r, r, (samples, robot.nq))).to(robot.axis) for r in (np.pi, 2.0, 4.0)
+    )
+    Y = regressor(robot, q, qd, qdd).detach().flatten(0, 1).cpu().double().numpy()
+    scale = np.linalg.norm(Y, axis=0)
+    acting = np.flatnonzero(scale > RANK * scale.max())
+    factors: Any = qr(Y[:, acting] / scale[acting], mode="r", pivoting=True)
+    R, pivots = factors
+    size = np.abs(np.diag(R))
+    rank = int((size > RANK * size[0]).sum())
+    # Y = Y_b B: the dependent columns are combinations of the independent ones.
+    K = solve_triangular(R[:rank, :rank], R[:rank, rank:])
+    lead, rest = acting[pivots[:rank]], acting[pivots[rank:]]
+    B = np.zeros((rank, Y.shape[1]))
+    B[np.arange(rank), lead] = 1.0
+    B[:, rest] = K * scale[rest] / scale[lead][:, None]
+    order = np.argsort(lead)
+    B, lead = B[order], lead[order]
+    return BaseParameters(
+        tuple(lead.tolist()), B, tuple(_name(robot, i, row) for i, row in zip(lead, B, strict=True))
+    )
+
+
+def _name(robot: RobotModel, column: int, row: np.ndarray) -> str:
+    others = int((np.abs(row) > 1e-8 * np.abs(row).max()).sum()) - 1
+    name = f"{PARAMETER_NAMES[column % 10]}[{robot.joint_names[column // 10]}]"
+    return f"{name} + {others} more" if others else name
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Least-squares estimate of the base parameters from a log.
+
+    Attributes:
+        base: what the base parameters are.
+        value, standard_error: `(r,)` estimate of β and its standard error.
+        covariance: `(r, r)` covariance of the estimate.
+        damping, friction: `(nq,)` viscous and Coulomb friction if they were asked for, else None.
+        noise_std: `(nq,)` standard deviation of the torque that remains [N m, N].
+        condition: condition number of the scaled problem; beyond about 100 the motion excites too little.
+    """
+
+    base: BaseParameters
+    value: np.ndarray
+    standard_error: np.ndarray
+    covariance: np.ndarray
+    damping: np.ndarray | None
+    friction: np.ndarray | None
+    noise_std: np.ndarray
+    condition: float
+
+
+def identify(
+    robot: RobotModel,
+    q: JointVector,
+    qd: JointVector,
+    qdd: JointVector,
+    tau: JointVector,
+    *,
+    friction: bool = False,
+) -> Identification:
+    """Identify base parameters from a log of free motion by weighted linear least squares.
+
+    Solves τ − armature q̈ = Y_b β (+ d q̇ + f_c tanh(q̇/v_0)) + ε, first with equal weights, then with each
+    joint weighted by the noise that the first pass leaves. The accelerations are taken as exact.
+
+    Args:
+        robot: its kinematics, gravity, drive inertia and v_0 are used, its inertial figures are not.
+        q, qd, qdd: `(n, nq)` the motion.
+        tau: `(n, nq)` measured joint force; without `friction`, less the dissipative part [N m, N].
+        friction: identify viscous and Coulomb friction with the inertial parameters.
+
+    Raises:
+        ShapeError: an argument does not fit the robot.
+        DataError: a value is not finite, there are too few samples, or the motion does not excite all.
+    """
+    robot.check_state(q=q, qd=qd, qdd=qdd, tau=tau)
+    if not all(bool(torch.isfinite(x).all()) for x in (q, qd, qdd, tau)):
+        raise DataError("the log has a value that is not finite", expected="finite q, qd, qdd and tau")
+    base = base_parameters(robot)
+    W = regressor(robot, q, qd, qdd)[..., list(base.columns)]
+    if friction:
+        columns = torch.diag_embed(qd), torch.diag_embed(torch.tanh(qd / robot.friction_velocity))
+        W = torch.cat([W, *columns], dim=-1)
+    W = W.detach().cpu().double().numpy()
+    y = (tau - robot.armature * qdd).detach().cpu().double().numpy()
+    n, nq, unknowns = W.shape
+    if n * nq <= unknowns or n < 2:
+        raise DataError(
+            "too few samples to identify the robot", expected=f"more than {unknowns // nq + 1}", got=n
+        )
+    freedom = n - unknowns / nq
+    x, _, _ = _least_squares(W, y, np.ones(nq))
+    # An exact log leaves no noise to weigh by.
+    floor = 1e-12 * np.abs(y).max() + 1e-300
+    first = np.sqrt(((y - W @ x) ** 2).sum(axis=0) / freedom)
+    x, covariance, condition = _least_squares(W, y, 1.0 / np.maximum(first, floor))
+    noise = np.sqrt(((y - W @ x) ** 2).sum(axis=0) / freedom)
+    r = base.rank
+    extra = x[r:].reshape(2, nq) if friction else (None, None)
+    covariance = covariance[:r, :r]
+    error = np.sqrt(np.diag(covariance))
+    return Identification(base, x[:r], error, covariance, extra[0], extra[1], noise, condition)
+
+
+def _least_squares(W: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Weighted solution, its covariance, and the condition of the problem with columns of unit length."""
+    A = (W * weights[:, None]).reshape(-1, W.shape[-1])
+    b = (y * weights).ravel()
+    scale = np.linalg.norm(A, axis=0)
+    if scale.min() <= RANK * scale.max():
+        raise DataError("the motion does not excite all parameters", expected="motion of every joint")
+    Q, R = np.linalg.qr(A / scale)
+    singular = np.linalg.svd(R, compute_uv=False)
+    if singular[-1] <= RANK * singular[0]:
+        raise DataError(
+            "the motion does not excite all parameters",
+            expected="motion that moves every joint, fast and slow, through many poses",
+            got=f"condition number {singular[0] / max(singular[-1], 1e-300):.3g}",
+        )
+    x = solve_triangular(R, Q.T @ b)
+    variance = ((b - (A / scale) @ x) ** 2).sum() / (len(b) - len(x))
+    inverse = solve_triangular(R, np.eye(len(x)))
+    covariance = variance * (inverse @ inverse.T) / np.outer(scale, scale)
+    return x / scale, covariance, float(singular[0] / singular[-1])

@@ -1,0 +1,167 @@
+"""Analytical parameters θ_A: the figures of a robot that are learned. The robot is frozen; θ_A makes robots.
+
+| quantity            | coordinates of each joint j                                         | number |
+|---------------------|---------------------------------------------------------------------|--------|
+| `inertia`           | log-Cholesky form of the pseudo-inertia of the link that j moves    | 10     |
+| `mass`              | log m of that link                                                  | 1      |
+| `com`               | centre of mass of that link [m]                                     | 3      |
+| `offset`            | turn (rotation vector) and shift [m] of j's placement               | 6      |
+| `damping`, `friction`, `stribeck`, `stribeck_velocity`, `friction_velocity`, `armature` | log | 1 each |
+
+Every value of the coordinates is a physical robot, as long as the robot they start from is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from forcegp.errors import InertiaError, ModelError, UnknownNameError
+from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, log_cholesky, pseudo_inertia
+from forcegp.robot.model import RobotModel
+
+POSITIVE = (
+    "mass", "damping", "friction", "stribeck", "stribeck_velocity", "friction_velocity", "armature",
+)  # fmt: skip
+QUANTITIES = ("inertia", "com", "offset", *POSITIVE)
+SMALLEST = 1e-3
+"""Where a friction or drive figure starts that is zero in the robot, since its logarithm is learned."""
+
+
+class AnalyticalParameters(nn.Module):
+    """The learnable figures of a robot; calling the module gives the robot that they describe.
+
+    The state dict holds one tensor a quantity, `coordinates.<quantity>`, one row a joint.
+
+    Args:
+        robot: the robot whose figures are the starting point, and all figures that are not learned.
+        learn: joint names by quantity, or `"all"` joints, such as `{"mass": ["joint_7"], "damping": "all"}`.
+            The inertia, mass and centre of mass named by a joint are those of the link that it moves.
+
+    Raises:
+        UnknownNameError: a quantity or a joint does not exist.
+        ModelError: nothing is learned, or the inertia of a link is learned twice.
+        InertiaError: the inertia of a link that is to be learned whole is not physical.
+    """
+
+    def __init__(self, robot: RobotModel, learn: Mapping[str, Sequence[str] | Literal["all"]]) -> None:
+        super().__init__()
+        self.start = robot
+        self.joints = {quantity: _joints(robot, quantity, names) for quantity, names in learn.items()}
+        _check(self.joints)
+        self._rows = {
+            quantity: torch.tensor([robot.joint_index(name) for name in names], device=robot.device)
+            for quantity, names in self.joints.items()
+        }
+        self.coordinates = nn.ParameterDict({name: self._initial(name) for name in self.joints})
+
+    def forward(self) -> RobotModel:
+        """The robot with the learned figures, differentiable in the coordinates."""
+        fields: dict[str, Tensor] = {}
+        for quantity, x in self.coordinates.items():
+            for name, rows in self._fields(quantity, x).items():
+                old = fields.get(name, getattr(self.start, name))
+                fields[name] = old.index_copy(0, self._rows[quantity], rows)
+        return self.start.replace(**fields)
+
+    def reset(
+        self,
+        generator: torch.Generator,
+        *,
+        relative: float = 0.0,
+        length: float = 0.0,
+        angle: float = 0.0,
+    ) -> None:
+        """Draw all coordinates uniformly from a window about the robot that they started from.
+
+        Args:
+            generator: the source of randomness.
+            relative: half width for logarithms: a figure varies by a factor of up to e^{±relative}.
+            length: half width for centres of mass, shifts and lengths [m].
+            angle: half width for turns [rad].
+        """
+        for quantity, x in self.coordinates.items():
+            half = torch.full_like(x, relative)
+            if quantity == "com":
+                half[:] = length
+            elif quantity == "offset":
+                half[:, :3], half[:, 3:] = angle, length
+            elif quantity == "inertia":
+                half[:, 4:] = length
+            noise = 2.0 * torch.rand(x.shape, generator=generator, dtype=torch.float64) - 1.0
+            x.data.copy_(self._initial(quantity).data + half * noise.to(x))
+
+    def _initial(self, quantity: str) -> nn.Parameter:
+        robot, rows = self.start, self._rows[quantity]
+        if quantity == "inertia":
+            for name, row in zip(self.joints[quantity], rows.tolist(), strict=True):
+                _check_inertia(robot, name, row)
+            J = pseudo_inertia(robot.mass[rows], robot.com[rows], robot.inertia[rows])
+            return nn.Parameter(log_cholesky(J))
+        if quantity == "com":
+            return nn.Parameter(robot.com[rows].clone())
+        if quantity == "offset":
+            return nn.Parameter(torch.zeros(len(rows), 6, dtype=robot.dtype, device=robot.device))
+        values = getattr(robot, quantity)[rows]
+        if quantity == "mass" and bool((values <= 0.0).any()):
+            name = self.joints[quantity][int(values.argmin())]
+            raise InertiaError(f"the link of joint {name!r} has no mass to learn", expected="a positive mass")
+        return nn.Parameter(torch.where(values > 0.0, values, torch.full_like(values, SMALLEST)).log())
+
+    def _fields(self, quantity: str, x: Tensor) -> dict[str, Tensor]:
+        if quantity == "inertia":
+            return dict(
+                zip(("mass", "com", "inertia"), from_pseudo_inertia(from_log_cholesky(x)), strict=True)
+            )
+        if quantity == "offset":
+            rows = self._rows[quantity]
+            turn = torch.linalg.matrix_exp(_cross_matrix(x[:, :3]))
+            return {
+                "placement_rotation": self.start.placement_rotation[rows] @ turn,
+                "placement_position": self.start.placement_position[rows] + x[:, 3:],
+            }
+        return {quantity: x if quantity == "com" else x.exp()}
+
+
+def _joints(robot: RobotModel, quantity: str, names: Sequence[str] | Literal["all"]) -> tuple[str, ...]:
+    if quantity not in QUANTITIES:
+        raise UnknownNameError("quantity to learn", quantity, QUANTITIES)
+    chosen = robot.joint_names if names == "all" else tuple(names)
+    for name in chosen:
+        robot.joint_index(name)
+    return tuple(dict.fromkeys(chosen))
+
+
+def _check(joints: Mapping[str, tuple[str, ...]]) -> None:
+    if not any(joints.values()):
+        raise ModelError("no analytical parameter is to be learned", expected="joints of some quantity")
+    for part in ("mass", "com"):
+        twice = set(joints.get("inertia", ())) & set(joints.get(part, ()))
+        if twice:
+            raise ModelError(
+                f"{part} and inertia of the link of joint {min(twice)!r} are both to be learned",
+                expected="one of them",
+                hint=f"inertia contains {part}: remove {part} for this joint",
+            )
+
+
+def _check_inertia(robot: RobotModel, joint: str, row: int) -> None:
+    try:
+        log_cholesky(pseudo_inertia(robot.mass[row], robot.com[row], robot.inertia[row]))
+    except InertiaError as error:
+        raise InertiaError(
+            f"the inertia of the link of joint {joint!r} is not physical, so it has no log-Cholesky form",
+            expected=error.expected,
+            got=error.got,
+            hint="learn its mass or com singly, or start from a robot with a physical inertia",
+        ) from error
+
+
+def _cross_matrix(v: Tensor) -> Tensor:
+    """[v]× of `(n, 3)` rotation vectors."""
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
