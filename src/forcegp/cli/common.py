@@ -49,7 +49,9 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
     times = (TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, *times, console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    # A file or a pipe gets no bar: its steps would only fill the log.
+    with Progress(*columns, *times, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(description, total=total)
         yield lambda done, total=None: bar.update(task, completed=done, total=total)
 

@@ -44,12 +44,13 @@ def fit(
 
     forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model/ --json
     """
-    from forcegp.models.registry import create
     from forcegp.scene import load_scene
 
     read = load_scene(scene)
     system = read.system()
     training = data_of_robot(read_data(data, differentiate), system.robot)
+    from forcegp.models.registry import create
+
     regression = create(model, system, noise_std=noise_std_of(noise_std, read, training), seed=seed)
     with progress_bar(f"fitting {model}", 1) as progress:
         result = regression.fit(training, progress=lambda done, most, _: progress(done, most))

@@ -34,7 +34,8 @@ def simulate(
     read = load_scene(scene)
     changes = {"duration": duration, "seed": seed}
     config = replace(read.simulation, **{name: v for name, v in changes.items() if v is not None})
+    system = read.system()
     with progress_bar("simulating", config.steps) as progress:
-        result = run(read.system(), config, progress=lambda done, _: progress(done))
+        result = run(system, config, progress=lambda done, _: progress(done))
     result.data.write(out)
     show({**result.summary(), "file": str(out)}, as_json)

@@ -105,7 +105,8 @@ def _listing(names: Sequence[str] | Columns) -> str:
 def _take(source: str, left: Columns, name: str, remedy: str | None = None) -> NDArray[np.generic]:
     if name in left:
         return left.pop(name)
-    near = get_close_matches(name, list(left), n=1, cutoff=0.75)
+    kin = [other for other in left if other.split(".", 1)[0] == name.split(".", 1)[0]]
+    near = get_close_matches(name, kin or list(left), n=1, cutoff=0.75)
     raise DataError(
         f"{source}: column {name!r} is missing",
         expected=name,

@@ -156,7 +156,9 @@ def validate(document: Document) -> SceneSections:
     try:
         return SceneSections.model_validate_json(text)
     except ValidationError as error:
-        raise _scene_error(document, error.errors()[0]) from error
+        # A misspelt key is also a missing one: the spelling is what there is to correct.
+        errors = sorted(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
+        raise _scene_error(document, errors[0]) from error
 
 
 def _scene_error(document: Document, error: ErrorDetails) -> SceneError:

@@ -1,0 +1,171 @@
+"""The command line as a user meets it: files in, files out, one message where something is wrong."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from forcegp.cli import app, main
+from forcegp.data import Dataset
+from logs import JOINTS, random_log
+
+COMMANDS = ("reproduce", "simulate", "select", "fit", "predict", "evaluate")
+
+
+def run(*arguments: object) -> str:
+    """Output of a command that succeeds."""
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert done.exit_code == 0, (done.output, done.exception)
+    return done.stdout
+
+
+Fail = Callable[..., str]
+
+
+@pytest.fixture
+def fail(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Fail:
+    """Runs a command that is to fail, and gives its message."""
+
+    def run_and_fail(*arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["forcegp", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, err = capfd.readouterr()
+        assert ended.value.code == 2
+        assert out == ""
+        return err
+
+    return run_and_fail
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    random_log(480).write(tmp_path / "run.parquet")
+    return tmp_path / "run.parquet"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_examples(command: str) -> None:
+    text = run(command, "--help")
+    assert "Examples" in text and f"forcegp {command}" in text
+
+
+def test_version() -> None:
+    assert run("--version").startswith("forcegp 0.")
+
+
+def test_select_writes_both_parts_and_their_provenance(log: Path, tmp_path: Path) -> None:
+    train, rest = tmp_path / "train.parquet", tmp_path / "rest.parquet"
+    result = json.loads(run("select", log, "-n", 50, "--out", train, "--rest", rest, "--json"))
+    assert result == {
+        "training_points": 50,
+        "training_file": str(train),
+        "test_points": 430,
+        "test_file": str(rest),
+    }
+    chosen, kept = Dataset.read(train), Dataset.read(rest)
+    assert not chosen.header.ordered and kept.header.ordered
+    assert "selected 50 training points of 480 rows by farthest points" in chosen.header.provenance[-1]
+    assert torch.equal(torch.cat([chosen.t, kept.t]).sort().values, Dataset.read(log).t)
+    again = tmp_path / "again.parquet"
+    run("select", log, "-n", 10, "--out", again)
+    assert torch.equal(Dataset.read(again).q, chosen.q[:10])
+
+
+def test_select_holds_out_stretches(log: Path, tmp_path: Path) -> None:
+    train, rest = tmp_path / "train.parquet", tmp_path / "rest.parquet"
+    options = ("--split", "stretches", "--stretch", 0.2, "--seed", 4, "--json")
+    result = json.loads(run("select", log, "-n", 50, "-o", train, "--rest", rest, *options))
+    assert len(result["held_out_rows"]) == 2
+    assert result["test_points"] == sum(b - a for a, b in result["held_out_rows"])
+    held = set(Dataset.read(rest).t.tolist())
+    assert not held & set(Dataset.read(train).t.tolist())
+
+
+def rename(log: Path, old: str, new: str) -> None:
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(log)
+    pq.write_table(table.rename_columns([new if c == old else c for c in table.column_names]), log)
+
+
+def test_a_wrong_joint_name_is_one_message(fail: Fail, log: Path, tmp_path: Path) -> None:
+    rename(log, "tau.elbow", "tau.elbwo")
+    message = fail("select", log, "-n", 5, "-o", tmp_path / "out.parquet")
+    assert message.startswith(f"error: {log}: column 'tau.elbow' is missing\n")
+    assert "hint: is 'tau.elbwo' the column that is meant?" in message
+    assert not (tmp_path / "out.parquet").exists()
+
+
+def test_a_nan_is_one_message(fail: Fail, log: Path, tmp_path: Path) -> None:
+    import numpy as np
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(log)
+    values = np.zeros(480)
+    values[17] = np.nan
+    pq.write_table(table.set_column(table.column_names.index("qd.wrist"), "qd.wrist", pa.array(values)), log)
+    message = fail("select", log, "-n", 5, "-o", tmp_path / "out.parquet")
+    assert "column 'qd.wrist' holds nan in row 17" in message and str(log) in message
+
+
+def test_a_log_of_another_robot_is_one_message(fail: Fail, log: Path, tmp_path: Path) -> None:
+    message = fail("fit", "--scene", "kuka_plane", "--data", log, "--out", tmp_path / "model")
+    assert "joint 'lbr_iiwa_joint_1' of robot 'kuka_iiwa' is not in the data" in message
+    assert ", ".join(JOINTS) in message
+
+
+@pytest.mark.parametrize("content", ["<robot", "not xml at all", ""])
+def test_an_unreadable_robot_file_is_one_message(fail: Fail, tmp_path: Path, content: str) -> None:
+    (tmp_path / "arm.urdf").write_text(content)
+    (tmp_path / "scene.toml").write_text('[robot]\nmodel = "arm.urdf"\n')
+    message = fail("simulate", "--scene", tmp_path / "scene.toml", "--out", tmp_path / "run.parquet")
+    assert message.startswith(f"error: {tmp_path / 'scene.toml'}:1: robot: ")
+    assert "arm.urdf" in message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("select", "missing.parquet", "-n", "5", "-o", "out.parquet"), "missing.parquet: no such file"),
+        (("simulate", "--scene", "kuka_plain", "--out", "run.parquet"), "did you mean 'kuka_plane'?"),
+        (("select", "missing.parquet"), "Missing option"),
+        (("selekt",), "No such command"),
+    ],
+)
+def test_what_is_not_there_is_one_message(
+    fail: Fail, arguments: tuple[str, ...], expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert expected in fail(*arguments)
+
+
+def test_a_place_that_cannot_be_written_is_one_message(fail: Fail, log: Path) -> None:
+    message = fail("select", log, "-n", 5, "-o", f"{log}/out.parquet")
+    assert message.startswith("error: ") and "run.parquet" in message
+
+
+def test_the_program_ends_without_a_traceback(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from forcegp.cli import main; main()", "simulate", "-s", "kuka_plain"]
+    done = subprocess.run([*command, "-o", str(tmp_path / "x.parquet")], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: kuka_plain: no such scene") and "Traceback" not in done.stderr
+
+
+def test_simulate_then_select(tmp_path: Path) -> None:
+    out = tmp_path / "run.parquet"
+    figures = json.loads(
+        run("simulate", "--scene", "kuka_plane", "--duration", 0.5, "--seed", 3, "--out", out, "--json")
+    )
+    assert figures["samples"] == 120 and figures["file"] == str(out)
+    data = Dataset.read(out)
+    assert len(data) == 120 and data.header.seed == 3 and data.header.noise_std == 0.1
+    run("select", out, "-n", 20, "-o", tmp_path / "train.parquet")
