@@ -114,7 +114,7 @@ def seeds() -> list[bytes]:
     """The files to mutate: bundled ones, arms of example-robot-data if it is installed, and MJCF models."""
     here = Path(__file__).resolve().parents[1]
     paths = sorted((Path(forcegp.__file__).parent / "robot/bundled").glob("*.urdf")) * 4
-    paths += [here / "tests/robot/data/branched.xml"] * 12
+    paths += [here / "tests/robot/data/branched.xml"] * 40
     spec = find_spec("cmeel")
     if spec is not None and spec.origin is not None:
         folder = Path(spec.origin).parents[1] / "cmeel.prefix/share/example-robot-data/robots"

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from forcegp import dynamics, kinematics
+    from forcegp import dynamics, identification, kinematics
     from forcegp.constraints import (
         Baumgarte,
         ConstrainedSystem,
@@ -20,10 +20,11 @@ if TYPE_CHECKING:
         SurfaceContact,
     )
     from forcegp.data import Dataset, SavitzkyGolay
-    from forcegp.robot import RobotModel, load_robot
+    from forcegp.robot import AnalyticalParameters, RobotModel, load_robot
     from forcegp.scene import Scene, load_scene
 
 _HOME = {
+    "AnalyticalParameters": "robot",
     "Baumgarte": "constraints",
     "ConstrainedSystem": "constraints",
     "Cylinder": "constraints",
@@ -37,6 +38,7 @@ _HOME = {
     "Sphere": "constraints",
     "SurfaceContact": "constraints",
     "dynamics": "",
+    "identification": "",
     "kinematics": "",
     "load_robot": "robot",
     "load_scene": "scene",
@@ -44,6 +46,7 @@ _HOME = {
 """The subpackage of each public name; empty where the name is a module itself."""
 
 __all__ = [
+    "AnalyticalParameters",
     "Baumgarte",
     "ConstrainedSystem",
     "Cylinder",
@@ -57,6 +60,7 @@ __all__ = [
     "Sphere",
     "SurfaceContact",
     "dynamics",
+    "identification",
     "kinematics",
     "load_robot",
     "load_scene",

@@ -12,6 +12,7 @@ import torch
 import forcegp
 from forcegp import dynamics, kinematics
 from forcegp.errors import InertiaError, RobotFileError, RobotFileWarning, UnsupportedRobotError
+from forcegp.robot.load import BUNDLED
 from robots import random_states
 
 RELATIVE = 1e-8  # MuJoCo diagonalises inertias on loading, which costs it some digits
@@ -139,10 +140,22 @@ def test_mujoco_error_is_passed_on_with_its_cause(tmp_path: Path) -> None:
         load_text(tmp_path, '<body><joint nane="j"/><geom size="1"/></body>')
 
 
+def test_warnings_of_mujoco_are_remarks_and_leave_no_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    twice = '<body name="b"><joint name="i"/><joint name="j"/><geom size="0.1"/></body>'
+    with pytest.raises(InertiaError, match=r"link 'b/(i|j)' of joint '(i|j)' moves without inertia"):
+        load_text(tmp_path, twice)
+    with pytest.warns(RobotFileWarning, match="MuJoCo warns: Inertia matrix is too close to singular"):
+        load_text(tmp_path, twice, locked_joints={"j": 0.0})
+    assert [path.name for path in tmp_path.iterdir()] == ["robot.xml"]
+
+
 def test_includes_come_from_the_same_folder_only_and_once(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(f"<mujocoinclude>{BODY.format('')}</mujocoinclude>")
     assert load_text(tmp_path, '<include file="arm.xml"/>').joint_names == ("hinge",)
-    for name in ("/etc/passwd", "../arm.xml", "arm\0.xml", "robot.xml"):
+    for name in ("/etc/passwd", "../arm.xml", "", ".", "none.xml", "arm\0.xml", "robot.xml"):
         with pytest.raises(RobotFileError, match=r"include of|not well-formed"):
             load_text(tmp_path, f'<include file="{name}"/>')
     (tmp_path / "arm.xml").write_text('<mujocoinclude><include file="arm.xml"/></mujocoinclude>')
@@ -159,3 +172,28 @@ def test_coupled_joint_can_be_locked(tmp_path: Path) -> None:
     assert robot.joint_names == ("hinge",)
     turn = kinematics.frame_pose(robot, torch.zeros(1, dtype=robot.dtype), "f")[0]
     assert turn[0, 0].item() == pytest.approx(np.cos(0.4))
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_urdf_and_the_mjcf_that_mujoco_makes_of_it_are_one_robot(tmp_path: Path, name: str) -> None:
+    urdf = Path(forcegp.__file__).parent / "robot/bundled" / f"{name}.urdf"
+    text = urdf.read_text().replace("</robot>", '<mujoco><compiler fusestatic="false"/></mujoco></robot>')
+    spec = mujoco.MjSpec.from_string(text)
+    spec.compile()
+    path = tmp_path / f"{name}.xml"
+    path.write_text(spec.to_xml())
+    ours, converted = forcegp.load_robot(urdf), forcegp.load_robot(path)
+    assert converted.joint_names == ours.joint_names
+    states = random_states(ours, 4)[:3]
+    expected = dynamics.inverse_dynamics(ours, *states)
+    # MuJoCo writes numbers with six digits or so.
+    torch.testing.assert_close(dynamics.inverse_dynamics(converted, *states), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(converted.lower, ours.lower, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(converted.friction, ours.friction, rtol=1e-4, atol=1e-4)
+    for frame in ours.frame_names[1:]:
+        torch.testing.assert_close(
+            kinematics.frame_pose(converted, states[0], frame),
+            kinematics.frame_pose(ours, states[0], frame),
+            rtol=1e-4,
+            atol=1e-4,
+        )

@@ -149,7 +149,7 @@ def test_learning_recovers_the_mass_and_offset_it_started_from(robot: forcegp.Ro
     assert theta().mass[-1].item() == pytest.approx(robot.mass[-1].item(), rel=1e-3)
     # The turn about the last axis and nothing else is lost in a redefinition of q7 and of the link axes.
     shift = theta.coordinates["offset"][0, 3:]
-    assert float(shift.abs().max()) < 1e-3
+    assert shift.abs().max().item() < 1e-3
 
 
 def test_wrong_requests_are_refused(robot: forcegp.RobotModel) -> None:
@@ -171,3 +171,22 @@ def test_wrong_requests_are_refused(robot: forcegp.RobotModel) -> None:
     massless = robot.replace(mass=torch.zeros_like(robot.mass))
     with pytest.raises(InertiaError, match="'lbr_iiwa_joint_1' has no mass to learn"):
         AnalyticalParameters(massless, {"mass": "all"})
+
+
+def test_torch_func_differentiates_through_the_robot(robot: forcegp.RobotModel) -> None:
+    """jacrev over the coordinates equals the regressor's columns, scaled by the mass for its logarithm."""
+    q, qd, qdd, _ = random_states(robot, 3)
+    theta = AnalyticalParameters(robot, {"mass": [LAST], "damping": "all"})
+
+    def tau(coordinates: dict[str, torch.Tensor]) -> torch.Tensor:
+        made = torch.func.functional_call(theta, coordinates)
+        return dynamics.inverse_dynamics(made, q, qd, qdd) - dynamics.damping_force(made, qd)
+
+    jacobian = torch.func.jacrev(tau)(dict(theta.named_parameters()))
+    expected = torch.diag_embed(robot.damping * qd)
+    torch.testing.assert_close(jacobian["coordinates.damping"], expected, rtol=1e-12, atol=1e-12)
+    without = robot.replace(mass=robot.mass * torch.tensor([1.0] * 6 + [0.0], dtype=robot.dtype))
+    difference = [dynamics.inverse_dynamics(r, q, qd, qdd) for r in (robot, without)]
+    torch.testing.assert_close(
+        jacobian["coordinates.mass"][..., 0], difference[0] - difference[1], rtol=1e-10, atol=1e-10
+    )

@@ -1,6 +1,7 @@
-"""The frozen robot model and its readers."""
+"""The frozen robot model, its readers, and what can be learned of it."""
 
 from forcegp.robot.load import load_robot
 from forcegp.robot.model import RobotModel
+from forcegp.robot.parameters import AnalyticalParameters
 
-__all__ = ["RobotModel", "load_robot"]
+__all__ = ["AnalyticalParameters", "RobotModel", "load_robot"]

@@ -39,7 +39,7 @@ def load_robot(
         source: `"kuka_iiwa"`, `"franka_panda"`, `"double_pendulum"`, or the path of a file.
         base_position: position of the root link in the world [m].
         base_rpy: its roll, pitch and yaw about the world's axes [rad].
-        gravity: gravitational acceleration in the world [m/s²].
+        gravity: gravitational acceleration in the world [m/s²]; what an MJCF file says of it is not used.
         locked_joints: joints to hold at a position [rad, m], as if they were fixed in the file.
         dtype: floating-point type of all constants.
         device: device of all constants.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -38,7 +40,8 @@ def read_mjcf(root: Element, path: Path) -> Tree:
         InertiaError: a mass or an inertia is not physical.
     """
     document, coupled, remarks = reduce_mjcf(root, path)
-    model = _compile(document, str(path))
+    with _warnings_of_mujoco(str(path), remarks):
+        model = _compile(document, str(path))
     names = _names(model, "body", model.nbody)
     joint_names = _names(model, "jnt", model.njnt)
     links = [Link(names[0])]
@@ -58,6 +61,17 @@ def read_mjcf(root: Element, path: Path) -> Tree:
         sites=_sites(model, names),
         remarks=tuple(remarks),
     )
+
+
+@contextmanager
+def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
+    """Collect MuJoCo's warnings, which would else go to a log file in the working folder."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: remarks.append(f"{label}: MuJoCo warns: {text}"))
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _compile(document: Element, label: str) -> Any:

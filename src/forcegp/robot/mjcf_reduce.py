@@ -93,14 +93,14 @@ def _included(include: Element, folder: Path, seen: set[Path], path: Path) -> El
     name = include.get("file", "")
     try:
         target = (folder / name).resolve()
-        inside = target.is_relative_to(folder)
+        inside = target.is_relative_to(folder) and target.is_file()
     except (ValueError, OSError, RuntimeError):
         target, inside = folder, False
     if not inside or target in seen:
         raise RobotFileError(
             f"{path}: include of {name!r} is refused",
             expected="a file in the folder of the robot file, included once",
-            got="it was included before" if target in seen else "a file elsewhere",
+            got="it was included before" if target in seen else "a file elsewhere, or none",
         )
     seen.add(target)
     return parse_xml(read_bytes(target), str(target))

@@ -63,7 +63,7 @@ class AnalyticalParameters(nn.Module):
         fields: dict[str, Tensor] = {}
         for quantity, x in self.coordinates.items():
             for name, rows in self._fields(quantity, x).items():
-                old = fields.get(name, getattr(self.start, name))
+                old = fields[name] if name in fields else getattr(self.start, name)
                 fields[name] = old.index_copy(0, self._rows[quantity], rows)
         return self.start.replace(**fields)
 
