@@ -77,7 +77,7 @@ def test_joint_figures_are_read(pair: tuple[forcegp.RobotModel, mujoco.MjModel])
     assert robot.damping.tolist() == [0.3] * 6
     assert robot.friction.tolist() == [0, 0.4, 0, 0, 0, 0]
     assert (robot.lower[:3].tolist(), robot.upper[:3].tolist()) == ([-1, -0.2, -np.inf], [1.5, 0.3, np.inf])
-    assert robot.effort_limit[:2].tolist() == [40, np.inf]
+    assert robot.effort_limit.tolist() == [40, 40, 87, np.inf, np.inf, np.inf]
 
 
 @pytest.mark.parametrize(

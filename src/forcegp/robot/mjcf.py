@@ -145,7 +145,6 @@ def _joint(
     axis = model.jnt_axis[j].copy()
     start = float(model.qpos0[model.jnt_qposadr[j]])
     limits = model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf)
-    effort = np.abs(model.jnt_actfrcrange[j]).max() if model.jnt_actfrclimited[j] else np.inf
     return Joint(
         name=name,
         kind=kind,
@@ -158,9 +157,31 @@ def _joint(
         armature=float(model.dof_armature[dof]),
         lower=float(limits[0]),
         upper=float(limits[1]),
-        effort=float(effort),
+        effort=_effort(model, j),
         refused=refused,
     )
+
+
+def _effort(model: Any, j: int) -> float:
+    """Largest force that joint and actuators let through; motors also limit it by their control."""
+    effort = float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
+    drives = [
+        a
+        for a in range(model.nu)
+        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[a, 0] == j
+    ]
+    if not drives:
+        return effort
+    return min(effort, sum(_drive_effort(model, a) for a in drives))
+
+
+def _drive_effort(model: Any, a: int) -> float:
+    gear, limit = abs(float(model.actuator_gear[a, 0])), np.inf
+    if model.actuator_forcelimited[a]:
+        limit = float(np.abs(model.actuator_forcerange[a]).max())
+    if model.actuator_ctrllimited[a] and model.actuator(a).name.startswith("motor"):
+        limit = min(limit, float(np.abs(model.actuator_ctrlrange[a]).max()))
+    return gear * limit if limit < np.inf else np.inf
 
 
 def _sites(model: Any, names: list[str]) -> tuple[Site, ...]:

@@ -14,7 +14,7 @@ from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
 from forcegp.robot.safety import MAX_ELEMENTS, MAX_NUMBER, parse_xml, read_bytes
 
 _IGNORED_SECTIONS = (
-    "size", "statistic", "visual", "asset", "contact", "sensor", "keyframe", "custom", "actuator", "tendon",
+    "size", "statistic", "visual", "asset", "contact", "sensor", "keyframe", "custom", "tendon",
 )  # fmt: skip
 _BODY_PARTS = ("body", "frame", "joint", "freejoint", "inertial", "site", "geom")
 _IGNORED_PARTS = ("camera", "light")
@@ -24,6 +24,8 @@ _COMPILER = (
     "eulerseq", "inertiafromgeom", "inertiagrouprange", "alignfree",
 )  # fmt: skip
 _NO_MESH = ("material", "mesh", "hfield", "user")
+_ACTUATORS = ("motor", "general", "position", "velocity", "intvelocity", "damper")
+_ACTUATOR_LIMITS = ("gear", "forcerange", "forcelimited", "ctrlrange", "ctrllimited")
 _WORDS = ("name", "class", "childclass", "user", "joint1", "joint2")
 
 
@@ -56,6 +58,8 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, str], lis
             document.append(_copy_default(section))
         elif section.tag == "worldbody":
             document.append(_copy_body(section, any(from_geoms), f"{path}: body"))
+        elif section.tag == "actuator":
+            document.append(_copy_actuators(section))
         elif section.tag == "equality":
             coupled.update(_couplings(section, path))
         elif section.tag not in _IGNORED_SECTIONS:
@@ -113,11 +117,31 @@ def _fluid(option: Element, where: str) -> list[str]:
 
 def _copy_default(default: Element) -> Element:
     copy = Element("default", default.attrib)
+    limits = {}
     for child in default:
         if child.tag == "default":
             copy.append(_copy_default(child))
         elif child.tag in _DEFAULTS:
             SubElement(copy, child.tag, {k: v for k, v in child.attrib.items() if k not in _NO_MESH})
+        elif child.tag in _ACTUATORS:
+            limits |= _actuator_limits(child)
+    if limits:
+        SubElement(copy, "general", limits)
+    return copy
+
+
+def _actuator_limits(actuator: Element) -> dict[str, str]:
+    return {k: actuator.attrib[k] for k in _ACTUATOR_LIMITS if k in actuator.attrib}
+
+
+def _copy_actuators(section: Element) -> Element:
+    """Actuators of joints with nothing but their limits; the name says whether the control is the force."""
+    copy = Element("actuator")
+    for i, actuator in enumerate(section):
+        if actuator.tag in _ACTUATORS and actuator.get("joint"):
+            name = f"{'motor' if actuator.tag == 'motor' else 'servo'}_{i}"
+            kept = {k: actuator.attrib[k] for k in ("class", "joint") if k in actuator.attrib}
+            SubElement(copy, "general", {"name": name, **kept, **_actuator_limits(actuator)})
     return copy
 
 
