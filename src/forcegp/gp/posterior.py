@@ -71,6 +71,13 @@ class ForcePosterior:
         ]
         return sum(parts[1:], start=parts[0]).mT
 
+    def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
+        """Posterior mean of Q̄ = m + Σ E f, `(n, nq)`: the force field of a rollout."""
+        force = self.mean(system, at)
+        for p, (prior, x) in enumerate(zip(self.priors, self.features(system, at), strict=True)):
+            force = force + (prior.operator(system, at) @ self.latent_mean(p, x)[..., None])[..., 0]
+        return force
+
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
         """Posterior mean of a quantity, o + B(m + Σ E f), `(n, d)`."""
         mean = prior_mean(system, at, z, self.mean)

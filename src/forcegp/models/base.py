@@ -6,12 +6,22 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
+from forcegp.gp.priors import States
+
+if TYPE_CHECKING:
+    from forcegp.rollout.forward import Torque
+    from forcegp.rollout.trajectory import Rollout
+
+ForceField = Callable[[ConstrainedSystem, States], Tensor]
+"""The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""
 
 FitProgress = Callable[[int, int, float], None]
 """Called with the evaluations made, the most that will be made, and the objective."""
@@ -94,6 +104,54 @@ class Model(ABC):
         covariance: bool = True,
     ) -> Prediction:
         """Predict a quantity at states `(*batch, nq)`; `active` `(*batch, n_contacts)` defaults to all."""
+
+    def force_field(self) -> ForceField | None:
+        """The mean impressed force Q̄ `(n, nq)` at states, or `None` for a model of accelerations alone.
+
+        Raises:
+            ModelError: the model has not been fitted.
+        """
+        return None
+
+    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
+        """Force functions drawn from the posterior, all evaluated at once.
+
+        Args:
+            samples: number S of functions.
+            generator: source of the draws.
+
+        Returns:
+            A force field on `(S * k, nq)` states, of which the s-th run of k belongs to function s.
+
+        Raises:
+            ModelError: the model has no posterior over force functions, or has not been fitted.
+        """
+        raise ModelError(
+            f"a {self.kind!r} model has no function samples", hint="use StructuredGP, or samples=0"
+        )
+
+    def rollout(
+        self,
+        q0: Tensor,
+        qd0: Tensor,
+        tau: Torque,
+        duration: float = 10.0,
+        samples: int = 0,
+        **settings: Any,
+    ) -> Rollout:
+        """Predict trajectories from initial states (section 4); see `forcegp.rollout.rollout_model`.
+
+        Args:
+            q0, qd0: `(*batch, nq)` initial states.
+            tau: motor torque over time `(samples, nq)` or `(*batch, samples, nq)`, or a law of (t, q, q̇).
+            duration: simulated time [s].
+            samples: number of function samples that are integrated too.
+            **settings: `options`, `seed`, `active`, `system` and `progress` of `rollout_model`.
+        """
+        # A rollout is built on models, so that its module cannot be imported before this one.
+        from forcegp.rollout.forward import rollout_model
+
+        return rollout_model(self, q0, qd0, tau, duration, samples, **settings)
 
     @abstractmethod
     def save(self, path: str | Path) -> None:

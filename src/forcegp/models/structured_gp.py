@@ -22,7 +22,7 @@ from forcegp.gp.mean import AnalyticalMean, mean_of
 from forcegp.gp.posterior import ForcePosterior, posterior
 from forcegp.gp.priors import ForcePrior, JointForcePrior, Standardization, States, check_priors, states
 from forcegp.gp.whitening import Measurement, WhitenedRows, combine, whiten
-from forcegp.models.base import FitProgress, FitResult, Model, Prediction, not_fitted
+from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction, not_fitted
 from forcegp.models.observation import NoiseStd, Observation, measurement_of
 
 NOISE = "noise"
@@ -303,6 +303,9 @@ class StructuredGP(Model):
             None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
             _parts(system, at, quantity),
         )
+
+    def force_field(self) -> ForceField:
+        return self.posterior.total_force
 
     def save(self, path: str | Path) -> None:
         """Write the model as a folder; `forcegp.load_model` reads it back exactly."""

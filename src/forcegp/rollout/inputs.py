@@ -1,0 +1,165 @@
+"""Motor torques of a rollout: an array over time, or a feedback law."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem, Equations
+from forcegp.errors import ShapeError, UnknownNameError
+from forcegp.simulate.control import Gains, Target, control_torque, tool_motion
+from forcegp.simulate.plan import Plan
+
+INTERPOLATIONS = ("hold", "linear")
+EDGE = 1e-6
+"""Part of a sampling period within which a time counts as a sampling time, against rounding."""
+
+
+class Reached(NamedTuple):
+    """The states that a rollout has come to.
+
+    Attributes:
+        system: robot and contacts.
+        eom: their equations of motion.
+        q, qd: `(n, nq)`.
+    """
+
+    system: ConstrainedSystem
+    eom: Equations
+    q: Tensor
+    qd: Tensor
+
+
+class Inputs(ABC):
+    """Motor torque as a function of time and state."""
+
+    @abstractmethod
+    def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
+        """Q_u `(n, nq)` [N m].
+
+        Args:
+            t: `(n, 1)` time [s].
+            end: `(n, 1)` end of the step that the torque is for; at t = end a torque that jumps has
+                the value before the jump.
+            at: the state, and the equations of motion there.
+        """
+
+
+@dataclass(frozen=True)
+class Sampled(Inputs):
+    """Torques over time, held or interpolated between samples; the last one is held.
+
+    Args:
+        values: `(n or 1, samples, nq)`.
+        dt: sampling period [s].
+        linear: interpolate linearly instead of holding each sample.
+    """
+
+    values: Tensor
+    dt: float
+    linear: bool = False
+
+    def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
+        last = self.values.shape[1] - 1
+        k = torch.floor(t / self.dt + EDGE)
+        k = torch.minimum(k, torch.ceil(end / self.dt - EDGE) - 1.0).clamp(0, last)
+        before = self._at(k)
+        if not self.linear:
+            return before
+        after = self._at((k + 1).clamp(max=last))
+        return before + (t / self.dt - k).clamp(0.0, 1.0) * (after - before)
+
+    def _at(self, k: Tensor) -> Tensor:
+        index = k[:, 0].long()
+        if len(self.values) == 1:
+            return self.values[0, index]
+        return self.values[torch.arange(len(index), device=index.device), index]
+
+
+@dataclass(frozen=True)
+class Feedback(Inputs):
+    """A law of one's own, `(t, q, qd)` → τ, of tensors `(n, 1)`, `(n, nq)`, `(n, nq)`."""
+
+    function: Callable[[Tensor, Tensor, Tensor], Tensor]
+
+    def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
+        return self.function(t, at.q, at.qd).expand_as(at.q)
+
+
+@dataclass(frozen=True)
+class TaskSpaceControl(Inputs):
+    """The simulator's task-space controller following a plan, with the analytical mechanics of a system.
+
+    Args:
+        system: the mechanics that the controller believes in.
+        plan: what it follows.
+        dt: sampling period of the plan [s].
+        gains: its gains.
+        limit: `(nq,)` torque limits [N m]; `None` for the robot's own.
+    """
+
+    system: ConstrainedSystem
+    plan: Plan
+    dt: float
+    gains: Gains
+    limit: Tensor | None = None
+
+    def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
+        robot, eom, q, qd = self.system.robot, at.eom, at.q, at.qd
+        if at.system.robot is not robot:
+            eom = self.system.equations(q, qd)
+        tool = tool_motion(robot, eom.poses, eom.motion, qd, self.plan.frame, self.plan.point)
+        k = torch.floor(t[:, 0] / self.dt + EDGE).long().clamp(max=len(self.plan.reference.t) - 1)
+        target = Target(*(values[k] for values in self.plan.targets))
+        wanted = control_torque(tool, eom, q, qd, target, self._normal(eom, q), self.gains)
+        limit = robot.effort_limit if self.limit is None else self.limit
+        return wanted.clamp(-limit, limit)
+
+    def _normal(self, eom: Equations, q: Tensor) -> Tensor:
+        """Unit normal of the surface below the tool; zero in free space, where there is nothing to push."""
+        if self.plan.contact is None:
+            return q.new_zeros(len(q), 3)
+        return torch.nn.functional.normalize(eom.contact_points[self.plan.contact].normal, dim=-1)
+
+
+def inputs_of(
+    tau: Tensor | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor],
+    batch: torch.Size,
+    rows: int,
+    dt: float,
+    interpolation: str,
+) -> Inputs:
+    """Inputs from what a caller gives.
+
+    Args:
+        tau: `(*batch, samples, nq)` or `(samples, nq)`, a law of (t, q, q̇), or inputs ready made.
+        batch: batch of the initial states.
+        rows: number of trajectories; a multiple of the batch.
+        dt: sampling period of an array [s].
+        interpolation: `"hold"` or `"linear"`.
+
+    Raises:
+        UnknownNameError: no such interpolation.
+        ShapeError: the array does not fit the initial states.
+    """
+    if interpolation not in INTERPOLATIONS:
+        raise UnknownNameError("interpolation", interpolation, INTERPOLATIONS)
+    if isinstance(tau, Inputs):
+        return tau
+    if not isinstance(tau, Tensor):
+        return Feedback(tau)
+    if tau.ndim < 2 or tau.shape[-2] == 0 or tau.shape[:-2] not in (torch.Size(), batch):
+        raise ShapeError(
+            "the torques do not fit the initial states",
+            expected=f"shape (samples, nq) or {(*batch, 'samples', 'nq')}",
+            got=tuple(tau.shape),
+        )
+    values = tau.reshape((-1, *tau.shape[-2:]))
+    if len(values) > 1:
+        values = values.expand(rows // len(values), *values.shape).flatten(0, 1)
+    return Sampled(values, dt, interpolation == "linear")

@@ -1,0 +1,153 @@
+"""The result of a rollout: trajectories, drift, multipliers, contacts, and what samples say of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forcegp import kinematics
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ModelError, NumericalError
+from forcegp.rollout.contact import ContactEvent
+
+
+class Divergence(NamedTuple):
+    """A trajectory that was given up.
+
+    Attributes:
+        t: time of its last trustworthy state [s].
+        row: index of the trajectory in the flattened batch.
+        q, qd: that state.
+        reason: what was wrong with the next one.
+    """
+
+    t: float
+    row: int
+    q: list[float]
+    qd: list[float]
+    reason: str
+
+
+class DivergedError(NumericalError):
+    """A rollout in which a trajectory diverged; `rollout` holds all that was computed."""
+
+    def __init__(self, diverged: Sequence[Divergence], rows: int, rollout: Rollout) -> None:
+        self.rollout = rollout
+        first = diverged[0]
+        super().__init__(
+            f"{len(diverged)} of {rows} trajectories diverge, the first at t = {first.t:.4f} s",
+            expected="finite states and joint speeds below the speed limit",
+            got=f"{first.reason}, after q = {first.q}, qd = {first.qd}",
+            hint="a smaller step, another stabilization, or on_divergence='keep'; the error's `rollout` "
+            "holds what was computed",
+        )
+
+
+class Bands(NamedTuple):
+    """Pointwise quantiles over samples.
+
+    Attributes:
+        lower, upper: bounds of the central band.
+        median: the middle.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    median: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """Trajectories of a batch of initial states at T times; NaN after a trajectory diverged.
+
+    Attributes:
+        system: robot and contacts, with the stabilization of the rollout.
+        t: `(T,)` [s].
+        q, qd, qdd, tau: `(*batch, T, nq)`.
+        multiplier: λ `(*batch, T, m)` [N]; NaN where the model knows no forces.
+        c, cd: `(*batch, T, m)` constraint error and its rate, of all contacts, open or closed [m], [m/s].
+        active: `(*batch, T, n_contacts)` bool, closed contacts.
+        events: contacts that opened and closed.
+        diverged: trajectories that were given up.
+        samples: trajectories of function samples, batch `(S, *batch)`.
+    """
+
+    system: ConstrainedSystem
+    t: Tensor
+    q: Tensor
+    qd: Tensor
+    qdd: Tensor
+    tau: Tensor
+    multiplier: Tensor
+    c: Tensor
+    cd: Tensor
+    active: Tensor
+    events: Sequence[ContactEvent] = ()
+    diverged: Sequence[Divergence] = ()
+    samples: Rollout | None = field(default=None)
+
+    @property
+    def batch(self) -> torch.Size:
+        """Shape of the batch."""
+        return self.q.shape[:-2]
+
+    @property
+    def rows(self) -> int:
+        """Number of trajectories."""
+        return self.batch.numel()
+
+    @property
+    def drift(self) -> Tensor:
+        """`(*batch, T, m)` c(q) of closed contacts, 0 where open [m]."""
+        rows = self.system.active_rows(self.active, self.active.shape[:-1])
+        return torch.where(rows, self.c, 0.0)
+
+    def tip(self, frame: str, point: Sequence[float] = (0.0, 0.0, 0.0)) -> Tensor:
+        """World position `(*batch, T, 3)` of a point fixed in a frame [m]; NaN after a divergence."""
+        return kinematics.point_position(self.system.robot, self.q, frame, tuple(point))
+
+    def bands(self, values: Tensor, level: float = 0.9) -> Bands:
+        """Central band of a quantity over function samples.
+
+        Args:
+            values: `(S, …)`, such as `rollout.samples.multiplier`; NaN of diverged samples are left out.
+            level: part of the samples that the band holds, between 0 and 1.
+        """
+        tail = 0.5 * (1.0 - level)
+        quantiles = torch.tensor([tail, 1.0 - tail, 0.5], dtype=values.dtype, device=values.device)
+        return Bands(*torch.nanquantile(values, quantiles, dim=0))
+
+    def need_samples(self) -> Rollout:
+        """The sampled trajectories.
+
+        Raises:
+            ModelError: the rollout was made without samples.
+        """
+        if self.samples is None:
+            raise ModelError("the rollout has no samples", hint="pass samples=100 to rollout")
+        return self.samples
+
+    def contact_lost(self) -> Tensor:
+        """`(*batch, T, n_contacts)` probability that a contact was open at a time or before, over samples.
+
+        Raises:
+            ModelError: the rollout was made without samples.
+        """
+        lost = (~self.need_samples().active).cumsum(-2) > 0
+        return lost.to(self.q.dtype).mean(0)
+
+    def __getitem__(self, index: object) -> Rollout:
+        """The trajectories of some members of the batch; events keep their row of the whole batch."""
+        names = ("q", "qd", "qdd", "tau", "multiplier", "c", "cd", "active")
+        chosen = {name: getattr(self, name)[index] for name in names}
+        samples = None if self.samples is None else self.samples[(slice(None), *_as_tuple(index))]
+        return dataclasses.replace(self, **chosen, samples=samples)
+
+
+def _as_tuple(index: object) -> tuple:
+    return index if isinstance(index, tuple) else (index,)
