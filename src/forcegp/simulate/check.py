@@ -28,6 +28,7 @@ class EngineCheck:
         inverse_dynamics: [N m].
         free_acceleration: of one step under a random force [rad/s²].
         constrained_acceleration: of one step with the constraint force and joint friction applied [rad/s²].
+        largest_acceleration: largest acceleration of all these steps, for scale [rad/s²].
     """
 
     engine: str
@@ -36,13 +37,15 @@ class EngineCheck:
     inverse_dynamics: float
     free_acceleration: float
     constrained_acceleration: float
+    largest_acceleration: float
 
     def __str__(self) -> str:
         return (
             f"{self.engine}, {self.states} random states, largest differences: "
             f"mass matrix {self.mass_matrix:.1e} kg m², inverse dynamics {self.inverse_dynamics:.1e} N m, "
             f"free acceleration {self.free_acceleration:.1e} rad/s², "
-            f"constrained acceleration {self.constrained_acceleration:.1e} rad/s²"
+            f"constrained acceleration {self.constrained_acceleration:.1e} rad/s² "
+            f"(of {self.largest_acceleration:.0f})"
         )
 
 
@@ -69,6 +72,8 @@ def check_engine(
         q, qd, qdd, force = draw(1.0).clamp(-1.0, 1.0) * math.pi, draw(1.0), draw(5.0), draw(20.0)
         eom = system.equations(q, qd)
         Q_bar = eom.Q_K + force
+        free = dynamics.forward_dynamics(robot, q, qd, force)
+        constrained = eom.acceleration(Q_bar)
         held = force + eom.Q_D + eom.constraint_force(Q_bar)
         return EngineCheck(
             engine=engine.name,
@@ -78,10 +83,9 @@ def check_engine(
                 torch.stack([engine.inverse_dynamics(*x) for x in zip(q, qd, qdd, strict=True)])
                 - dynamics.inverse_dynamics(robot, q, qd, qdd)
             ),
-            free_acceleration=_largest(
-                _step(engine, q, qd, force) - dynamics.forward_dynamics(robot, q, qd, force)
-            ),
-            constrained_acceleration=_largest(_step(engine, q, qd, held) - eom.acceleration(Q_bar)),
+            free_acceleration=_largest(_step(engine, q, qd, force) - free),
+            constrained_acceleration=_largest(_step(engine, q, qd, held) - constrained),
+            largest_acceleration=max(_largest(free), _largest(constrained)),
         )
 
 

@@ -69,7 +69,7 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
     from forcegp.simulate.mujoco import MuJoCoEngine
     from forcegp.simulate.pybullet import PyBulletEngine
 
-    makers = {"pybullet": PyBulletEngine, "mujoco": MuJoCoEngine}
+    makers = dict(zip(ENGINES, (PyBulletEngine, MuJoCoEngine), strict=True))
     if name != "auto" and name not in makers:
         raise UnknownNameError("engine", name, ["auto", *makers])
     if name != "auto":

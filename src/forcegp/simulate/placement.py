@@ -22,7 +22,7 @@ MAX_STEP = 0.3
 DAMPING = 0.1
 """Damping of the squares in proportion to the squared error, so that it fades as the pose is reached."""
 LEANING = 0.1
-"""Share of the way to the preferred joint positions that each step takes in the null space of the pose."""
+"""Share of the way to the preferred joint positions that a step takes in the null space of the pose."""
 
 
 def inverse_kinematics(
@@ -36,7 +36,7 @@ def inverse_kinematics(
 ) -> JointVector:
     """Joint positions that put a point of a frame at a pose, by damped least squares from many starts.
 
-    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e plus a step towards `near` in the null space of J.
+    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move towards `near` in the null space of J.
 
     Args:
         robot: the robot.
@@ -54,9 +54,11 @@ def inverse_kinematics(
     """
     index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
     q = starts.clamp(robot.lower, robot.upper)
-    for _ in range(ITERATIONS):
+    for k in range(ITERATIONS):
         error, J, _ = _pose_error(robot, q, index, x, position, rotation)
-        q = q + _damped_step(J, error, LEANING * (near - q)).clamp(-MAX_STEP, MAX_STEP)
+        # Leaning against a joint limit would keep the pose from being reached, so the last steps do not.
+        leaning = LEANING * (near - q) if k < ITERATIONS // 2 else torch.zeros_like(q)
+        q = q + _damped_step(J, error, leaning).clamp(-MAX_STEP, MAX_STEP)
         q = q.clamp(robot.lower, robot.upper)
     error, _, aligned = _pose_error(robot, q, index, x, position, rotation)
     found = q[(error.abs().amax(-1) < POSE_TOLERANCE) & aligned]

@@ -19,6 +19,9 @@ from forcegp.simulate.touch import any_row, contact_forces, land
 
 RUNAWAY_SPEED = 50.0
 """A joint faster than this [rad/s] is no motion that anybody planned."""
+PROGRESS_STRIDE = 24
+"""Steps between two calls of the progress function, a tenth of a second at 240 Hz."""
+
 ON_SURFACE = 1e-8
 """A contact is closed at the start where the error is below this [m]; placement leaves less."""
 
@@ -35,10 +38,13 @@ def simulate(
     task-space controller, the normal force Q_I from the constrained equations of motion with their
     Baumgarte terms, and Q_z is viscous friction at the contact (section 5 of the paper).
 
+    Surface contacts are unilateral: one opens when its multiplier would turn negative, and closes with an
+    inelastic impact. The run is computed on the CPU, where the data stay.
+
     Args:
         system: robot and contacts; without contacts the motion is free.
         config: what is simulated.
-        progress: called as the run goes on.
+        progress: called every few steps, and after the last.
 
     Returns:
         The data set with the reference, the actual motion of the tool and figures on the run.
@@ -48,6 +54,7 @@ def simulate(
         MissingDependencyError: the engine is not installed.
         ForceGPError: the robot has fewer than six joints.
     """
+    system = system.with_robot(system.robot.to(device="cpu"))
     generator = torch.Generator().manual_seed(config.seed)
     with torch.no_grad():
         plan = make_plan(system, config, generator)
@@ -85,7 +92,7 @@ def _follow(
         closed, (q, qd_next) = touch.closed, engine.state()
         log.qdd[k] = (qd_next - qd) / config.dt
         qd = qd_next
-        if progress is not None:
+        if progress is not None and ((k + 1) % PROGRESS_STRIDE == 0 or k + 1 == config.steps):
             progress(k + 1, config.steps)
     return log
 
