@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import TypeVar
 
-from typing_extensions import Self
+E = TypeVar("E", bound="ForceGPError")
 
 
 class ForceGPError(Exception):
@@ -29,7 +30,7 @@ class ForceGPError(Exception):
         super().__init__("\n  ".join(parts))
 
     @classmethod
-    def at(cls, place: str, cause: ForceGPError) -> Self:
+    def at(cls: type[E], place: str, cause: ForceGPError) -> E:
         """An error of this class that adds to another one where it arose (a file, a line)."""
         message = f"{place}: {cause.message}"
         return cls(message, expected=cause.expected, got=cause.got, hint=cause.hint)

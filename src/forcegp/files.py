@@ -9,12 +9,13 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
-from typing_extensions import Self
 
 from forcegp.errors import ForceGPError
+
+H = TypeVar("H", bound="Header")
 
 MAX_HEADER_BYTES = 1 << 20
 """A header is a page of text; anything larger is not one of ours."""
@@ -121,7 +122,7 @@ class Header(BaseModel):
         return json.dumps(head | self.model_dump(mode="json"), indent=2, allow_nan=False)
 
     @classmethod
-    def from_json(cls, text: str | bytes, source: str, error: type[ForceGPError]) -> Self:
+    def from_json(cls: type[H], text: str | bytes, source: str, error: type[ForceGPError]) -> H:
         """Read a header, checking its format, version and fields.
 
         Args:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
 
 import typer
 
@@ -31,6 +31,7 @@ Differentiate = Annotated[
 ]
 
 
+@runtime_checkable
 class Advance(Protocol):
     """Moves a progress bar."""
 
