@@ -80,6 +80,15 @@ def test_an_exact_log_gives_the_exact_parameters(robot: forcegp.RobotModel) -> N
     np.testing.assert_allclose(result.value, result.base.of(robot), atol=1e-10)
 
 
+def test_a_robot_in_single_precision_is_identified_as_well(robot: forcegp.RobotModel) -> None:
+    single = robot.to(dtype=torch.float32)
+    log = [x.float() for x in _log(robot, 200, 0)]
+    result = identify(single, *log)
+    assert result.base.rank == base_parameters(robot).rank
+    np.testing.assert_allclose(result.noise_std, NOISE, rtol=0.3)
+    assert np.abs((result.value - result.base.of(robot)) / result.standard_error).max() < 5.0
+
+
 def test_logs_that_cannot_identify_are_refused(robot: forcegp.RobotModel) -> None:
     log = _log(robot, 100, 0)
     still = [log[0][:1].expand(100, 7), torch.zeros_like(log[1]), torch.zeros_like(log[2]), log[3]]

@@ -107,25 +107,28 @@ class BaseParameters:
         return self.combination @ parameter_vector(robot).detach().cpu().numpy()
 
 
-def base_parameters(robot: RobotModel, samples: int = 400, seed: int = 0) -> BaseParameters:
+def base_parameters(robot: RobotModel, samples: int = 100, seed: int = 0) -> BaseParameters:
     """Base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
 
+    Runs in double precision on the CPU, wherever the robot is.
+
     Args:
-        robot: the robot.
+        robot: the robot; only its kinematics and gravity enter.
         samples: number of random states.
         seed: of the random states.
     """
+    # Kinematics in single precision break symmetries by its rounding, and so seem to have a higher rank.
+    tolerance = max(RANK, 100.0 * torch.finfo(robot.dtype).eps)
+    robot = robot.to("cpu", torch.float64)
     random = np.random.default_rng(seed)
-    q, qd, qdd = (
-        torch.as_tensor(random.uniform(-r, r, (samples, robot.nq))).to(robot.axis) for r in (np.pi, 2.0, 4.0)
-    )
-    Y = regressor(robot, q, qd, qdd).detach().flatten(0, 1).cpu().double().numpy()
+    states = (torch.as_tensor(random.uniform(-r, r, (samples, robot.nq))) for r in (np.pi, 2.0, 4.0))
+    Y = regressor(robot, *states).detach().flatten(0, 1).numpy()
     scale = np.linalg.norm(Y, axis=0)
-    acting = np.flatnonzero(scale > RANK * scale.max())
+    acting = np.flatnonzero(scale > tolerance * scale.max())
     factors: Any = qr(Y[:, acting] / scale[acting], mode="r", pivoting=True)
     R, pivots = factors
     size = np.abs(np.diag(R))
-    rank = int((size > RANK * size[0]).sum())
+    rank = int((size > tolerance * size[0]).sum())
     # Y = Y_b B: the dependent columns are combinations of the independent ones.
     K = solve_triangular(R[:rank, :rank], R[:rank, rank:])
     lead, rest = acting[pivots[:rank]], acting[pivots[rank:]]
@@ -196,12 +199,13 @@ def identify(
     if not all(bool(torch.isfinite(x).all()) for x in (q, qd, qdd, tau)):
         raise DataError("the log has a value that is not finite", expected="finite q, qd, qdd and tau")
     base = base_parameters(robot)
+    robot = robot.to("cpu", torch.float64)
+    q, qd, qdd, tau = (x.detach().to("cpu", torch.float64) for x in (q, qd, qdd, tau))
     W = regressor(robot, q, qd, qdd)[..., list(base.columns)]
     if friction:
         columns = torch.diag_embed(qd), torch.diag_embed(torch.tanh(qd / robot.friction_velocity))
         W = torch.cat([W, *columns], dim=-1)
-    W = W.detach().cpu().double().numpy()
-    y = (tau - robot.armature * qdd).detach().cpu().double().numpy()
+    W, y = W.detach().numpy(), (tau - robot.armature * qdd).detach().numpy()
     n, nq, unknowns = W.shape
     if n * nq <= unknowns or n < 2:
         raise DataError(

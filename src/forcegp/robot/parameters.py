@@ -34,7 +34,8 @@ SMALLEST = 1e-3
 class AnalyticalParameters(nn.Module):
     """The learnable figures of a robot; calling the module gives the robot that they describe.
 
-    The state dict holds one tensor a quantity, `coordinates.<quantity>`, one row a joint.
+    The state dict holds one tensor a quantity, `coordinates.<quantity>`, one row a joint. They live on the
+    robot's device and in its precision: to change these, start from `robot.to(...)`.
 
     Args:
         robot: the robot whose figures are the starting point, and all figures that are not learned.
