@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from forcegp import dynamics, identification, kinematics
+    from forcegp import compiled, derivatives, dynamics, identification, kinematics
     from forcegp.constraints import (
         Baumgarte,
         ConstrainedSystem,
@@ -37,6 +37,8 @@ _HOME = {
     "Scene": "scene",
     "Sphere": "constraints",
     "SurfaceContact": "constraints",
+    "compiled": "",
+    "derivatives": "",
     "dynamics": "",
     "identification": "",
     "kinematics": "",
@@ -59,6 +61,8 @@ __all__ = [
     "Scene",
     "Sphere",
     "SurfaceContact",
+    "compiled",
+    "derivatives",
     "dynamics",
     "identification",
     "kinematics",

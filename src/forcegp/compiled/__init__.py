@@ -89,10 +89,10 @@ class CompiledDynamics:
         }
         turned = {"sin": torch.sin, "cos": torch.cos}
         arrays = [turned[name](given["q"]) if name in turned else given[name] for name in self._arrays]
-        out = torch.empty((math.prod(batch), *self._shape), dtype=self.robot.dtype, device=self.robot.device)
-        if out.shape[0]:
-            self._kernel(arrays, out)
-        return out.reshape((*batch, *self._shape))
+        out = torch.empty((*batch, *self._shape), dtype=self.robot.dtype, device=self.robot.device)
+        if out.numel():
+            self._kernel(arrays, out.view((-1, *self._shape)))
+        return out
 
 
 class _Kernel(torch.autograd.Function):
@@ -118,7 +118,7 @@ class _Kernel(torch.autograd.Function):
         given = tuple(torch.zeros_like(x) if t is None else t for x, t in zip(states, tangents, strict=True))
         # PyTorch does not nest forward mode, so J t is the derivative of Jᵀ u with respect to u.
         value, pull = torch.func.vjp(ctx.compiled.eager, *states)[:2]
-        return torch.func.vjp(pull, torch.zeros_like(value))[1](given)[0]
+        return torch.func.vjp(pull, torch.zeros_like(value))[1](given)[0].contiguous()
 
     @staticmethod
     def vmap(info, in_dims, compiled, *states):  # pyright: ignore[reportIncompatibleMethodOverride]
