@@ -20,52 +20,88 @@ if TYPE_CHECKING:
         SurfaceContact,
     )
     from forcegp.data import Dataset, SavitzkyGolay
+    from forcegp.evaluation import Evaluation, evaluate
+    from forcegp.gp.learning import LearningOptions
+    from forcegp.gp.mean import AnalyticalMean
+    from forcegp.gp.priors import ContactForcePrior, JointForcePrior, OperatorForcePrior
+    from forcegp.models.analytical import AnalyticalModel
+    from forcegp.models.files import load_model
+    from forcegp.models.independent_gp import IndependentGP
+    from forcegp.models.neural import NeuralNetwork
+    from forcegp.models.observation import Observation
+    from forcegp.models.structured_gp import StructuredGP
     from forcegp.robot import AnalyticalParameters, RobotModel, load_robot
     from forcegp.scene import Scene, load_scene
 
 _HOME = {
+    "AnalyticalMean": "gp.mean",
+    "AnalyticalModel": "models.analytical",
     "AnalyticalParameters": "robot",
     "Baumgarte": "constraints",
     "ConstrainedSystem": "constraints",
+    "ContactForcePrior": "gp.priors",
     "Cylinder": "constraints",
     "Dataset": "data",
+    "Evaluation": "evaluation",
     "ImplicitSurface": "constraints",
+    "IndependentGP": "models.independent_gp",
+    "JointForcePrior": "gp.priors",
+    "LearningOptions": "gp.learning",
+    "NeuralNetwork": "models.neural",
+    "Observation": "models.observation",
+    "OperatorForcePrior": "gp.priors",
     "Plane": "constraints",
     "PointConnection": "constraints",
     "RobotModel": "robot",
     "SavitzkyGolay": "data",
     "Scene": "scene",
     "Sphere": "constraints",
+    "StructuredGP": "models.structured_gp",
     "SurfaceContact": "constraints",
     "compiled": "",
     "derivatives": "",
     "dynamics": "",
+    "evaluate": "evaluation",
     "identification": "",
     "kinematics": "",
+    "load_model": "models.files",
     "load_robot": "robot",
     "load_scene": "scene",
 }
 """The subpackage of each public name; empty where the name is a module itself."""
 
 __all__ = [
+    "AnalyticalMean",
+    "AnalyticalModel",
     "AnalyticalParameters",
     "Baumgarte",
     "ConstrainedSystem",
+    "ContactForcePrior",
     "Cylinder",
     "Dataset",
+    "Evaluation",
     "ImplicitSurface",
+    "IndependentGP",
+    "JointForcePrior",
+    "LearningOptions",
+    "NeuralNetwork",
+    "Observation",
+    "OperatorForcePrior",
     "Plane",
     "PointConnection",
     "RobotModel",
     "SavitzkyGolay",
     "Scene",
     "Sphere",
+    "StructuredGP",
     "SurfaceContact",
     "compiled",
     "derivatives",
     "dynamics",
+    "evaluate",
     "identification",
     "kinematics",
+    "load_model",
     "load_robot",
     "load_scene",
 ]

@@ -24,6 +24,7 @@ from forcegp.gp.priors import ForcePrior, JointForcePrior, Standardization, Stat
 from forcegp.gp.whitening import Measurement, WhitenedRows, combine, whiten
 from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction, not_fitted
 from forcegp.models.observation import NoiseStd, Observation, measurement_of
+from forcegp.models.structured_settings import save_structured
 
 NOISE = "noise"
 ANALYTICAL = "analytical."
@@ -223,6 +224,21 @@ class StructuredGP(Model):
                 self.force_priors, training.scales, self._kernel_parameters(), rows.blocks, self.mean
             )
 
+    @torch.no_grad()
+    def restore(self, training: Training, hyperparameters: dict[str, Tensor], alpha: Tensor) -> None:
+        """Take over the state of a saved model; the factorisation waits until a covariance is asked for.
+
+        Raises:
+            ValueError: the weights `alpha` do not fit the training data.
+        """
+        self.training, self.hyperparameters = training, hyperparameters
+        blocks = self._rows(training, hyperparameters).blocks
+        rows = sum(block.rows for block in blocks)
+        if alpha.shape != (rows,) or not bool(torch.isfinite(alpha).all()):
+            raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
+        params = self._kernel_parameters()
+        self._posterior = ForcePosterior(self.force_priors, training.scales, params, blocks, self.mean, alpha)
+
     def _result(self, learned: Learned) -> FitResult:
         training, fitted = self.training, self.posterior
         assert training is not None
@@ -309,8 +325,6 @@ class StructuredGP(Model):
 
     def save(self, path: str | Path) -> None:
         """Write the model as a folder; `forcegp.load_model` reads it back exactly."""
-        from forcegp.models.structured_files import save_structured
-
         save_structured(self, path)
 
 

@@ -1,0 +1,53 @@
+"""Reading structured Gaussian processes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ModelError
+from forcegp.gp.mean import AnalyticalMean
+from forcegp.gp.priors import Standardization
+from forcegp.gp.whitening import Measurement
+from forcegp.models.folder import ModelHeader, settings_of
+from forcegp.models.structured_gp import StructuredGP, Training
+from forcegp.models.structured_settings import COLUMNS, StructuredSettings
+
+
+def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+
+
+def load_structured(
+    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+) -> StructuredGP:
+    """The model that `save_structured` wrote.
+
+    Raises:
+        ModelError: a tensor is missing or has another shape; names file and field.
+    """
+    settings = settings_of(header, StructuredSettings, source)
+    priors = tuple(prior.build() for prior in settings.priors)
+    model = StructuredGP(
+        system, AnalyticalMean(settings.mean), priors, settings.noise_std, settings.learn_noise
+    )
+    try:
+        measurements = tuple(
+            Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in COLUMNS})
+            for i, quantity in enumerate(settings.measured)
+        )
+        noise = tuple(tensors[f"data.{i}.noise_std"] for i in range(len(measurements)))
+        scales = tuple(
+            Standardization(
+                _below(tensors, f"scale.{prior.name}.mean."),
+                _below(tensors, f"scale.{prior.name}.std."),
+                constant,
+            )
+            for prior, constant in zip(priors, settings.constant, strict=True)
+        )
+        model.restore(Training(measurements, noise, scales), _below(tensors, "hyper."), tensors["alpha"])
+    except (KeyError, RuntimeError, ValueError, IndexError) as cause:
+        raise ModelError(f"{source}: the model's tensors do not fit its settings", got=str(cause)) from cause
+    return model

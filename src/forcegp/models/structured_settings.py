@@ -1,0 +1,143 @@
+"""Structured Gaussian processes as settings and tensors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field
+
+from forcegp.errors import ModelError
+from forcegp.gp import kernels
+from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior
+from forcegp.models.base import not_fitted
+from forcegp.models.folder import Settings, write_model
+
+if TYPE_CHECKING:
+    from forcegp.models.structured_gp import StructuredGP
+
+LEAVES = {
+    "squared_exponential": kernels.SquaredExponential,
+    "matern32": kernels.Matern32,
+    "matern52": kernels.Matern52,
+    "linear": kernels.Linear,
+}
+PAIRS = {"sum": kernels.Sum, "product": kernels.Product}
+COLUMNS = ("q", "qd", "tau", "active", "values")
+
+
+class LeafKernel(Settings):
+    """A kernel that reads inputs."""
+
+    type: Literal["squared_exponential", "matern32", "matern52", "linear"]
+    inputs: tuple[str, ...] | None
+
+    def build(self) -> kernels.Kernel:
+        return LEAVES[self.type](self.inputs)
+
+
+class PairKernel(Settings):
+    """A kernel of two others."""
+
+    type: Literal["sum", "product"]
+    left: KernelSettings
+    right: KernelSettings
+
+    def build(self) -> kernels.Kernel:
+        return PAIRS[self.type](self.left.build(), self.right.build())
+
+
+KernelSettings = Annotated[LeafKernel | PairKernel, Field(discriminator="type")]
+PairKernel.model_rebuild()
+
+
+class JointPrior(Settings):
+    """A `JointForcePrior`."""
+
+    type: Literal["joint"] = "joint"
+    name: str
+    kernel: KernelSettings
+    inputs: tuple[str, ...]
+    periodic: bool
+
+    def build(self) -> ForcePrior:
+        return JointForcePrior(self.kernel.build(), self.inputs, self.periodic, self.name)
+
+
+class ContactPrior(Settings):
+    """A `ContactForcePrior`."""
+
+    type: Literal["contact"] = "contact"
+    name: str
+    contact: str
+    kernel: KernelSettings
+    inputs: tuple[str, ...]
+
+    def build(self) -> ForcePrior:
+        return ContactForcePrior(self.contact, self.kernel.build(), self.inputs, self.name)
+
+
+class StructuredSettings(Settings):
+    """What is kept of a structured Gaussian process beside its tensors."""
+
+    mean: tuple[str, ...]
+    noise_std: float | tuple[float, ...]
+    learn_noise: bool
+    priors: tuple[Annotated[JointPrior | ContactPrior, Field(discriminator="type")], ...]
+    measured: tuple[str, ...]
+    constant: tuple[tuple[str, ...], ...]
+
+
+def _kernel_settings(kernel: kernels.Kernel) -> LeafKernel | PairKernel:
+    if isinstance(kernel, kernels.Sum):
+        left, right = _kernel_settings(kernel.left), _kernel_settings(kernel.right)
+        return PairKernel(
+            type="product" if isinstance(kernel, kernels.Product) else "sum", left=left, right=right
+        )
+    for name, kind in LEAVES.items():
+        if type(kernel) is kind:
+            inputs = getattr(kernel, "inputs")  # noqa: B009  (every leaf has it)
+            return LeafKernel(type=name, inputs=inputs)  # pyright: ignore[reportArgumentType]
+    raise ModelError(
+        f"a kernel of type {type(kernel).__name__} cannot be saved", expected=", ".join([*LEAVES, *PAIRS])
+    )
+
+
+def _prior_settings(prior: ForcePrior) -> JointPrior | ContactPrior:
+    kernel = _kernel_settings(prior.kernel)
+    if type(prior) is JointForcePrior:
+        return JointPrior(name=prior.name, kernel=kernel, inputs=prior.inputs, periodic=prior.periodic)
+    if type(prior) is ContactForcePrior:
+        return ContactPrior(name=prior.name, contact=prior.contact, kernel=kernel, inputs=prior.inputs)
+    raise ModelError(
+        f"force prior {prior.name!r} of type {type(prior).__name__} holds Python code and cannot be saved",
+        expected="JointForcePrior or ContactForcePrior",
+    )
+
+
+def save_structured(model: StructuredGP, path: str | Path) -> None:
+    """Write a fitted model; where θ_A was learned, the robot that is kept is the learned one.
+
+    Raises:
+        ModelError: the model has not been fitted, or a prior or kernel of it is Python code.
+    """
+    if model.training is None:
+        raise not_fitted(model)
+    noise = model.noise_std
+    settings = StructuredSettings(
+        mean=model.mean.terms,
+        noise_std=float(noise) if isinstance(noise, int | float) else tuple(float(x) for x in noise),
+        learn_noise=model.learn_noise,
+        priors=tuple(_prior_settings(prior) for prior in model.force_priors),
+        measured=tuple(m.quantity for m in model.training.measurements),
+        constant=tuple(scale.constant for scale in model.training.scales),
+    )
+    tensors = {f"hyper.{key}": value for key, value in model.hyperparameters.items()}
+    tensors["alpha"] = model.posterior.alpha
+    for i, (m, std) in enumerate(zip(model.training.measurements, model.training.noise_std, strict=True)):
+        tensors |= {f"data.{i}.{name}": getattr(m, name) for name in COLUMNS}
+        tensors[f"data.{i}.noise_std"] = std
+    for prior, scale in zip(model.force_priors, model.training.scales, strict=True):
+        tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
+        tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
+    write_model(path, model.kind, model.system, settings, tensors)
