@@ -81,7 +81,7 @@ def test_rows_by_slice_mask_and_indices() -> None:
 )
 def test_rows_that_do_not_exist(rows: object, message: str) -> None:
     with pytest.raises(DataError, match=message):
-        random_log(10)[rows]  # pyright: ignore[reportArgumentType]
+        random_log(10)[rows]
 
 
 def test_selecting_joints_reorders_every_joint_vector() -> None:
@@ -129,6 +129,9 @@ def replaced(name: str, row: int, value: float) -> Callable[[], Dataset]:
             "'contact.table' has the wrong type",
         ),
         (lambda: random_log().replace(contact={}), "'multiplier' is logged of contact 'table'"),
+        (lambda: random_log().replace(extras={"qd": torch.zeros(60, 3).double()}), "'qd' cannot be the name"),
+        (lambda: random_log().replace(extras={"a.b": torch.zeros(60, 3).double()}), "'a.b' cannot be"),
+        (lambda: random_log().replace(extras={"F_I": torch.zeros(60, 3).double()}), "'F_I' cannot be"),
         (lambda: random_log().replace(joint_names=("a", "a", "b")), "joint names are not valid"),
         (
             lambda: random_log().replace(contact={"elbow": torch.ones(60).bool()}, contact_extras={}),
@@ -154,6 +157,13 @@ def test_robot_check_names_the_joint_and_reports_another_robot() -> None:
     foreign = log.replace(header=log.header.model_copy(update={"robot_fingerprint": "0123"}))
     with pytest.warns(RobotMismatchWarning, match=robot.fingerprint):
         foreign.check_robot(robot)
+
+
+def test_a_log_is_one_trajectory_unless_it_says_otherwise() -> None:
+    zero = torch.zeros(4, 1, dtype=torch.float64)
+    t = torch.arange(4, dtype=torch.float64)
+    log = Dataset(t=t, q=zero, qd=zero, tau=zero, qdd=zero, joint_names=("a",))
+    assert log.segment.tolist() == [0] * 4 and log.segment.dtype == torch.int64
 
 
 def test_contacts_as_a_table_and_the_missing_one() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,7 @@ def check_layout(data: Dataset) -> None:
     shared = sorted(set(data.joint_names) & set(data.contact))
     if shared:
         raise DataError(f"{shared[0]!r} is the name of a joint and of a contact", hint="rename the contact")
+    _check_names(data)
     for name, value in (("t", data.t), *_named_columns(data)):
         _check_type(name, value, data.t)
     for name in (*JOINT_VECTORS, *data.extras):
@@ -57,6 +59,19 @@ def check_layout(data: Dataset) -> None:
             raise DataError(f"column 'contact.{name}' has the wrong type", expected="bool", got=value.dtype)
     if data.segment.dtype != torch.int64:
         raise DataError("column 'segment' has the wrong type", expected="int64", got=data.segment.dtype)
+
+
+def _check_names(data: Dataset) -> None:
+    """Extras must not hide a field, nor each other, and a dot in their name would cut it on disk."""
+    taken = {field.name for field in fields(data)}
+    for name in (*data.extras, *data.contact_extras):
+        if name in taken or "." in name or not name:
+            raise DataError(
+                f"{name!r} cannot be the name of a further logged quantity",
+                expected="a name of its own without a dot",
+                hint=f"{', '.join(sorted(taken))} are taken",
+            )
+        taken.add(name)
 
 
 def _check_type(name: str, value: Tensor, like: Tensor) -> None:

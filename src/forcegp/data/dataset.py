@@ -7,9 +7,9 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor
 
 from forcegp.data import check, columns, table
@@ -17,8 +17,6 @@ from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.header import DataHeader
 from forcegp.errors import DataError, UnknownNameError
 from forcegp.robot.model import RobotModel
-
-Rows = slice | Tensor | Sequence[int] | Sequence[bool]
 
 
 class RobotMismatchWarning(UserWarning):
@@ -50,16 +48,16 @@ class Dataset:
         DataError: a shape, type, value or time does not fit; the message names column and row.
     """
 
-    t: Float[Tensor, " n"]
-    q: Float[Tensor, "n nq"]
-    qd: Float[Tensor, "n nq"]
-    tau: Float[Tensor, "n nq"]
-    qdd: Float[Tensor, "n nq"]
+    t: Tensor
+    q: Tensor
+    qd: Tensor
+    tau: Tensor
+    qdd: Tensor
     joint_names: tuple[str, ...]
     contact: Mapping[str, Tensor] = field(default_factory=dict)
     extras: Mapping[str, Tensor] = field(default_factory=dict)
     contact_extras: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
-    segment: Int[Tensor, " n"] = None  # pyright: ignore[reportAssignmentType]  # filled in below
+    segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
     header: DataHeader = field(default_factory=DataHeader)
 
     def __post_init__(self) -> None:
@@ -74,7 +72,7 @@ class Dataset:
         """Number of samples."""
         return self.t.shape[0]
 
-    def __getattr__(self, name: str) -> Tensor:
+    def __getattr__(self, name: str) -> Any:
         extras, contact_extras = self.__dict__.get("extras", {}), self.__dict__.get("contact_extras", {})
         if name in extras:
             return extras[name]
@@ -87,7 +85,7 @@ class Dataset:
             expected="one of " + ", ".join([*columns.JOINT_VECTORS, *extras, *contact_extras]),
         )
 
-    def __getitem__(self, rows: Rows) -> Dataset:
+    def __getitem__(self, rows: object) -> Dataset:
         """The data set of some rows, given as a slice, a mask `(n,)` or indices in any order.
 
         Raises:
