@@ -23,7 +23,7 @@ def evaluate(
     forcegp evaluate --model model/ --data test.parquet --out evaluation/
     """
     from forcegp.evaluation import evaluate as run
-    from forcegp.models.registry import load_model
+    from forcegp.models.files import load_model
 
     regression = load_model(model)
     test = data_of_robot(read_data(data), regression.system.robot)

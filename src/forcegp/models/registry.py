@@ -1,0 +1,91 @@
+"""The models by the short names of the command line and the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.errors import UnknownNameError
+from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior
+from forcegp.models.analytical import AnalyticalModel
+from forcegp.models.base import Model
+from forcegp.models.independent_gp import IndependentGP
+from forcegp.models.neural import NeuralNetwork
+from forcegp.models.observation import NoiseStd
+from forcegp.models.structured_gp import StructuredGP
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A named model.
+
+    Attributes:
+        description: one line for help texts and the report.
+        make: builds it from the system, the noise, the seed and options of its own.
+    """
+
+    description: str
+    make: Callable[..., Model]
+
+
+def _analytical(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+    return AnalyticalModel(system, seed=seed, **options)
+
+
+def _network(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+    return NeuralNetwork(system, seed=seed, **options)
+
+
+def _independent(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+    return IndependentGP(system, noise_std=noise_std, **options)
+
+
+def _structured(mean: str) -> Callable[..., Model]:
+    def make(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+        return StructuredGP(system, mean=mean, noise_std=noise_std, **options)
+
+    return make
+
+
+def contact_priors(system: ConstrainedSystem) -> list[ForcePrior]:
+    """A joint force prior, and a Cartesian friction prior for each contact with a surface."""
+    surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
+    return [JointForcePrior(), *(ContactForcePrior(name) for name in surfaces)]
+
+
+def _contact(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+    options = {"mean": "analytical", "force_priors": contact_priors(system)} | options
+    return StructuredGP(system, noise_std=noise_std, **options)
+
+
+MODELS: dict[str, Entry] = {
+    "analytical": Entry("equations of motion with learned inertia and damping, no friction", _analytical),
+    "nn": Entry("neural network with sigmoid layers on (q, qd, tau)", _network),
+    "gp": Entry("one Gaussian process per joint acceleration on (q, qd, tau)", _independent),
+    "sgp-zero": Entry("structured GP, all joint forces unknown", _structured("zero")),
+    "sgp-mean": Entry("structured GP around the analytical forces", _structured("analytical")),
+    "sgp-contact": Entry("structured GP with mean and a Cartesian prior on contact friction", _contact),
+}
+"""The models, simplest first."""
+
+
+def create(
+    name: str, system: ConstrainedSystem, *, noise_std: NoiseStd = 0.1, seed: int = 0, **options: Any
+) -> Model:
+    """An unfitted model by its short name.
+
+    Args:
+        name: a key of `MODELS`.
+        system: robot and contacts.
+        noise_std: of measured accelerations [rad/s², m/s²], for models that have one.
+        seed: of random initial values, for models that have any.
+        options: further arguments of the model's class.
+
+    Raises:
+        UnknownNameError: no such model.
+    """
+    if name not in MODELS:
+        raise UnknownNameError("model", name, MODELS)
+    return MODELS[name].make(system, noise_std, seed, **options)
