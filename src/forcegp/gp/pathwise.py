@@ -1,0 +1,131 @@
+"""Functions drawn from the posterior over forces, cheap to evaluate anywhere (pathwise conditioning).
+
+A prior function is drawn with random features and corrected by the data, Matheron's rule:
+f_post(x) = f_prior(x) + k(x, X) Wᵀ (K + I)⁻¹ (y − W f_prior(X) − ε) (Wilson et al. 2020). Each sample is one
+deterministic force function, so a trajectory integrated under it obeys Newton's equation and the
+constraint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.gp.exact import target_of
+from forcegp.gp.kernels import Features, FunctionDraw, sub
+from forcegp.gp.posterior import ForcePosterior
+from forcegp.gp.priors import States
+
+FEATURES = 1024
+"""Random features an output; the covariance of the prior draws errs by about 1/√FEATURES of its scale."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosteriorSamples:
+    """Functions drawn from the posterior over latent forces.
+
+    Attributes:
+        posterior: what they are drawn from.
+        draws: random features of each prior.
+        feature_weights: of each prior, `(components, features, samples)`.
+        data_weights: of each prior and block, `(components, n, samples)`.
+    """
+
+    posterior: ForcePosterior
+    draws: tuple[FunctionDraw, ...]
+    feature_weights: tuple[Tensor, ...]
+    data_weights: tuple[tuple[Tensor, ...], ...]
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return self.feature_weights[0].shape[-1]
+
+    def latent(self, p: int, features: Features, sample: Tensor | None = None) -> Tensor:
+        """Forces of prior p.
+
+        Args:
+            p: index of the prior.
+            features: its standardized inputs at n states.
+            sample: `(n,)` which sample each state belongs to; all samples at all states by default.
+
+        Returns:
+            `(samples, n, components)`, or `(n, components)` where `sample` is given.
+        """
+        kernel, own = (
+            self.posterior.priors[p].kernel,
+            sub(self.posterior.params, self.posterior.priors[p].name),
+        )
+        terms = [(self.draws[p].basis(features), self.feature_weights[p])]
+        for block, weights in zip(self.posterior.blocks, self.data_weights[p], strict=True):
+            terms.append((kernel.covariance(own, features, block.features[p]), weights))
+        if sample is None:
+            return sum((k @ w for k, w in terms[1:]), start=terms[0][0] @ terms[0][1]).permute(2, 1, 0)
+        rows = torch.stack([torch.einsum("knj,kjn->nk", k, w[..., sample]) for k, w in terms])
+        return rows.sum(0)
+
+    def forces(
+        self, system: ConstrainedSystem, at: States, sample: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Sampled joint force Q and dissipative contact force Q_z.
+
+        Args:
+            system: robot and contacts.
+            at: n states.
+            sample: `(n,)` which sample each state belongs to; all samples at all states by default.
+
+        Returns:
+            Q and Q_z `(samples, n, nq)`, or `(n, nq)` where `sample` is given [N m, N].
+        """
+        Q = self.posterior.mean(system, at)
+        Q = Q if sample is not None else Q.expand(self.count, *Q.shape)
+        Q_z = torch.zeros_like(Q)
+        for p, features in enumerate(self.posterior.features(system, at)):
+            prior = self.posterior.priors[p]
+            force = (prior.operator(system, at) @ self.latent(p, features, sample)[..., None])[..., 0]
+            Q, Q_z = (Q, Q_z + force) if prior.in_contact_only else (Q + force, Q_z)
+        return Q, Q_z
+
+
+def draw_samples(
+    posterior: ForcePosterior, count: int, generator: torch.Generator, features: int = FEATURES
+) -> PosteriorSamples:
+    """Draw functions from the posterior over forces.
+
+    Args:
+        posterior: what to draw from.
+        count: number of functions.
+        generator: source of randomness, on the CPU.
+        features: random features an output.
+    """
+    like = posterior.alpha
+    draws, weights, prior_at_data = (
+        [],
+        [],
+        torch.zeros(len(like), count, dtype=like.dtype, device=like.device),
+    )
+    for p, prior in enumerate(posterior.priors):
+        draw = prior.kernel.draw(sub(posterior.params, prior.name), features, generator)
+        size = draw.basis(posterior.blocks[0].features[p]).shape
+        w = torch.randn(size[0], size[2], count, dtype=torch.float64, generator=generator).to(like)
+        rows = [
+            torch.einsum("nak,kns->nas", block.operators[p], draw.basis(block.features[p]) @ w).flatten(0, 1)
+            for block in posterior.blocks
+        ]
+        prior_at_data += torch.cat(rows)
+        draws.append(draw)
+        weights.append(w)
+    noise = torch.randn(len(like), count, dtype=torch.float64, generator=generator).to(like)
+    residual = target_of(posterior.blocks)[:, None] - prior_at_data - noise
+    alpha = torch.cholesky_solve(residual, posterior.conditioned.L)
+    data_weights: list[list[Tensor]] = [[] for _ in posterior.priors]
+    first = 0
+    for block in posterior.blocks:
+        own = alpha[first : first + block.rows].unflatten(0, block.target.shape)
+        first += block.rows
+        for p, W in enumerate(block.operators):
+            data_weights[p].append(torch.einsum("nak,nas->kns", W, own))
+    return PosteriorSamples(posterior, tuple(draws), tuple(weights), tuple(tuple(w) for w in data_weights))
