@@ -138,7 +138,7 @@ def base_parameters(robot: RobotModel, samples: int = 100, seed: int = 0) -> Bas
     order = np.argsort(lead)
     B, lead = B[order], lead[order]
     return BaseParameters(
-        tuple(lead.tolist()), B, tuple(_name(robot, i, row) for i, row in zip(lead, B, strict=True))
+        tuple(lead.tolist()), B, tuple(_name(robot, i, row) for i, row in zip(lead.tolist(), B, strict=True))
     )
 
 

@@ -325,7 +325,7 @@ def test_joint_figures_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["base_position", "base_rpy", "gravity"])
-@pytest.mark.parametrize("value", [(1, 2), (0, 0, float("nan")), "abc", None])
+@pytest.mark.parametrize("value", [(1, 2), (0, 0, float("nan")), (), (1e400, 0.0, 0.0)])
 def test_options_are_checked(name: str, value: object) -> None:
     with pytest.raises(ShapeError, match=f"{name} is not valid"):
         forcegp.load_robot("kuka_iiwa", **{name: value})  # type: ignore[arg-type]

@@ -24,9 +24,9 @@ BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa")
 def load_robot(
     source: str | Path,
     *,
-    base_position: Sequence[float] = (0.0, 0.0, 0.0),
-    base_rpy: Sequence[float] = (0.0, 0.0, 0.0),
-    gravity: Sequence[float] = (0.0, 0.0, -9.81),
+    base_position: Sequence[float | int] = (0.0, 0.0, 0.0),
+    base_rpy: Sequence[float | int] = (0.0, 0.0, 0.0),
+    gravity: Sequence[float | int] = (0.0, 0.0, -9.81),
     locked_joints: Mapping[str, float] | None = None,
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
@@ -83,7 +83,7 @@ def _read_file(path: Path) -> Tree:
     )
 
 
-def _vector(value: Sequence[float], name: str) -> np.ndarray:
+def _vector(value: Sequence[float | int], name: str) -> np.ndarray:
     try:
         vector = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
