@@ -52,6 +52,8 @@ def skew(v: Tensor) -> Tensor:
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """Σ_k a_k b_k over the first dimension, broadcasting over the others."""
+    if a.numel() < _SMALL and b.numel() < _SMALL:
+        return (a * b).sum(0)
     total = a[0] * b[0]
     for k in range(1, len(a)):
         total = torch.addcmul(total, a[k], b[k])
@@ -60,12 +62,12 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 def apply(A: Tensor, v: Tensor) -> Tensor:
     """A v for matrices `(r, k, …)` and vectors `(k, …)`."""
-    return dot(A.transpose(0, 1), v)
+    return dot(A.transpose(0, 1), v.unsqueeze(1))
 
 
 def product(A: Tensor, X: Tensor) -> Tensor:
     """A X for matrices `(r, k, …)` and `(k, c, …)`."""
-    return dot(A.transpose(0, 1).unsqueeze(2), X)
+    return dot(A.transpose(0, 1).unsqueeze(2), X.unsqueeze(1))
 
 
 def sum_over(E: Tensor, x: Tensor) -> Tensor:

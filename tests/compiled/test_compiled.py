@@ -149,6 +149,14 @@ def test_a_failing_compiler_says_why(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert set(cache.iterdir()) == before
 
 
+def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("")
+    monkeypatch.setenv("FORCEGP_CACHE", str(file / "kernels"))
+    with pytest.raises(MissingDependencyError, match=r"cannot be written to (.|\n)*set FORCEGP_CACHE"):
+        compile_dynamics(random_robot(7), "gravity_force")
+
+
 def test_what_cannot_be_compiled_is_refused() -> None:
     robot = random_robot(0)
     with pytest.raises(UnknownNameError, match=r"'mas_matrix'(.|\n)*did you mean 'mass_matrix'"):

@@ -74,7 +74,7 @@ def _compile(text: str) -> Path:
     """The shared library of a source text, compiled unless the cache has it.
 
     Raises:
-        MissingDependencyError: no compiler, or it failed.
+        MissingDependencyError: no compiler, it failed, or the cache cannot be written.
     """
     compiler = find_compiler()
     version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
@@ -82,17 +82,28 @@ def _compile(text: str) -> Path:
     library = cache_directory() / f"{key}.so"
     if library.exists():
         return library
-    library.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with atomic_file(library) as temporary:
-        command = [compiler, *FLAGS, "-x", "c++", "-", "-o", str(temporary), "-pthread"]
-        done = subprocess.run(command, input=text, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            raise MissingDependencyError(
-                f"the C++ compiler {compiler} could not build the kernel",
-                got=done.stderr.strip()[-2000:],
-                hint="set CXX to a recent GCC or Clang, or use forcegp.dynamics, which needs no compiler",
-            )
+    try:
+        library.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with atomic_file(library) as temporary:
+            _run_compiler(compiler, text, temporary)
+    except OSError as cause:
+        raise MissingDependencyError(
+            f"the kernel cannot be written to {library.parent}",
+            got=str(cause),
+            hint="set FORCEGP_CACHE to a folder that can be written",
+        ) from cause
     return library
+
+
+def _run_compiler(compiler: str, text: str, library: Path) -> None:
+    command = [compiler, *FLAGS, "-x", "c++", "-", "-o", str(library), "-pthread"]
+    done = subprocess.run(command, input=text, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise MissingDependencyError(
+            f"the C++ compiler {compiler} could not build the kernel",
+            got=done.stderr.strip()[-2000:],
+            hint="set CXX to a recent GCC or Clang, or use forcegp.dynamics, which needs no compiler",
+        )
 
 
 def cpu_kernel(text: str) -> Kernel:
@@ -129,6 +140,7 @@ def cuda_kernel(text: str) -> Kernel:
     def run(arrays: Sequence[Tensor], out: Tensor) -> None:
         batch = out.shape[0]
         blocks = (batch + CUDA_THREADS - 1) // CUDA_THREADS
-        function(grid=(blocks, 1, 1), block=(CUDA_THREADS, 1, 1), args=[*arrays, out, batch])
+        with torch.cuda.device(out.device):
+            function(grid=(blocks, 1, 1), block=(CUDA_THREADS, 1, 1), args=[*arrays, out, batch])
 
     return run

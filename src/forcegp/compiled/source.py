@@ -52,7 +52,7 @@ _CUDA = """\
 typedef {type} T;
 typedef T V;
 
-extern "C" __global__ void kernel({parameters}, T* out, long long batch) {{
+extern "C" __global__ void kernel({parameters}, T* out, int batch) {{
   const long long row = (long long)blockIdx.x * blockDim.x + threadIdx.x;
   if (row >= batch) return;
 {body}
@@ -81,8 +81,8 @@ def _statements(program: Program, load: dict[tuple[str, int], str], store: str) 
     for position in program.graph.live(program.outputs):
         op, left, right = nodes[position]
         if op == "const":
-            # A scalar operand is spread over the lanes by the compiler; hexadecimal keeps every bit.
-            name[position] = f"T({float(left).hex()})"  # pyright: ignore[reportArgumentType]
+            # A scalar operand is spread over the lanes by the compiler; repr keeps every bit.
+            name[position] = f"T({left!r})"  # pyright: ignore[reportArgumentType]
             continue
         name[position] = f"x{position}"
         if op == "input":
