@@ -1,0 +1,62 @@
+"""How much is computed: a few minutes, or the sizes of the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from forcegp.errors import UnknownNameError
+
+STRUCTURED = ("sgp-zero", "sgp-mean", "sgp-contact")
+GP_MODELS = ("gp", *STRUCTURED)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Sizes of a reproduction.
+
+    Attributes:
+        name: of the profile.
+        duration: simulated motion [s].
+        seeds: number of simulated runs, each with its own split.
+        sizes: training points of the GP models.
+        main: training points of the GP models in the figures over time.
+        baseline_points: training points of the analytical model and the neural networks.
+        networks: which networks are trained.
+        stretch: duration of a held-out stretch, and of the window of figures 4 and 5 [s].
+        test_samples: at most so many test samples are predicted for the scores.
+        multiplier_seconds: length of the multiplier figure [s].
+        identification_points: training points of the identification.
+        identification_evaluations: iterations of the identification.
+    """
+
+    name: str
+    duration: float
+    seeds: int
+    sizes: tuple[int, ...]
+    main: int
+    baseline_points: int
+    networks: tuple[str, ...]
+    stretch: float = 3.0
+    test_samples: int = 2000
+    multiplier_seconds: float = 10.0
+    identification_points: int = 200
+    identification_evaluations: int = 150
+
+
+PROFILES = {
+    "quick": Profile("quick", 60.0, 1, (50, 100, 200), 200, 5000, ("nn",), identification_points=100),
+    "paper": Profile(
+        "paper", 600.0, 3, (100, 200, 400, 600, 800, 1000), 1000, 10_000, ("nn", "nn-30-20", "nn-200x4")
+    ),
+}
+
+
+def profile_of(name: str) -> Profile:
+    """A profile by name.
+
+    Raises:
+        UnknownNameError: no such profile.
+    """
+    if name not in PROFILES:
+        raise UnknownNameError("profile", name, PROFILES)
+    return PROFILES[name]

@@ -1,0 +1,207 @@
+"""The page of a reproduction, and that of one evaluated model: single HTML files that need no others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jinja2
+
+from forcegp.files import write_text
+from forcegp.report.covariance import draw_force_prior, draw_operators, draw_structured
+from forcegp.report.curves import draw_identification, draw_learning_curve, draw_residual
+from forcegp.report.data import (
+    SPLITS,
+    CovarianceData,
+    IdentificationData,
+    MultiplierData,
+    Results,
+    TaskSpaceData,
+    WindowData,
+    paper_numbers,
+)
+from forcegp.report.findings import findings
+from forcegp.report.motion import draw_constraint, draw_multiplier, draw_path, draw_task_space
+from forcegp.report.predictions import common_limit, draw_errors, draw_predictions
+from forcegp.report.style import Picture
+from forcegp.report.tables import (
+    Table,
+    curve_table,
+    error_table,
+    quality_table,
+    residual_table,
+    settings_table,
+    simulation_table,
+)
+
+
+@dataclass(frozen=True)
+class FigureData:
+    """What the figures of a reproduction are drawn from."""
+
+    covariance: CovarianceData
+    multiplier: MultiplierData
+    task_space: TaskSpaceData
+    windows: list[WindowData]
+    identification: IdentificationData
+
+
+@dataclass(frozen=True)
+class FigureBlock:
+    """Pictures under one number and caption.
+
+    Attributes:
+        heading: what it is, with the paper's figure number where it has one.
+        caption: what is seen.
+        pictures: the panels.
+        source: file with the data.
+    """
+
+    heading: str
+    caption: str
+    pictures: tuple[Picture, ...]
+    source: str
+
+
+def write_page(path: Path, results: Results, figures: FigureData) -> None:
+    """Write the page of a reproduction."""
+    write_text(path, render_page(results, figures))
+
+
+def render_page(results: Results, figures: FigureData) -> str:
+    """The page of a reproduction as HTML."""
+    paper = paper_numbers()
+    tables: dict[str, Table] = {
+        "errors": error_table(results, paper),
+        "quality": quality_table(results),
+        "noisy": curve_table(results, paper, "noisy"),
+        "clean": curve_table(results, paper, "clean"),
+        "residual": residual_table(results, paper),
+        "simulation": simulation_table(results),
+        "settings": settings_table(results),
+    }
+    return _environment().get_template("report.html.j2").render(
+        results=results,
+        paper=paper,
+        tables=tables,
+        findings=findings(results, paper, figures.multiplier, figures.identification),
+        learning=_learning(results),
+        blocks=_figures(figures),
+    )  # fmt: skip
+
+
+def render_evaluation(title: str, figures: dict[str, str], window: WindowData) -> str:
+    """The page of one evaluated model as HTML.
+
+    Args:
+        title: name of the model and the data.
+        figures: what was measured, by name, as text.
+        window: its predictions.
+    """
+    table = Table("Scores on this data set", ("score", "value"), tuple(figures.items()))
+    blocks = (
+        FigureBlock(
+            "Predictions and errors",
+            "Accelerations by joint: measured in black, predicted in colour, with the band of two "
+            "standard deviations where the model gives one. Errors are measured less predicted; where "
+            "the data hold the noise-free acceleration, it is the black line.",
+            (draw_predictions(window), draw_errors(window)),
+            "window.json",
+        ),
+    )
+    template = _environment().get_template("evaluation.html.j2")
+    return template.render(title=title, table=table, blocks=blocks)
+
+
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("forcegp.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def _learning(results: Results) -> FigureBlock:
+    paper = paper_numbers()
+    pictures = [
+        draw_learning_curve(results, paper, split, kind) for kind in ("noisy", "clean") for split in SPLITS
+    ]
+    seeds = len(results.seeds)
+    spread = f" Lines are means of {seeds} seeds, bands their range." if seeds > 1 else ""
+    return FigureBlock(
+        "Learning curves (main paper, error over N)",
+        "Mean absolute error over the number of training points, and the mean constraint residual. "
+        "Dashed: the paper's curves, read off its plots; they were measured on the paper's split against "
+        f"noisy accelerations, and compare with that panel alone.{spread}",
+        (*pictures, draw_residual(results, paper, "stretches")),
+        "results.json",
+    )
+
+
+def _figures(data: FigureData) -> Sequence[FigureBlock]:
+    windows = data.windows
+    limit = common_limit(windows)
+    seconds = f"{windows[0].t[-1] - windows[0].t[0]:.1f} s" if windows else ""
+    bands = tuple(draw_multiplier(data.multiplier, band) for band in data.multiplier.bands)
+    return (
+        FigureBlock(
+            "Figure 1: structured covariance",
+            f"H k_Q Hᵀ block by block, for {len(data.covariance.t)} states a tenth of a second apart, "
+            "with the learned hyperparameters of the zero-mean S-GP. Left: the operators H(xᵢ), which "
+            "the known mechanics gives. Middle: the prior on the forces, one independent process a "
+            "joint, so every block is diagonal. Right: the covariance of accelerations, full in every "
+            f"block and without the direction that the surface forbids: rank {data.covariance.rank} of "
+            f"{len(data.covariance.acceleration)}. Logarithmic shades.",
+            (
+                draw_operators(data.covariance),
+                draw_force_prior(data.covariance),
+                draw_structured(data.covariance),
+            ),
+            "stages/figures/covariance/data.json",
+        ),
+        FigureBlock(
+            "Figure 2: surface error and multiplier",
+            "The error of the surface equation in simulation, and the Lagrange multiplier λ (the normal "
+            "force) predicted from accelerations alone, beside the simulator's own. No training point "
+            "lies in the shaded time. Below each: the same, less the simulator's value. Bands are two "
+            "standard deviations.",
+            (draw_constraint(data.multiplier), *bands),
+            "stages/figures/multiplier/data.json",
+        ),
+        FigureBlock(
+            "Figure 3: task-space motion",
+            "The tool runs straight lines between random points on the surface, with trapezoidal speed "
+            "and at rest at every point; dashed as planned, wide as executed under torque control with "
+            "contact and friction.",
+            (draw_task_space(data.task_space), draw_path(data.task_space)),
+            "stages/figures/task-space/data.json",
+        ),
+        FigureBlock(
+            "Figure 4: predictions",
+            f"Accelerations of all joints over the same {seconds} of held-out motion, no training point "
+            "within: noisy measurements in black, predicted mean in colour, with the band of two "
+            "standard deviations where the model gives one.",
+            tuple(draw_predictions(window) for window in windows),
+            "stages/figures/window/",
+        ),
+        FigureBlock(
+            "Figure 5: errors of the predictions",
+            "The same window less the predicted mean: noise-free acceleration in black, noisy in grey, "
+            f"the model's band in colour. All models at the same scale of ±{limit:.2g} rad/s²; what is "
+            "larger is cut off.",
+            tuple(draw_errors(window, limit) for window in windows),
+            "stages/figures/window/",
+        ),
+        FigureBlock(
+            "Identification (main paper)",
+            "Mass of the last link, started at 2.5 kg, and error of the last joint's position, started "
+            f"0.05 m off along each axis, learned from {data.identification.points} points together with "
+            "the unknown friction; the analytical model alone, which has no room for the friction, "
+            "beside them. At every evaluation the best parameters so far. The dotted line marks 1 mm.",
+            tuple(draw_identification(data.identification)),
+            "stages/figures/identification/",
+        ),
+    )
