@@ -55,13 +55,11 @@ class PosteriorSamples:
         Returns:
             `(samples, n, components)`, or `(n, components)` where `sample` is given.
         """
-        kernel, own = (
-            self.posterior.priors[p].kernel,
-            sub(self.posterior.params, self.posterior.priors[p].name),
-        )
+        prior = self.posterior.priors[p]
+        own = sub(self.posterior.params, prior.name)
         terms = [(self.draws[p].basis(features), self.feature_weights[p])]
         for block, weights in zip(self.posterior.blocks, self.data_weights[p], strict=True):
-            terms.append((kernel.covariance(own, features, block.features[p]), weights))
+            terms.append((prior.kernel.covariance(own, features, block.features[p]), weights))
         if sample is None:
             return sum((k @ w for k, w in terms[1:]), start=terms[0][0] @ terms[0][1]).permute(2, 1, 0)
         rows = torch.stack([torch.einsum("knj,kjn->nk", k, w[..., sample]) for k, w in terms])
