@@ -27,7 +27,7 @@ from forcegp.robot.load import BUNDLED
 from forcegp.robot.safety import MAX_BYTES, MAX_ELEMENTS
 from robots import ARMS, example_data
 
-SECONDS = 2.0  # what the requirements allow for any file
+SECONDS = 2.0  # what the requirements allow for any file; processor time, as other programs may run
 LINK = '<link name="{0}"><inertial><mass value="1"/>{1}</inertial></link>'
 BALL = '<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/>'
 JOINT = '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/>{4}</joint>'
@@ -153,10 +153,10 @@ def _laughs() -> str:
 def test_hostile_files_are_refused_in_time(tmp_path: Path, text: Callable[[], str], message: str) -> None:
     path = tmp_path / "robot.urdf"
     path.write_text(text())
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(RobotFileError, match=message):
         forcegp.load_robot(path)
-    assert time.perf_counter() - start < SECONDS
+    assert time.process_time() - start < SECONDS
 
 
 def test_a_chain_as_long_as_allowed_loads_and_a_longer_one_is_refused(tmp_path: Path) -> None:
@@ -165,13 +165,13 @@ def test_a_chain_as_long_as_allowed_loads_and_a_longer_one_is_refused(tmp_path: 
         joints = [joint(f"j{i}", f"l{i}", f"l{i + 1}", kind=kind) for i in range(count)]
         return write(tmp_path, *links, *joints, link("tip"), joint("last", f"l{count}", "tip"))
 
-    start = time.perf_counter()
+    start = time.process_time()
     assert forcegp.load_robot(chain(400, "revolute")).nq == 401
     # Fixed joints fold away, however many there are: two thousand, beyond Python's recursion limit.
     assert forcegp.load_robot(chain(2000, "fixed")).nq == 1
     with pytest.raises(RobotFileError, match="1 to 500 moving joints"):
         forcegp.load_robot(chain(1500, "revolute"))
-    assert time.perf_counter() - start < 3 * SECONDS
+    assert time.process_time() - start < 3 * SECONDS
 
 
 TWO = ('<link name="base"/>', link("a"), link("b"))
@@ -297,6 +297,7 @@ def test_singular_mass_matrix_is_refused_by_link(tmp_path: Path) -> None:
     assert forcegp.load_robot(write(tmp_path, *parts, *joints[:1], joints[1].format("0 1 0"))).nq == 2
 
 
+@pytest.mark.filterwarnings("ignore::forcegp.errors.RobotFileWarning")
 def test_doubtful_inertia_of_published_files_is_remarked_on(tmp_path: Path) -> None:
     path = example_data() / "allegro_hand_description/urdf/allegro_right_hand.urdf"
     with pytest.warns(RobotFileWarning, match=r"'link_3.0' is not physical: .* triangle inequality"):
