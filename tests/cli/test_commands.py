@@ -160,12 +160,37 @@ def test_the_program_ends_without_a_traceback(tmp_path: Path) -> None:
     assert done.stderr.startswith("error: kuka_plain: no such scene") and "Traceback" not in done.stderr
 
 
-def test_simulate_then_select(tmp_path: Path) -> None:
-    out = tmp_path / "run.parquet"
+def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
+    log, train, test = (tmp_path / f"{name}.parquet" for name in ("run", "train", "test"))
     figures = json.loads(
-        run("simulate", "--scene", "kuka_plane", "--duration", 0.5, "--seed", 3, "--out", out, "--json")
+        run("simulate", "-s", "kuka_plane", "--duration", 1.0, "--seed", 3, "--out", log, "--json")
     )
-    assert figures["samples"] == 120 and figures["file"] == str(out)
-    data = Dataset.read(out)
-    assert len(data) == 120 and data.header.seed == 3 and data.header.noise_std == 0.1
-    run("select", out, "-n", 20, "-o", tmp_path / "train.parquet")
+    assert figures["samples"] == 240 and figures["file"] == str(log)
+    data = Dataset.read(log)
+    assert len(data) == 240 and data.header.seed == 3 and data.header.noise_std == 0.1
+    run("select", log, "-n", 20, "-o", train, "--rest", test)
+
+    model = tmp_path / "model"
+    fitted = json.loads(run("fit", "-s", "kuka_plane", "-d", train, "-m", "sgp-mean", "-o", model, "--json"))
+    assert fitted["model"] == "sgp-mean" and fitted["training_points"] == 20
+    for quantity, width in (("qdd", 7), ("multiplier", None)):
+        predicted = tmp_path / f"{quantity}.parquet"
+        run("predict", "-m", model, "-d", test, "-q", quantity, "-o", predicted)
+        values = getattr(Dataset.read(predicted), f"predicted_{quantity}")
+        std = getattr(Dataset.read(predicted), f"predicted_{quantity}_std")
+        if width is None:
+            values, std = values["table"], std["table"]
+        assert values.shape == ((220, width) if width else (220,))
+        assert bool((std > 0.0).all())
+    figures = json.loads(run("evaluate", "-m", model, "-d", test, "-o", tmp_path / "figures", "--json"))
+    # Mean error over noise of 0.1; the analytical mean alone knows the motion up to the contact's friction.
+    assert 0.05 < figures["noisy_mae"] < 0.3
+    assert json.loads(Path(figures["file"]).read_text())["samples"] == 220
+
+    assert "did you mean 'multiplier'?" in fail(
+        "predict", "-m", model, "-d", test, "-q", "multiplyer", "-o", log
+    )
+    assert "did you mean 'sgp-mean'?" in fail(
+        "fit", "-s", "kuka_plane", "-d", train, "-m", "sgp-men", "-o", model
+    )
+    assert "model.json" in fail("evaluate", "-m", tmp_path, "-d", test)

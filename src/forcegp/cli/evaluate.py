@@ -7,24 +7,34 @@ from typing import Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, read_data, show
+from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, progress_bar, read_data, show
 
 
 def evaluate(
     model: ModelFolder,
     data: DataFile,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the figures and the page.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for evaluation.json.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a model's predictions with a data set: errors, coverage, density, constraint residual.
+
+    Errors are in rad/s² (m/s² for sliding joints); coverage is the share of samples within two standard
+    deviations. The file in the folder has the figures by joint and the calibration too.
 
     [bold]Examples[/bold]
 
     forcegp evaluate --model model/ --data test.parquet --out evaluation/
     """
     from forcegp.evaluation import evaluate as run
+    from forcegp.files import write_json
     from forcegp.models.files import load_model
 
     regression = load_model(model)
     test = data_of_robot(read_data(data), regression.system.robot)
-    show(run(regression, test, out).summary(), as_json)
+    with progress_bar("evaluating", len(test)) as progress:
+        result = run(regression, test, progress=progress)
+    figures: dict[str, object] = dict(result.summary())
+    if out is not None:
+        write_json(out / "evaluation.json", result.to_dict())
+        figures["file"] = str(out / "evaluation.json")
+    show(figures, as_json)
