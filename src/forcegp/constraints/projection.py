@@ -18,8 +18,10 @@ POSITION_TOLERANCE = 1e-12
 """Largest constraint error that counts as none [m]; rounding of the kinematics of an arm leaves 1e-15."""
 ROUNDING = 100.0
 """Constraint error, in units of the precision's ε, that rounding may leave; it counts in float32 only."""
-MAX_ITERATIONS = 12
-"""Newton doubles the digits in each iteration; a state off by centimetres needs four."""
+MAX_ITERATIONS = 30
+"""Newton doubles the digits in each iteration; a state off by a centimetre needs four."""
+MAX_STEP = 0.2
+"""Largest move of a joint in one iteration [rad, m]; light wrist joints are asked for more than they give."""
 
 
 def project_velocity(eom: Equations, qd: JointVector) -> JointVector:
@@ -52,7 +54,8 @@ def project_state(
         error = _largest(c)
         if float(error) <= tolerance:
             return q, project_velocity(eom, qd)
-        q = q - (eom.L @ c[..., None])[..., 0]
+        move = (eom.L @ c[..., None])[..., 0]
+        q = q - move * (MAX_STEP / move.detach().abs().amax(-1, keepdim=True).clamp(min=MAX_STEP))
     raise NumericalError(
         "no state on the constraint manifold is found",
         expected=f"a constraint error of at most {tolerance:g} m after {MAX_ITERATIONS} iterations",

@@ -1,0 +1,108 @@
+"""Unilateral contact: lift-off and landing where closed forms say, impacts, no false loss."""
+
+import math
+
+import pytest
+import torch
+
+from forcegp.constraints import Baumgarte
+from forcegp.errors import ModelError
+from forcegp.rollout import AccelerationLaw, RolloutOptions, rollout
+from rollout_cases import ANALYTICAL, GRAVITY, SLIDER_MASS, arm, simulated, slider
+
+WEIGHT = SLIDER_MASS * GRAVITY
+EVENT_TOLERANCE = 1e-7
+"""An event is located to far less than a step of 4 ms [s]."""
+
+
+def unilateral(**options) -> RolloutOptions:
+    return RolloutOptions(unilateral=True, **options)
+
+
+def state(along: float, up: float) -> torch.Tensor:
+    return torch.tensor([along, up], dtype=torch.float64)
+
+
+def ramp(t: torch.Tensor, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
+    """A pull that reaches the weight after 0.1003 s."""
+    return torch.cat([torch.zeros_like(t), WEIGHT * t / 0.1003], dim=-1)
+
+
+@pytest.mark.parametrize("method", ["semi_implicit_euler", "rk4", "dop853"])
+def test_lift_off_is_located_within_the_step(tmp_path, method: str) -> None:
+    system = slider(tmp_path)
+    dt = 0.02 if method == "dop853" else 1.0 / 240.0
+    options = unilateral(method=method, stabilization="none", dt=dt)
+    found = rollout(ANALYTICAL, system, state(0, 0), state(0.5, 0), ramp, 0.2, options=options)
+    (event,) = found.events
+    assert (event.contact, event.closed) == ("floor", False)
+    assert event.t == pytest.approx(0.1003, abs=EVENT_TOLERANCE)
+    # After lift-off z̈ = g (t/t₀ − 1), so z = g (t − t₀)³ / (6 t₀).
+    height = GRAVITY * (found.t[-1] - 0.1003) ** 3 / (6.0 * 0.1003)
+    tolerance = 1e-4 if method == "semi_implicit_euler" else 1e-8
+    assert float(found.q[-1, 1]) == pytest.approx(float(height), abs=tolerance)
+    before = found.t < 0.1003
+    assert torch.equal(found.active[:, 0], before)
+    assert torch.allclose(found.multiplier[before, 0], WEIGHT * (1.0 - found.t[before] / 0.1003))
+    assert float(found.multiplier[~before].abs().max()) == 0.0
+
+
+def test_landing_is_located_and_inelastic(tmp_path) -> None:
+    system, height = slider(tmp_path), 0.05
+    fall = math.sqrt(2.0 * height / GRAVITY)
+    options = unilateral(method="rk4", stabilization="none")
+    nothing = torch.zeros(1, 2, dtype=torch.float64)
+    found = rollout(ANALYTICAL, system, state(0, height), state(0.5, 0), nothing, 0.2, options=options)
+    (event,) = found.events
+    assert event.closed
+    assert event.t == pytest.approx(fall, abs=EVENT_TOLERANCE)
+    assert not bool(found.active[0]) and bool(found.active[-1])
+    after = found.t > fall
+    assert float(found.qd[after, 1].abs().max()) < 1e-12, "no rebound"
+    assert torch.allclose(found.qd[:, 0], torch.tensor(0.5, dtype=torch.float64)), "no friction"
+    assert float(found.c[after].abs().max()) < 1e-9
+    assert torch.allclose(found.multiplier[after], torch.tensor(WEIGHT, dtype=torch.float64))
+
+
+def test_a_jump_of_the_torque_opens_the_contact_at_its_sample(tmp_path) -> None:
+    tau = torch.zeros(48, 2, dtype=torch.float64)
+    tau[24:, 1] = 1.5 * WEIGHT
+    found = rollout(ANALYTICAL, slider(tmp_path), state(0, 0), state(0, 0), tau, 0.2, options=unilateral())
+    (event,) = found.events
+    assert event.t == pytest.approx(24 / 240)
+    assert int(found.active[:, 0].sum()) == 24
+
+
+def test_members_of_a_batch_lose_contact_at_their_own_times(tmp_path) -> None:
+    times = torch.tensor([0.05, 0.0777, 0.111, 9.0], dtype=torch.float64)[:, None]
+
+    def pulls(t: torch.Tensor, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
+        return torch.cat([torch.zeros_like(t), WEIGHT * t / times], dim=-1)
+
+    start = torch.zeros(4, 2, dtype=torch.float64)
+    found = rollout(ANALYTICAL, slider(tmp_path), start, start, pulls, 0.15, options=unilateral())
+    opened = {event.row: event.t for event in found.events}
+    assert sorted(opened) == [0, 1, 2]
+    assert [opened[i] for i in range(3)] == pytest.approx(times[:3, 0].tolist(), abs=EVENT_TOLERANCE)
+
+
+def test_a_resting_contact_with_baumgarte_stays_closed_after_landing(tmp_path) -> None:
+    system = slider(tmp_path, Baumgarte(10.0, 1.0))
+    nothing = torch.zeros(1, 2, dtype=torch.float64)
+    found = rollout(ANALYTICAL, system, state(0, 0.01), state(0, -0.3), nothing, 0.5, options=unilateral())
+    assert [event.closed for event in found.events] == [True]
+
+
+def test_sliding_motions_lose_no_contact() -> None:
+    data = simulated().data
+    found = rollout(ANALYTICAL, arm(Baumgarte()), data.q[0], data.qd[0], data.tau, 0.5, options=unilateral())
+    assert found.events == ()
+    bilateral = rollout(ANALYTICAL, arm(Baumgarte()), data.q[0], data.qd[0], data.tau, 0.5)
+    assert torch.equal(found.q, bilateral.q)
+
+
+def test_a_law_without_forces_cannot_lose_contact() -> None:
+    data = simulated().data
+    law = AccelerationLaw(None)  # type: ignore[arg-type]
+    with pytest.raises(ModelError, match="no multiplier"):
+        rollout(law, arm(), data.q[0], data.qd[0], data.tau, 0.1, options=unilateral())
