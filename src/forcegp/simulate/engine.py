@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from forcegp.errors import MissingDependencyError, UnknownNameError
 from forcegp.robot.model import RobotModel
@@ -11,6 +11,7 @@ from forcegp.types import JointMatrix, JointVector
 ENGINES = ("pybullet", "mujoco")
 
 
+@runtime_checkable
 class Engine(Protocol):
     """A physics engine that holds one robot, moves it under gravity and adds no other force of its own.
 
