@@ -9,17 +9,21 @@ import typer
 
 from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, progress_bar, read_data, show
 
+WINDOW_SECONDS = 3.0
+"""How much of the data the figures show, as in the paper."""
+
 
 def evaluate(
     model: ModelFolder,
     data: DataFile,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for evaluation.json.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for figures and a page.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a model's predictions with a data set: errors, coverage, density, constraint residual.
 
     Errors are in rad/s² (m/s² for sliding joints); coverage is the share of samples within two standard
-    deviations. The file in the folder has the figures by joint and the calibration too.
+    deviations. The folder gets a page with the predictions over the first seconds, its figures and their
+    data, and evaluation.json with the scores by joint and the calibration.
 
     [bold]Examples[/bold]
 
@@ -35,6 +39,12 @@ def evaluate(
         result = run(regression, test, progress=progress)
     figures: dict[str, object] = dict(result.summary())
     if out is not None:
+        from forcegp.experiments.window import opening, predicted_window
+        from forcegp.report.evaluation import write_evaluation
+
         write_json(out / "evaluation.json", result.to_dict())
+        window = predicted_window(regression, opening(test, WINDOW_SECONDS), regression.kind)
         figures["file"] = str(out / "evaluation.json")
+        title = f"Model {model} on {data}"
+        figures["page"] = str(write_evaluation(out, title, result.summary(), window))
     show(figures, as_json)

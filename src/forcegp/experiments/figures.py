@@ -26,8 +26,8 @@ from forcegp.report.data import CovarianceData, IdentificationData, MultiplierDa
 from forcegp.report.page import FigureData
 
 DATA = "data.json"
-COVARIANCE_STATES, COVARIANCE_STEP = 6, 24
-"""States of figure 1, and samples between them: a tenth of a second."""
+COVARIANCE_STATES = 6
+"""States of figure 1: the first training points."""
 MULTIPLIER_STEP = 4
 """Every fourth sample of figure 2 is predicted."""
 HeaderT = TypeVar("HeaderT", bound=Header)
@@ -62,12 +62,12 @@ def _stretch(task: Task) -> slice:
 
 def _covariance(stages: Stages, task: Task, fit: Fit) -> CovarianceData:
     def make(folder: Path, _: Advance) -> None:
-        model, first = fit.load(), _stretch(task).start
+        model = fit.load()
         assert isinstance(model, StructuredGP)
-        rows = slice(first, first + COVARIANCE_STATES * COVARIANCE_STEP, COVARIANCE_STEP)
-        write_text(folder / DATA, covariance_blocks(model, task.data[rows], fit.name).to_json())
+        data = task.train(fit.split, COVARIANCE_STATES)
+        write_text(folder / DATA, covariance_blocks(model, data, fit.name).to_json())
 
-    settings = {"states": COVARIANCE_STATES, "step": COVARIANCE_STEP}
+    settings = {"states": COVARIANCE_STATES}
     return _read(
         stages.run("figures/covariance", make, settings=settings, inputs=[fit.stage]) / DATA, CovarianceData
     )
@@ -118,14 +118,7 @@ def _task_space(stages: Stages, sizes: Profile, task: Task) -> TaskSpaceData:
 
 def _window(stages: Stages, task: Task, fit: Fit) -> WindowData:
     def make(folder: Path, _: Advance) -> None:
-        found = predicted_window(
-            fit.load(),
-            task.data[_stretch(task)],
-            name=fit.name,
-            training_points=fit.points,
-            noise_std=noise_std_of(task),
-            held_out=True,
-        )
+        found = predicted_window(fit.load(), task.data[_stretch(task)], fit.name)
         write_text(folder / DATA, found.to_json())
 
     return _read(

@@ -15,7 +15,7 @@ VECTORS = (
 
 
 def task_space_motion(t: Tensor, motion: Mapping[str, Tensor], rows: Tensor) -> TaskSpaceData:
-    """The motion of the tool at some samples, with the points that its lines join.
+    """The motion of the tool at some samples, with the points that it passes.
 
     Args:
         t: `(n,)` times of the log [s].
@@ -26,6 +26,6 @@ def task_space_motion(t: Tensor, motion: Mapping[str, Tensor], rows: Tensor) -> 
     first = int(motion["segment"][rows].min())
     return TaskSpaceData(
         t=series(t[rows]),
-        waypoints=matrix(motion["waypoints"][torch.arange(first, last + 2)]),
+        waypoints=matrix(motion["waypoints"][torch.arange(first + 1, last + 1)]),
         **{name: columns(motion[name][rows]) for name in VECTORS},
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from forcegp.report.data import SPLITS, IdentificationData, PaperNumbers, Results, Score
 from forcegp.report.style import AXES, INK, MARKERS, Picture, colour, draw, label
@@ -39,7 +39,7 @@ def draw_learning_curve(results: Results, paper: PaperNumbers, split: str, kind:
         kind: `"noisy"` or `"clean"`, the accelerations compared with.
     """
     measure: Measure = (lambda s: s.noisy_mae) if kind == "noisy" else (lambda s: s.clean_mae)
-    compared = kind == "noisy"
+    compared = kind == "noisy" and split == "selection"
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
@@ -48,10 +48,9 @@ def draw_learning_curve(results: Results, paper: PaperNumbers, split: str, kind:
             for model, values in paper.noisy_mae.items():
                 axes.plot(paper.points, values, color=colour(model), linestyle=(0, (2, 1.5)), linewidth=1.0)
             axes.plot([], [], color=INK, linestyle=(0, (2, 1.5)), linewidth=1.0, label="paper")
+        if kind == "noisy":
             floor = FLOOR * results.noise_std
-            axes.axhline(floor, color=INK, linewidth=0.7, linestyle=":")
-            axes.annotate("noise floor", (0.02, floor), xycoords=("axes fraction", "data"), fontsize=7.5,
-                          xytext=(0, 2), textcoords="offset points")  # fmt: skip
+            axes.axhline(floor, color=INK, linewidth=0.8, linestyle=":", label="noise alone")
         _finish(axes, f"error against {kind} acceleration [rad/s²]")
         figure.legend(loc="outside upper center", ncols=2)
 
@@ -148,8 +147,9 @@ def _finish(axes: Axes, name: str) -> None:
     axes.set_ylabel(name)
     low, high = axes.get_ylim()
     if high / low < 1e3:
-        axes.yaxis.set_major_formatter(ScalarFormatter())
-        axes.yaxis.set_minor_formatter(ScalarFormatter() if high / low < 8 else NullFormatter())
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _ends(results: Results, split: str, measure: Measure) -> str:

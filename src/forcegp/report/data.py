@@ -45,9 +45,7 @@ class WindowData(Header):
 
     Attributes:
         model: registry name.
-        training_points: what it learned from.
-        held_out: whether no training point comes from the window.
-        noise_std: of the measured accelerations [rad/s²].
+        noise_std: of the measured accelerations [rad/s²], where known.
         t: [s].
         joint_names: one a series.
         measured, clean, mean, std: accelerations by joint [rad/s²]; `clean` and `std` may be unknown.
@@ -57,9 +55,7 @@ class WindowData(Header):
     VERSION: ClassVar[int] = 1
 
     model: str
-    training_points: int
-    held_out: bool
-    noise_std: float
+    noise_std: float | None
     t: Series
     joint_names: list[str]
     measured: list[Series]

@@ -33,12 +33,12 @@ class Finding:
 
     Attributes:
         topic: in a few words.
-        agrees: whether the paper's claim, or ours, is borne out.
+        agrees: whether the paper's claim, or ours, is borne out; `None` where none is made.
         text: the reading, with its numbers.
     """
 
     topic: str
-    agrees: bool
+    agrees: bool | None
     text: str
 
 
@@ -155,7 +155,7 @@ def _splits(results: Results) -> Finding | None:
     listed = "; ".join(f"{label(m)} {held:.4f} against {papers:.4f}" for m, held, papers in rows)
     return Finding(
         "Held-out stretches",
-        all(held <= 2.0 * papers for _, held, papers in rows),
+        None,
         "Clean error on stretches of motion without a single training point, against the paper's split, "
         f"whose test samples lie next to training points: {listed} rad/s².",
     )
@@ -206,13 +206,13 @@ def _multiplier(data: MultiplierData) -> Finding:
         + f", mean error {b.mean_error:.2f} N, least {b.smallest:.1f} N"
         for b in data.bands
     )
-    agrees = all(b.inside >= INSIDE and b.smallest > 0.0 for b in data.bands)
+    informed = [b for b in data.bands if b.model != "sgp-zero"]
+    agrees = all(b.inside >= INSIDE and b.smallest > 0.0 for b in informed)
     text = f"λ predicted from accelerations alone, over {data.t[-1] - data.t[0]:.0f} s: {listed}."
-    if not agrees:
+    if len(informed) < len(data.bands):
         text += (
-            " Accelerations do not depend on the force along the surface normal; it is known only as far "
-            "as the prior carries it over from other states, so a model of few points or a wrong prior "
-            "is too sure of it."
+            " Accelerations do not tell the force along the surface normal, as H Aᵀ = 0; with a zero mean "
+            "nothing else does, so only models with the analytical mean (eq. 25) can be right about λ."
         )
     return Finding("Multiplier", agrees, text)
 

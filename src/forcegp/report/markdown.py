@@ -14,6 +14,8 @@ from forcegp.report.tables import (
     simulation_table,
 )
 
+VERDICT = {True: " (borne out)", False: " (differs)", None: ""}
+
 
 def results_markdown(
     results: Results, multiplier: MultiplierData | None, identification: IdentificationData | None
@@ -30,7 +32,7 @@ def results_markdown(
         f"Written by `forcegp reproduce --profile {results.profile}`; change nothing by hand. {paper.source}",
         "## What the numbers say",
         "\n".join(
-            f"- **{f.topic}** ({'borne out' if f.agrees else 'differs'}). {f.text}"
+            f"- **{f.topic}**{VERDICT[f.agrees]}. {f.text}"
             for f in findings(results, paper, multiplier, identification)
         ),
         "## Errors",

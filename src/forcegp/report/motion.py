@@ -27,6 +27,7 @@ def draw_task_space(data: TaskSpaceData) -> Picture:
             axes.set_ylabel(name)
             axes.margins(x=0.0)
         figure.axes[-1].set_xlabel("time [s]")
+        figure.align_ylabels()
         styles = [
             figure.axes[0].plot([], [], color=AXES[0], label="x")[0],
             figure.axes[0].plot([], [], color=AXES[1], label="y")[0],
@@ -100,6 +101,7 @@ def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> Picture:
         both.set_ylabel("multiplier λ [N]")
         error.set_ylabel("less simulator [N]")
         error.set_xlabel("time [s]")
+        figure.align_ylabels()
         figure.legend(*both.get_legend_handles_labels(), loc="outside upper center", ncols=3)
 
     alt = (

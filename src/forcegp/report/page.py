@@ -1,12 +1,10 @@
-"""The page of a reproduction, and that of one evaluated model: single HTML files that need no others."""
+"""The page of a reproduction: every figure and table of the paper, ours beside theirs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import jinja2
 
 from forcegp.files import write_text
 from forcegp.report.covariance import draw_force_prior, draw_operators, draw_structured
@@ -22,9 +20,9 @@ from forcegp.report.data import (
     paper_numbers,
 )
 from forcegp.report.findings import findings
+from forcegp.report.html import FigureBlock, render
 from forcegp.report.motion import draw_constraint, draw_multiplier, draw_path, draw_task_space
 from forcegp.report.predictions import common_limit, draw_errors, draw_predictions
-from forcegp.report.style import Picture
 from forcegp.report.tables import (
     Table,
     curve_table,
@@ -47,23 +45,6 @@ class FigureData:
     identification: IdentificationData
 
 
-@dataclass(frozen=True)
-class FigureBlock:
-    """Pictures under one number and caption.
-
-    Attributes:
-        heading: what it is, with the paper's figure number where it has one.
-        caption: what is seen.
-        pictures: the panels.
-        source: file with the data.
-    """
-
-    heading: str
-    caption: str
-    pictures: tuple[Picture, ...]
-    source: str
-
-
 def write_page(path: Path, results: Results, figures: FigureData) -> None:
     """Write the page of a reproduction."""
     write_text(path, render_page(results, figures))
@@ -81,46 +62,14 @@ def render_page(results: Results, figures: FigureData) -> str:
         "simulation": simulation_table(results),
         "settings": settings_table(results),
     }
-    return _environment().get_template("report.html.j2").render(
+    return render(
+        "report.html.j2",
         results=results,
         paper=paper,
         tables=tables,
         findings=findings(results, paper, figures.multiplier, figures.identification),
         learning=_learning(results),
         blocks=_figures(figures),
-    )  # fmt: skip
-
-
-def render_evaluation(title: str, figures: dict[str, str], window: WindowData) -> str:
-    """The page of one evaluated model as HTML.
-
-    Args:
-        title: name of the model and the data.
-        figures: what was measured, by name, as text.
-        window: its predictions.
-    """
-    table = Table("Scores on this data set", ("score", "value"), tuple(figures.items()))
-    blocks = (
-        FigureBlock(
-            "Predictions and errors",
-            "Accelerations by joint: measured in black, predicted in colour, with the band of two "
-            "standard deviations where the model gives one. Errors are measured less predicted; where "
-            "the data hold the noise-free acceleration, it is the black line.",
-            (draw_predictions(window), draw_errors(window)),
-            "window.json",
-        ),
-    )
-    template = _environment().get_template("evaluation.html.j2")
-    return template.render(title=title, table=table, blocks=blocks)
-
-
-def _environment() -> jinja2.Environment:
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader("forcegp.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
     )
 
 
@@ -134,8 +83,8 @@ def _learning(results: Results) -> FigureBlock:
     return FigureBlock(
         "Learning curves (main paper, error over N)",
         "Mean absolute error over the number of training points, and the mean constraint residual. "
-        "Dashed: the paper's curves, read off its plots; they were measured on the paper's split against "
-        f"noisy accelerations, and compare with that panel alone.{spread}",
+        "Dashed: the paper's curves, read off its plots, where they compare: against noisy accelerations on "
+        f"its own split, and for the residual. Dotted: the mean magnitude of the noise.{spread}",
         (*pictures, draw_residual(results, paper, "stretches")),
         "results.json",
     )
@@ -149,7 +98,7 @@ def _figures(data: FigureData) -> Sequence[FigureBlock]:
     return (
         FigureBlock(
             "Figure 1: structured covariance",
-            f"H k_Q Hᵀ block by block, for {len(data.covariance.t)} states a tenth of a second apart, "
+            f"H k_Q Hᵀ block by block, for {len(data.covariance.t)} training points, "
             "with the learned hyperparameters of the zero-mean S-GP. Left: the operators H(xᵢ), which "
             "the known mechanics gives. Middle: the prior on the forces, one independent process a "
             "joint, so every block is diagonal. Right: the covariance of accelerations, full in every "

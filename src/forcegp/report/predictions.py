@@ -54,7 +54,7 @@ def common_limit(windows: list[WindowData]) -> float:
         return 0.5
     largest = sorted(float(_error(window).abs().quantile(0.995)) for window in windows)
     middle = largest[(len(largest) - 1) // 2]
-    return max(4.0 * windows[0].noise_std, 1.3 * middle)
+    return max(4.0 * (windows[0].noise_std or 0.0), 1.3 * middle)
 
 
 def _error(window: WindowData) -> Tensor:
@@ -95,6 +95,7 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
         if limit is not None:
             axes.set_ylim(-limit, limit)
     rows[-1].set_xlabel("time [s]")
+    figure.align_ylabels()
     handles, names = rows[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=len(names))
     unit = "[rad/s²]"

@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 COLOURS = {
-    "analytical": "#7a7a7a",
-    "nn": "#b07800",
+    "analytical": "#9c2f1a",
+    "nn": "#d08c00",
     "gp": "#0072b2",
     "sgp-zero": "#c4488c",
     "sgp-mean": "#6a3d9a",
@@ -22,7 +22,7 @@ COLOURS = {
 }
 """One colour a model, told apart by colour-blind readers and on paper."""
 MARKERS = {"analytical": "x", "nn": "v", "gp": "s", "sgp-zero": "o", "sgp-mean": "D", "sgp-contact": "^"}
-OTHER = "#d55e00"
+OTHER = "#555555"
 INK = "#222222"
 FAINT = "#b8b8b8"
 AXES = ("#0072b2", "#d55e00", "#007a5e")
