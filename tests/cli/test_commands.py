@@ -16,7 +16,7 @@ from forcegp.cli import app, main
 from forcegp.data import Dataset
 from logs import JOINTS, random_log
 
-COMMANDS = ("reproduce", "simulate", "select", "fit", "predict", "evaluate")
+COMMANDS = ("reproduce", "simulate", "select", "fit", "predict", "evaluate", "rollout")
 
 
 def run(*arguments: object) -> str:
@@ -160,6 +160,7 @@ def test_the_program_ends_without_a_traceback(tmp_path: Path) -> None:
     assert done.stderr.startswith("error: kuka_plain: no such scene") and "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
     log, train, test = (tmp_path / f"{name}.parquet" for name in ("run", "train", "test"))
     figures = json.loads(
@@ -186,6 +187,17 @@ def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
     # Mean error over noise of 0.1; the analytical mean alone knows the motion up to the contact's friction.
     assert 0.05 < figures["noisy_mae"] < 0.3
     assert json.loads(Path(figures["file"]).read_text())["samples"] == 220
+
+    path = json.loads(
+        run("rollout", "-m", model, "-d", log, "-o", tmp_path, "--start", 24, "--duration", 0.25, "--json")
+    )
+    # Open loop for a quarter of a second, with a model that knows all but the friction at the contact.
+    assert path["duration_s"] == pytest.approx(0.25) and path["largest_joint_error"] < 0.01
+    assert path["largest_constraint_error_m"] < 1e-3
+    rolled = Dataset.read(path["file"])
+    assert torch.equal(rolled.q_logged, data.q[24:85]) and torch.equal(rolled.q[0], data.q[24])
+    assert "in order of time" in fail("rollout", "-m", model, "-d", train, "-o", tmp_path)
+    assert "even sampling period" in fail("rollout", "-m", model, "-d", test, "-o", tmp_path)
 
     assert "did you mean 'multiplier'?" in fail(
         "predict", "-m", model, "-d", test, "-q", "multiplyer", "-o", log

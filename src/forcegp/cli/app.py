@@ -11,6 +11,7 @@ from forcegp.cli.evaluate import evaluate
 from forcegp.cli.fit import fit
 from forcegp.cli.predict import predict
 from forcegp.cli.reproduce import reproduce
+from forcegp.cli.rollout import rollout
 from forcegp.cli.select import select
 from forcegp.cli.simulate import simulate
 from forcegp.errors import ForceGPError
@@ -26,16 +27,17 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (reproduce, simulate, select, fit, predict, evaluate):
+for command in (reproduce, simulate, select, fit, predict, evaluate, rollout):
     app.command()(command)
 
 
-def _version(wanted: bool) -> None:
+def _version(wanted: bool) -> bool:
     if wanted:
         from importlib.metadata import version
 
         typer.echo(f"forcegp {version('forcegp')}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()

@@ -33,9 +33,9 @@ Differentiate = Annotated[
 
 @runtime_checkable
 class Advance(Protocol):
-    """Moves a progress bar."""
+    """Moves a progress bar; `note` is a word on how it goes, such as the objective."""
 
-    def __call__(self, done: int, total: int | None = None) -> None: ...
+    def __call__(self, done: int, total: int | None = None, note: str = "") -> None: ...
 
 
 @contextmanager
@@ -43,18 +43,18 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
     """A progress bar on stderr.
 
     Yields:
-        A function to call with the number of steps done so far, and their total where it has changed.
+        A function to call with the number of steps done so far, their total where it has changed, and a note.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    times = (TimeElapsedColumn(), TimeRemainingColumn())
+    times = (TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
     console = Console(stderr=True)
     # A file or a pipe gets no bar: its steps would only fill the log.
     with Progress(*columns, *times, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(description, total=total)
-        yield lambda done, total=None: bar.update(task, completed=done, total=total)
+        task = bar.add_task(description, total=total, note="")
+        yield lambda done, total=None, note="": bar.update(task, completed=done, total=total, note=note)
 
 
 def show(result: Mapping[str, object], as_json: bool) -> None:

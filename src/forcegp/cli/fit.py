@@ -53,7 +53,9 @@ def fit(
 
     regression = create(model, system, noise_std=noise_std_of(noise_std, read, training), seed=seed)
     with progress_bar(f"fitting {model}", 1) as progress:
-        result = regression.fit(training, progress=lambda done, most, _: progress(done, most))
+        result = regression.fit(
+            training, progress=lambda done, most, value: progress(done, most, f"objective {value:.4g}")
+        )
     regression.save(out)
     if not result.converged:
         typer.secho(f"warning: the fit did not converge: {result.message}", fg="yellow", err=True)

@@ -28,4 +28,7 @@ def reproduce(
     """
     from forcegp.experiments.reproduce import run
 
-    show(run(profile, out, seed=seed, progress=progress_bar).summary(), as_json)
+    def say(line: str) -> None:
+        typer.echo(line, err=True)
+
+    show(run(profile, out, seed=seed, progress=progress_bar, say=say).summary(), as_json)
