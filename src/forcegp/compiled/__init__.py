@@ -132,7 +132,8 @@ class _Kernel(torch.autograd.Function):
 def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> CompiledDynamics:
     """Compile a function of `forcegp.dynamics` (or its derivatives) for one robot.
 
-    The first call on a machine runs its C++ compiler (a few seconds); later ones, in any process, read
+    The first call on a machine runs its C++ compiler (about a second for an arm, ten for a hand, minutes for
+    a hundred joints); later ones, in any process, read
     the kernel from the cache (`$FORCEGP_CACHE`, or `forcegp` in the user's cache folder). On a CUDA robot
     the kernel is compiled by NVRTC in each process.
 
