@@ -183,7 +183,8 @@ class AnalyticalModel(Model):
             ]
             values.append(torch.cat(by_name, dim=-1))
             parts = _parts(names, [x.shape[-1] for x in by_name])
-        return Prediction(torch.cat(values).reshape(*flat.batch, -1), None, parts)
+        mean = torch.cat(values)
+        return Prediction(mean.reshape(*flat.batch, mean.shape[-1]), None, parts)
 
     def force_field(self) -> ForceField:
         return AnalyticalMean()

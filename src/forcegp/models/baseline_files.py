@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
+from pydantic import PositiveFloat
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
@@ -18,7 +19,7 @@ from forcegp.models.independent_gp import IndependentGP, IndependentTraining
 from forcegp.models.neural import NeuralNetwork
 from forcegp.models.system_files import take
 
-STATES = ("q", "qd", "tau")
+STATES: tuple[str, ...] = ("q", "qd", "tau")
 
 
 class AnalyticalSettings(Settings):
@@ -42,7 +43,7 @@ class NetworkSettings(Settings):
 class IndependentSettings(Settings):
     """What is kept of independent Gaussian processes beside their tensors."""
 
-    noise_std: float | tuple[float, ...]
+    noise_std: PositiveFloat | tuple[PositiveFloat, ...]
 
 
 def save_analytical(model: AnalyticalModel, path: str | Path) -> None:

@@ -103,7 +103,7 @@ class IndependentGP(Model):
         progress: FitProgress | None,
     ) -> Learned:
         """Learn the process of one joint."""
-        priors, blocks = self.priors[joint : joint + 1], [self._block(training, joint)]
+        priors, blocks = self.priors[joint : joint + 1], [self.block(training, joint)]
         start = initial_hyperparameters(priors, blocks)
         constant = len(training.qdd) * training.noise_std[joint].log()
 
@@ -117,7 +117,7 @@ class IndependentGP(Model):
 
         return minimise(objective, start, options, bounds=bounds_of(start), progress=report)
 
-    def _block(self, training: IndependentTraining, joint: int) -> Block:
+    def block(self, training: IndependentTraining, joint: int) -> Block:
         """The accelerations of one joint in units of their noise."""
         inverse = 1.0 / training.noise_std[joint]
         operator = inverse.expand(len(training.qdd), 1, 1)
@@ -131,7 +131,7 @@ class IndependentGP(Model):
             NumericalError: a covariance is not positive definite.
         """
         self._conditioned = tuple(
-            condition(self.priors[j : j + 1], hyperparameters, [self._block(training, j)])
+            condition(self.priors[j : j + 1], hyperparameters, [self.block(training, j)])
             for j in range(len(self.priors))
         )
         self.hyperparameters, self.training = hyperparameters, training
@@ -146,7 +146,7 @@ class IndependentGP(Model):
             raise not_fitted(self)
         total = len(self.training.qdd) * float(self.training.noise_std.log().sum())
         for j in range(len(self.priors)):
-            blocks = [self._block(self.training, j)]
+            blocks = [self.block(self.training, j)]
             total += float(negative_log_likelihood(self.priors[j : j + 1], self.hyperparameters, blocks)[0])
         return -total
 
@@ -201,7 +201,7 @@ class IndependentGP(Model):
             mean, variance = self._predict(self.training, part, covariance)
             means.append(mean)
             variances.append(variance)
-        mean = torch.cat(means).reshape(*flat.batch, -1)
+        mean = torch.cat(means).reshape(*flat.batch, self.system.robot.nq)
         if not covariance:
             return Prediction(mean, None, {"qdd": slice(0, mean.shape[-1])})
         spread = torch.cat(variances).reshape(mean.shape)
@@ -216,7 +216,7 @@ class IndependentGP(Model):
         for j, prior in enumerate(self.priors):
             fitted = self._conditioned[j]
             at = Block((features,), (training.qdd.new_ones(n, 1, 1),), training.qdd.new_zeros(n, 1))
-            cross = cross_gram((prior,), self.hyperparameters, [self._block(training, j)], [at])
+            cross = cross_gram((prior,), self.hyperparameters, [self.block(training, j)], [at])
             means.append(cross.mT @ fitted.alpha)
             variance = torch.zeros_like(means[-1])
             if covariance:

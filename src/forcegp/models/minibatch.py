@@ -35,7 +35,7 @@ class BatchOptions:
 
     epochs: int = 400
     batch: int = 256
-    learning_rate: float = 1e-2
+    learning_rate: float = 0.03
     held_out: float = 0.1
     patience: int = 60
 

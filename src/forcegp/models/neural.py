@@ -20,6 +20,9 @@ from forcegp.models.observation import Observation, measurement_of
 
 PAPER_ARCHITECTURES: tuple[tuple[int, ...], ...] = ((80,), (30, 20), (200, 200, 200, 200))
 """Widths of the hidden layers of the three networks of the paper."""
+SHALLOW = BatchOptions(epochs=400, batch=256, learning_rate=0.03)
+DEEP = BatchOptions(epochs=100, batch=256, learning_rate=0.01)
+"""For networks of more than two hidden layers, whose epochs take longer and whose steps must be smaller."""
 
 
 class NeuralNetwork(Model):
@@ -59,7 +62,7 @@ class NeuralNetwork(Model):
 
         Args:
             data: states and measured accelerations.
-            options: how to train.
+            options: how to train; `SHALLOW` or `DEEP` by default.
             progress: called after each epoch.
 
         Returns:
@@ -81,9 +84,9 @@ class NeuralNetwork(Model):
             predicted = torch.func.functional_call(network, dict(tensors), (x[rows],))
             return nn.functional.mse_loss(predicted, y[rows])
 
-        learned = train(
-            loss, dict(network.named_parameters()), len(x), options or BatchOptions(), generator, progress
-        )
+        options = options or (DEEP if len(self.hidden) > 2 else SHALLOW)
+        start = dict(network.named_parameters())
+        learned = train(loss, start, len(x), options, generator, progress)
         network.load_state_dict(learned.tensors)
         self.adopt(network, inputs, outputs)
         return FitResult(
@@ -133,7 +136,7 @@ class NeuralNetwork(Model):
         flat = flat_states(self.system, q, qd, tau, active)
         x = _stacked(self.inputs, {"q": flat.q, "qd": flat.qd, "tau": flat.tau})
         mean = self.network(x) * self.outputs.std["qdd"] + self.outputs.mean["qdd"]
-        return Prediction(mean.reshape(*flat.batch, -1), None, {"qdd": slice(0, mean.shape[-1])})
+        return Prediction(mean.reshape(*flat.batch, mean.shape[-1]), None, {"qdd": slice(0, mean.shape[-1])})
 
     def save(self, path: str | Path) -> None:
         """Write the model as a folder; `forcegp.load_model` reads it back exactly."""

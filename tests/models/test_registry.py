@@ -1,0 +1,55 @@
+"""The models by their short names."""
+
+from __future__ import annotations
+
+import pytest
+
+import forcegp
+from forcegp.errors import UnknownNameError
+from forcegp.models.registry import MODELS, create
+from random_data import table_system
+
+system = table_system()
+
+
+def test_every_name_makes_its_model() -> None:
+    kinds = {name: type(create(name, system)) for name in MODELS}
+    assert kinds == {
+        "analytical": forcegp.AnalyticalModel,
+        "nn": forcegp.NeuralNetwork,
+        "gp": forcegp.IndependentGP,
+        "sgp-zero": forcegp.StructuredGP,
+        "sgp-mean": forcegp.StructuredGP,
+        "sgp-contact": forcegp.StructuredGP,
+    }
+    for entry in MODELS.values():
+        assert entry.description and "\n" not in entry.description and len(entry.description) < 80
+
+
+def test_the_structured_models_differ_in_mean_and_priors() -> None:
+    zero, mean, contact = (create(f"sgp-{name}", system) for name in ("zero", "mean", "contact"))
+    assert isinstance(zero, forcegp.StructuredGP) and isinstance(mean, forcegp.StructuredGP)
+    assert isinstance(contact, forcegp.StructuredGP)
+    assert zero.mean.terms == () and mean.mean == contact.mean == forcegp.AnalyticalMean()
+    assert (
+        [prior.name for prior in zero.force_priors]
+        == [prior.name for prior in mean.force_priors]
+        == ["joint"]
+    )
+    assert [prior.name for prior in contact.force_priors] == ["joint", "contact_table"]
+
+
+def test_noise_seed_and_options_arrive() -> None:
+    network = create("nn", system, seed=5, hidden=(30, 20))
+    assert isinstance(network, forcegp.NeuralNetwork)
+    assert (network.seed, network.hidden) == (5, (30, 20))
+    analytical = create("analytical", system, seed=6, learn={"mass": "all"})
+    assert isinstance(analytical, forcegp.AnalyticalModel)
+    assert analytical.seed == 6 and set(analytical.parameters.joints) == {"mass"}
+    for name in ("gp", "sgp-zero", "sgp-mean", "sgp-contact"):
+        assert create(name, system, noise_std=0.3).noise_std == 0.3  # type: ignore[attr-defined]
+
+
+def test_an_unknown_name_lists_the_models() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown model 'spg-mean'(.|\n)*analytical(.|\n)*'sgp-mean'"):
+        create("spg-mean", system)

@@ -1,0 +1,167 @@
+"""The figures of an evaluation against models whose errors are known."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import forcegp
+from forcegp import evaluate
+from forcegp.errors import DataError, ModelError
+from forcegp.gp.learning import LearningOptions
+from forcegp.models.base import FitProgress, FitResult, Model, Prediction
+from random_data import NOISE_STD, random_data, table_system
+
+ROUNDING = 1e-12
+"""Sums over some thousand numbers of the order of one."""
+
+system = table_system()
+data = random_data(system, 3000)
+
+
+class KnownError(Model):
+    """Predicts the noise-free acceleration plus a given error, and claims a given standard deviation."""
+
+    kind = "known_error"
+
+    def __init__(self, error: Tensor, std: float | None, noise_std: float = NOISE_STD) -> None:
+        self.system, self.error, self.std, self.noise_std = system, error, std, noise_std
+        self.seen = 0
+
+    def fit(self, data: forcegp.Dataset, *, progress: FitProgress | None = None) -> FitResult:
+        raise NotImplementedError
+
+    def save(self, path: str | Path) -> None:
+        raise NotImplementedError
+
+    def predict(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str = "qdd",
+        *,
+        active: Tensor | None = None,
+        covariance: bool = True,
+    ) -> Prediction:
+        rows = slice(self.seen, self.seen + len(q))
+        self.seen += len(q)
+        assert active is not None and torch.equal(active, data.active(["table"])[rows])
+        spread = None if self.std is None else torch.eye(7, dtype=q.dtype).expand(len(q), 7, 7) * self.std**2
+        return Prediction(data.qdd_clean[rows] + self.error[rows], spread)
+
+
+def gaussian(std: float, seed: int = 5) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return std * torch.randn(len(data), 7, generator=generator, dtype=torch.float64)
+
+
+def test_errors_are_the_known_ones() -> None:
+    error = torch.tensor([0.1, -0.2, 0.3, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(3000, 7)
+    found = evaluate(KnownError(error, None), data)
+    assert found.clean is not None and found.clean_mae == found.clean.mae
+    assert found.clean.mae_by_joint == pytest.approx([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0], abs=ROUNDING)
+    assert found.clean.mae == pytest.approx(1.6 / 7, abs=ROUNDING)
+    assert found.clean.rmse == pytest.approx(math.sqrt(1.14 / 7), abs=ROUNDING)
+    noise = data.qdd_clean + error - data.qdd
+    assert found.noisy_mae == pytest.approx(float(noise.abs().mean()), abs=ROUNDING)
+    assert found.noisy.rmse_by_joint == pytest.approx((noise**2).mean(0).sqrt().tolist(), abs=ROUNDING)
+    assert (found.samples, found.kind, found.joint_names) == (3000, "known_error", data.joint_names)
+    for name in ("coverage_noisy", "coverage_clean", "calibration", "nlpd"):
+        assert getattr(found, name) is None
+
+
+def test_a_perfect_model_has_the_floor_of_the_paper() -> None:
+    found = evaluate(KnownError(gaussian(0.0), None), data)
+    # The mean of 21000 absolute values with standard deviation 0.06: three standard errors.
+    assert found.noisy_mae == pytest.approx(
+        NOISE_STD * math.sqrt(2.0 / math.pi), abs=3 * 0.06 / math.sqrt(21000)
+    )
+    assert found.clean_mae == 0.0
+    assert found.residual_max is not None and found.residual_max < 1e-11
+
+
+def test_an_honest_uncertainty_is_calibrated() -> None:
+    found = evaluate(KnownError(gaussian(0.2), 0.2), data)
+    # Shares among 21000 numbers: three standard errors of at most sqrt(0.25 / 21000).
+    tolerance = 3.0 * math.sqrt(0.25 / 21000)
+    assert found.coverage_noisy == pytest.approx(0.9545, abs=tolerance)
+    assert found.coverage_clean == pytest.approx(0.9545, abs=tolerance)
+    assert found.calibration is not None
+    for level, share in found.calibration.items():
+        assert share == pytest.approx(float(level), abs=tolerance)
+    total = 0.2**2 + NOISE_STD**2
+    # Half the variance of a squared normal variable over 21000 of them.
+    expected = 0.5 * math.log(2.0 * math.pi * total) + 0.5
+    assert found.nlpd == pytest.approx(expected, abs=3.0 * math.sqrt(0.5 / 21000))
+    assert found.noise_std == (NOISE_STD,) * 7
+
+
+@pytest.mark.parametrize(("claimed", "coverage"), [(0.02, 0.6), (2.0, 1.0)])
+def test_a_dishonest_uncertainty_shows(claimed: float, coverage: float) -> None:
+    honest, other = (evaluate(KnownError(gaussian(0.2), std), data) for std in (0.2, claimed))
+    assert other.nlpd is not None and honest.nlpd is not None and other.nlpd > honest.nlpd + 0.3
+    assert other.coverage_noisy is not None
+    assert other.coverage_noisy > 0.999 if coverage == 1.0 else other.coverage_noisy < coverage + 0.1
+
+
+def test_the_residual_is_that_of_closed_contacts() -> None:
+    error = gaussian(0.1)
+    found = evaluate(KnownError(error, None), data)
+    active = data.active(["table"])
+    A = system.equations(data.q, data.qd).A
+    expected = (A @ error[..., None])[..., 0][active].abs()
+    assert found.residual == pytest.approx(float(expected.mean()), rel=1e-9)
+    assert found.residual_max == pytest.approx(float(expected.max()), rel=1e-9)
+    free = data.replace(contact={"table": torch.zeros(3000, dtype=torch.bool)})
+    plain = forcegp.AnalyticalModel(system)
+    assert evaluate(plain, free[:10]).residual is None
+
+
+def test_chunks_do_not_matter_and_progress_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = evaluate(KnownError(gaussian(0.2), 0.2), data)
+    monkeypatch.setattr("forcegp.evaluation.CHUNK_STATES", 700)
+    calls: list[tuple[int, int]] = []
+    parts = evaluate(KnownError(gaussian(0.2), 0.2), data, progress=lambda *x: calls.append(x))
+    assert calls == [(700, 3000), (1400, 3000), (2100, 3000), (2800, 3000), (3000, 3000)]
+    same = dataclasses.replace(parts, seconds_per_state=whole.seconds_per_state)
+    old, new = whole.summary(), same.summary()
+    assert old.pop("kind") == new.pop("kind")
+    assert new == pytest.approx(old, rel=1e-9)
+
+
+def test_without_clean_accelerations() -> None:
+    found = evaluate(forcegp.AnalyticalModel(system), data[:20].replace(extras={}))
+    assert found.clean is None and found.clean_mae is None and found.coverage_clean is None
+    assert found.noise_std == (NOISE_STD,) * 7
+
+
+def test_everything_fits_into_json() -> None:
+    found = evaluate(KnownError(gaussian(0.2), 0.2), data)
+    read = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert read["noisy"]["mae"] == found.noisy_mae
+    assert set(found.summary()) >= {"noisy_mae", "clean_mae", "nlpd", "residual"}
+
+
+def test_a_structured_gp_with_learned_noise_is_held_against_that() -> None:
+    model = forcegp.StructuredGP(system, mean="analytical", learn_noise=True, noise_std=0.3)
+    model.fit(data[:30], options=LearningOptions(max_evaluations=12))
+    found = evaluate(model, data[40:60])
+    learned = model.hyperparameters["noise.0.log_noise_std"].exp()
+    assert found.noise_std == pytest.approx(learned.tolist())
+    assert max(found.noise_std or ()) < 0.29
+
+
+def test_wrong_use_is_refused() -> None:
+    with pytest.raises(DataError, match="nothing to evaluate on"):
+        evaluate(forcegp.AnalyticalModel(system), data[:0])
+    with pytest.raises(ModelError, match="has not been fitted"):
+        evaluate(forcegp.IndependentGP(system), data[:5])
+    with pytest.raises(DataError, match="joint"):
+        evaluate(forcegp.AnalyticalModel(system), data.select(tuple(reversed(data.joint_names))))
