@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -39,6 +39,10 @@ class Kernel(ABC):
     @abstractmethod
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         """k(x, x′) `(k, n, n')`."""
+
+    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
+        """x ↦ k(x, x′) `(k, n, n')` for fixed x′, with what depends on x′ alone computed once."""
+        return lambda x1: self.covariance(params, x1, x2)
 
     @abstractmethod
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
@@ -96,12 +100,20 @@ class _Stationary(Kernel):
         """g as a function of r²."""
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        return self.towards(params, x2)(x1)
+
+    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         inverse = torch.exp(-params["log_lengthscale"])[:, None, :]
-        a = stacked(x1, self.inputs) * inverse
         b = stacked(x2, self.inputs) * inverse
-        norms = (a * a).sum(-1)[:, :, None] + (b * b).sum(-1)[:, None, :]
-        r2 = torch.baddbmm(norms, a, b.mT, alpha=-2.0)
-        return torch.exp(2.0 * params["log_std"])[:, None, None] * self.profile(r2)
+        squares = (b * b).sum(-1)[:, None, :]
+        variance = torch.exp(2.0 * params["log_std"])[:, None, None]
+
+        def covariance(x1: Features) -> Tensor:
+            a = stacked(x1, self.inputs) * inverse
+            r2 = torch.baddbmm((a * a).sum(-1)[:, :, None] + squares, a, b.mT, alpha=-2.0)
+            return variance * self.profile(r2)
+
+        return covariance
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         n = next(iter(x.values())).shape[0]
@@ -237,6 +249,11 @@ class Sum(Kernel):
         left = self.left.covariance(sub(params, "left"), x1, x2)
         return left + self.right.covariance(sub(params, "right"), x1, x2)
 
+    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
+        left = self.left.towards(sub(params, "left"), x2)
+        right = self.right.towards(sub(params, "right"), x2)
+        return lambda x1: left(x1) + right(x1)
+
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         return self.left.diagonal(sub(params, "left"), x) + self.right.diagonal(sub(params, "right"), x)
 
@@ -263,6 +280,11 @@ class Product(Sum):
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         left = self.left.covariance(sub(params, "left"), x1, x2)
         return left * self.right.covariance(sub(params, "right"), x1, x2)
+
+    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
+        left = self.left.towards(sub(params, "left"), x2)
+        right = self.right.towards(sub(params, "right"), x2)
+        return lambda x1: left(x1) * right(x1)
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         return self.left.diagonal(sub(params, "left"), x) * self.right.diagonal(sub(params, "right"), x)

@@ -9,6 +9,7 @@ constraint.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -86,6 +87,35 @@ class PosteriorSamples:
             force = (prior.operator(system, at) @ self.latent(p, features, sample)[..., None])[..., 0]
             Q, Q_z = (Q, Q_z + force) if prior.in_contact_only else (Q + force, Q_z)
         return Q, Q_z
+
+    @cached_property
+    def _weights_by_sample(self) -> list[list[Tensor]]:
+        """By prior, `(components, samples, terms, 1)` weights of the features and of each block's data."""
+        pairs = zip(self.feature_weights, self.data_weights, strict=True)
+        return [[w.mT.contiguous()[..., None] for w in (own, *data)] for own, data in pairs]
+
+    def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
+        """Q̄ = Q + Q_z of one sample a trajectory, the force field of a rollout.
+
+        Args:
+            system: robot and contacts.
+            at: samples × k states, of which the s-th run of k belongs to sample s.
+
+        Returns:
+            `(samples · k, nq)` [N m, N].
+        """
+        Q_bar = self.posterior.mean(system, at)
+        for p, features in enumerate(self.posterior.features(system, at)):
+            terms = [self.draws[p].basis(features)]
+            terms += [kernel(features) for kernel in self.posterior.kernels_to_data[p]]
+            parts = [
+                k.unflatten(1, (self.count, -1)) @ w
+                for k, w in zip(terms, self._weights_by_sample[p], strict=True)
+            ]
+            force = sum(parts[1:], start=parts[0])[..., 0].flatten(1).mT
+            E = self.posterior.priors[p].operator(system, at)
+            Q_bar = Q_bar + (E @ force[..., None])[..., 0]
+        return Q_bar
 
 
 def draw_samples(

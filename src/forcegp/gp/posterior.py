@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -57,6 +57,14 @@ class ForcePosterior:
                 weights[p].append(torch.einsum("nak,na->kn", W, alpha))
         return weights
 
+    @cached_property
+    def kernels_to_data(self) -> list[list[Callable[[Features], Tensor]]]:
+        """By prior and block, x ↦ k(x, X)."""
+        return [
+            [prior.kernel.towards(sub(self.params, prior.name), block.features[p]) for block in self.blocks]
+            for p, prior in enumerate(self.priors)
+        ]
+
     def features(self, system: ConstrainedSystem, at: States) -> tuple[dict[str, Tensor], ...]:
         """Standardized kernel inputs of each prior at states."""
         pairs = zip(self.priors, self.scales, strict=True)
@@ -64,10 +72,9 @@ class ForcePosterior:
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
         """Posterior mean of the force of prior p, without its prior mean, `(n, components)`."""
-        kernel, own = self.priors[p].kernel, sub(self.params, self.priors[p].name)
         parts = [
-            (kernel.covariance(own, features, block.features[p]) @ w[..., None])[..., 0]
-            for block, w in zip(self.blocks, self.weights[p], strict=True)
+            (kernel(features) @ w[..., None])[..., 0]
+            for kernel, w in zip(self.kernels_to_data[p], self.weights[p], strict=True)
         ]
         return sum(parts[1:], start=parts[0]).mT
 

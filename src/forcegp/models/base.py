@@ -87,6 +87,8 @@ class Model(ABC):
     kind: str
     """Name of the class of models in saved files."""
     system: ConstrainedSystem
+    has_function_samples: bool = False
+    """Whether `force_samples` draws functions from a posterior over forces."""
 
     @abstractmethod
     def fit(self, data: Dataset, *, progress: FitProgress | None = None) -> FitResult:

@@ -19,6 +19,7 @@ from forcegp.gp.exact import negative_log_likelihood
 from forcegp.gp.hyperprior import bounds_of, initial_hyperparameters, negative_log_prior
 from forcegp.gp.learning import Learned, LearningOptions, minimise
 from forcegp.gp.mean import AnalyticalMean, mean_of
+from forcegp.gp.pathwise import draw_samples
 from forcegp.gp.posterior import ForcePosterior, posterior
 from forcegp.gp.priors import ForcePrior, JointForcePrior, Standardization, States, check_priors, states
 from forcegp.gp.whitening import Measurement, WhitenedRows, combine, whiten
@@ -62,6 +63,7 @@ class StructuredGP(Model):
     """
 
     kind = "structured_gp"
+    has_function_samples = True
 
     def __init__(
         self,
@@ -322,6 +324,9 @@ class StructuredGP(Model):
 
     def force_field(self) -> ForceField:
         return self.posterior.total_force
+
+    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
+        return draw_samples(self.posterior, samples, generator).total_force
 
     def save(self, path: str | Path) -> None:
         """Write the model as a folder; `forcegp.load_model` reads it back exactly."""

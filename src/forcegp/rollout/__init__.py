@@ -1,14 +1,17 @@
 """Forward in time: trajectories that stay on the surface, with uncertainty, and contact that can be lost."""
 
+from forcegp.rollout.comparison import Comparison, beside_log, compare
 from forcegp.rollout.contact import ContactEvent
 from forcegp.rollout.forward import RolloutOptions, rollout, rollout_model
 from forcegp.rollout.inputs import Feedback, Inputs, Sampled, TaskSpaceControl
 from forcegp.rollout.law import AccelerationLaw, ForceLaw, Law, law_of
+from forcegp.rollout.probability import contact_loss_probability
 from forcegp.rollout.trajectory import Bands, DivergedError, Divergence, Rollout
 
 __all__ = [
     "AccelerationLaw",
     "Bands",
+    "Comparison",
     "ContactEvent",
     "DivergedError",
     "Divergence",
@@ -20,6 +23,9 @@ __all__ = [
     "RolloutOptions",
     "Sampled",
     "TaskSpaceControl",
+    "beside_log",
+    "compare",
+    "contact_loss_probability",
     "law_of",
     "rollout",
     "rollout_model",

@@ -1,0 +1,191 @@
+"""The data of the section on trajectories: what its figures, table and animation are drawn from."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from forcegp import kinematics
+from forcegp.files import Header
+from forcegp.report.data import Part, Series, series
+from forcegp.robot.model import BASE, RobotModel
+from forcegp.rollout.comparison import HORIZONS, LEVEL, Comparison
+
+FRAMES_PER_SECOND = 20
+"""Of the animation; one and a half times as smooth as a hand-drawn film, at half its size."""
+
+
+class Band(Part):
+    """A central band over function samples.
+
+    Attributes:
+        lower, upper: bounds.
+    """
+
+    lower: Series
+    upper: Series
+
+
+class ModelPath(Part):
+    """The first predicted trajectory of one model, up to where it diverged.
+
+    Attributes:
+        model: name.
+        tip: x, y and z of the tip [m].
+        tip_bands: of x, y and z over samples; empty without samples.
+        tip_error: distance from the logged tip, median over the starts [m].
+        drift: constraint error c(q) [m]; empty without contacts.
+        multiplier: λ [N]; empty where the model knows no forces.
+        multiplier_band: over samples.
+        lost: probability that contact was lost by then, over samples; empty without samples.
+        errors: tip error after each horizon, median over the starts [m]; `None` where over half diverged.
+        coverage: share of logged tip coordinates within the band; `None` without samples.
+        worst_drift: largest constraint error of mean and samples over all starts [m].
+        diverged_at: when the first trajectory was given up [s].
+    """
+
+    model: str
+    tip: list[Series]
+    tip_bands: list[Band]
+    tip_error: Series
+    drift: Series
+    multiplier: Series
+    multiplier_band: Band | None
+    lost: Series
+    errors: list[float | None]
+    coverage: float | None
+    worst_drift: float | None
+    diverged_at: float | None
+
+
+class Film(Part):
+    """Joint positions in space for an animation.
+
+    Attributes:
+        label: whose motion.
+        points: frames × points × 3, flat [m].
+    """
+
+    label: str
+    points: Series
+
+
+class RolloutData(Header):
+    """Trajectories predicted in open loop beside the logged one.
+
+    Attributes:
+        t: time since the start [s].
+        tip: logged x, y and z of the tip [m].
+        multiplier: logged λ of the first contact [N]; empty where it is not logged.
+        starts: number of starts that medians are over.
+        level: part of the samples that bands hold.
+        horizons: times of `ModelPath.errors` [s].
+        models: one a model.
+        frame_times: of the animation [s].
+        bodies: number of points of the arm in each frame.
+        films: the logged motion and one a model.
+    """
+
+    FORMAT: ClassVar[str] = "forcegp-rollout"
+    VERSION: ClassVar[int] = 1
+
+    t: Series
+    tip: list[Series]
+    multiplier: Series
+    starts: int
+    level: float
+    horizons: Series
+    models: list[ModelPath]
+    frame_times: Series
+    bodies: int
+    films: list[Film]
+
+
+def rollout_data(found: Comparison) -> RolloutData:
+    """The data of the section from a comparison; curves are those of its first start."""
+    horizons = [h for h in HORIZONS if h <= float(found.t[-1]) * (1.0 + 1e-9)]
+    stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(found.t[1] - found.t[0]))))
+    joints = [arm_points(found.system.robot, found.q[0, ::stride], found)]
+    films = [Film(label="logged", points=_rounded(joints[0]))]
+    for name, rolled in found.predicted.items():
+        sound = _sound(rolled.q[0])
+        points = arm_points(rolled.system.robot, rolled.q[0, :sound:stride], found)
+        films.append(Film(label=name, points=_rounded(points)))
+    logged = found.multiplier
+    return RolloutData(
+        t=series(found.t),
+        tip=[series(x) for x in found.tip[0].T],
+        multiplier=[] if logged is None else series(logged[0, :, 0]),
+        starts=len(found.q),
+        level=LEVEL,
+        horizons=horizons,
+        models=[_model_path(found, name, horizons) for name in found.predicted],
+        frame_times=series(found.t[::stride]),
+        bodies=joints[0].shape[1],
+        films=films,
+    )
+
+
+def _model_path(found: Comparison, name: str, horizons: list[float]) -> ModelPath:
+    rolled = found.predicted[name]
+    n = _sound(rolled.q[0])
+    samples, contacts = rolled.samples, rolled.system.m > 0
+    multiplier = rolled.multiplier[0, :n, 0] if contacts else rolled.multiplier.new_zeros(0)
+    known = bool(torch.isfinite(multiplier).all()) and len(multiplier) > 0
+    errors = [found.error_at(name, horizon) for horizon in horizons]
+    times = [d.t for d in (*rolled.diverged, *(samples.diverged if samples else ()))]
+    drifts = [x.drift.nan_to_num(0.0).abs().max() for x in (rolled, samples) if x is not None and contacts]
+    return ModelPath(
+        model=name,
+        tip=[series(x) for x in found.predicted_tip(name)[0, :n].T],
+        tip_bands=[] if samples is None else _bands(rolled, found.sampled_tip(name)[:, 0], n),
+        tip_error=series(_finite(found.tip_error(name).median(0).values)),
+        drift=series(rolled.drift[0, :n, 0]) if contacts else [],
+        multiplier=series(multiplier) if known else [],
+        multiplier_band=_bands(rolled, samples.multiplier[:, 0], n)[0] if samples and contacts else None,
+        lost=series(rolled.contact_lost()[0, :n, 0]) if samples and contacts else [],
+        errors=[e if math.isfinite(e) else None for e in errors],
+        coverage=found.coverage(name) if samples else None,
+        worst_drift=float(torch.stack(drifts).max()) if drifts else None,
+        diverged_at=min(times) if times else None,
+    )
+
+
+def _bands(rolled, values: Tensor, n: int) -> list[Band]:
+    """Bands `(S, T, d)` of each component over the first n times, as far as any sample goes."""
+    band = rolled.bands(values[:, :n], LEVEL)
+    last = int(torch.isfinite(band.lower).all(-1).sum())
+    return [
+        Band(lower=series(low), upper=series(high))
+        for low, high in zip(band.lower[:last].T, band.upper[:last].T, strict=True)
+    ]
+
+
+def _sound(q: Tensor) -> int:
+    """How many leading times `(T, nq)` hold a finite state."""
+    return int(torch.isfinite(q).all(-1).sum())
+
+
+def _finite(values: Tensor) -> Tensor:
+    return values[torch.isfinite(values)]
+
+
+def arm_points(robot: RobotModel, q: Tensor, found: Comparison) -> Tensor:
+    """Base, link origins on the way to the tip, and the tip: `(frames, points, 3)` in the world [m]."""
+    poses = kinematics.link_poses(robot, q)
+    joint = robot.frame_parents[robot.frame_index(found.frame)]
+    chain: list[int] = []
+    while joint != BASE:
+        chain.insert(0, joint)
+        joint = robot.parents[joint]
+    origins = poses.position[:, chain] + robot.base_position
+    base = robot.base_position.expand(len(q), 1, 3)
+    tip = kinematics.point_position(robot, q, found.frame, tuple(found.point))[:, None]
+    return torch.cat([base, origins, tip], dim=1)
+
+
+def _rounded(points: Tensor) -> Series:
+    return [round(x, 5) for x in points.flatten().tolist()]

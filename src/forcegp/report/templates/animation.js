@@ -1,0 +1,85 @@
+"use strict";
+(() => {
+  const figure = document.currentScript.parentElement;
+  const data = JSON.parse(figure.querySelector('script[type="application/json"]').textContent);
+  const canvas = figure.querySelector("canvas"), pen = canvas.getContext("2d");
+  const button = figure.querySelector("button"), slider = figure.querySelector("input");
+  const clock = figure.querySelector("output");
+  const frames = data.times.length, size = 3 * data.bodies;
+  let turn = -2.2, lift = 0.45, frame = 0, playing = false, started = 0, dragged = null;
+  slider.max = frames - 1;
+
+  // Orthographic view from a direction (turn, lift), in metres about the middle of the arm.
+  const first = data.films[0].points;
+  let reach = 0.3;
+  for (let i = 0; i < first.length; i += 3) {
+    reach = Math.max(reach, Math.hypot(first[i] - first[0], first[i + 1] - first[1], first[i + 2] - first[2]));
+  }
+  const centre = [first[0], first[1], first[2] + 0.35 * reach];
+  const scale = 0.42 * canvas.height / reach * 1.35;
+  const view = (x, y, z) => {
+    const dx = x - centre[0], dy = y - centre[1], dz = z - centre[2];
+    const across = -Math.sin(turn) * dx + Math.cos(turn) * dy;
+    const ahead = Math.cos(turn) * dx + Math.sin(turn) * dy;
+    const up = Math.cos(lift) * dz - Math.sin(lift) * ahead;
+    return [canvas.width / 2 + scale * across, canvas.height / 2 - scale * up];
+  };
+  const line = (points, colour, width) => {
+    pen.strokeStyle = colour; pen.lineWidth = width; pen.beginPath();
+    points.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)));
+    pen.stroke();
+  };
+  const draw = () => {
+    pen.clearRect(0, 0, canvas.width, canvas.height);
+    pen.lineJoin = pen.lineCap = "round";
+    for (let k = -4; k <= 4; k++) {
+      const s = 0.2 * k, z = first[size - 1], x = first[0], y = first[1];
+      line([view(x - 0.8, y + s, z), view(x + 0.8, y + s, z)], "#e3e3e3", 1);
+      line([view(x + s, y - 0.8, z), view(x + s, y + 0.8, z)], "#e3e3e3", 1);
+    }
+    data.films.forEach((film, index) => {
+      const shown = Math.min(frame, film.points.length / size - 1);
+      const at = (f, b) => view(...film.points.slice(f * size + 3 * b, f * size + 3 * b + 3));
+      const trail = [];
+      for (let f = Math.max(0, shown - 60); f <= shown; f++) trail.push(at(f, data.bodies - 1));
+      const arm = Array.from({ length: data.bodies }, (_, b) => at(shown, b));
+      pen.globalAlpha = shown < frame ? 0.25 : 1;
+      line(trail, film.colour, 1.5);
+      line(arm, film.colour, index ? 3 : 7);
+      pen.fillStyle = film.colour;
+      arm.forEach(([x, y]) => { pen.beginPath(); pen.arc(x, y, index ? 3 : 5, 0, 7); pen.fill(); });
+      pen.globalAlpha = 1;
+      pen.font = "16px sans-serif";
+      pen.fillText(film.label + (shown < frame ? " (diverged)" : ""), 16, 26 + 22 * index);
+    });
+    slider.value = frame;
+    clock.textContent = data.times[frame].toFixed(2) + " s";
+  };
+  const tick = (now) => {
+    if (!playing) return;
+    const t = (now - started) / 1000;
+    while (frame < frames - 1 && data.times[frame + 1] <= t) frame++;
+    if (frame === frames - 1) stop();
+    draw();
+    requestAnimationFrame(tick);
+  };
+  const stop = () => { playing = false; button.textContent = "Play"; };
+  button.onclick = () => {
+    if (playing) return stop();
+    if (frame === frames - 1) frame = 0;
+    playing = true; button.textContent = "Pause";
+    started = performance.now() - 1000 * data.times[frame];
+    requestAnimationFrame(tick);
+  };
+  slider.oninput = () => { stop(); frame = Number(slider.value); draw(); };
+  canvas.onpointerdown = (e) => { dragged = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); };
+  canvas.onpointerup = () => { dragged = null; };
+  canvas.onpointermove = (e) => {
+    if (!dragged) return;
+    turn -= 0.008 * (e.clientX - dragged[0]);
+    lift = Math.max(-0.2, Math.min(1.5, lift + 0.008 * (e.clientY - dragged[1])));
+    dragged = [e.clientX, e.clientY];
+    draw();
+  };
+  draw();
+})();

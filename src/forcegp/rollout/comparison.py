@@ -1,0 +1,208 @@
+"""Predicted trajectories beside logged ones: tip error over time, drift, bands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp import kinematics
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.data import Dataset
+from forcegp.errors import DataError
+from forcegp.models.base import Model
+from forcegp.rollout.forward import RolloutOptions, rollout_model
+from forcegp.rollout.run import Progress
+from forcegp.rollout.trajectory import Rollout
+
+HORIZONS = (0.5, 1.0, 2.0, 5.0, 10.0)
+"""Times at which tip errors are reported [s]."""
+LEVEL = 0.9
+"""Part of the samples that a band holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Open-loop predictions of several models from the same logged states, under the logged torques.
+
+    Attributes:
+        system: robot and contacts as logged.
+        frame, point: the tip.
+        t: `(T,)` time since the start [s].
+        q: `(k, T, nq)` logged joint positions.
+        multiplier: `(k, T, n_contacts)` logged λ [N], or `None`.
+        predicted: rollouts by model, batch `(k,)`.
+    """
+
+    system: ConstrainedSystem
+    frame: str
+    point: Sequence[float]
+    t: Tensor
+    q: Tensor
+    multiplier: Tensor | None
+    predicted: Mapping[str, Rollout]
+
+    @property
+    def tip(self) -> Tensor:
+        """Logged world position of the tip, `(k, T, 3)` [m]."""
+        return kinematics.point_position(self.system.robot, self.q, self.frame, tuple(self.point))
+
+    def predicted_tip(self, model: str) -> Tensor:
+        """Predicted position of the tip `(k, T, 3)` [m], by the model's own kinematics; NaN once diverged."""
+        return self._whole(self.predicted[model].tip(self.frame, self.point))
+
+    def sampled_tip(self, model: str) -> Tensor:
+        """Tip of each function sample, `(S, k, T, 3)` [m]."""
+        return self._whole(self.predicted[model].need_samples().tip(self.frame, self.point))
+
+    def tip_error(self, model: str) -> Tensor:
+        """Distance between predicted and logged tip, `(k, T)` [m]; infinite once diverged."""
+        return (self.predicted_tip(model) - self.tip).norm(dim=-1).nan_to_num(torch.inf)
+
+    def error_at(self, model: str, horizon: float) -> float:
+        """Median over the starts of the tip error after a time [m].
+
+        Raises:
+            DataError: the comparison is shorter.
+        """
+        if horizon > float(self.t[-1]) * (1.0 + 1e-9):
+            raise DataError("the comparison ends earlier", expected=f"{horizon} s", got=float(self.t[-1]))
+        step = int((self.t - horizon).abs().argmin())
+        return float(self.tip_error(model)[:, step].median())
+
+    def coverage(self, model: str, level: float = LEVEL) -> float:
+        """Share of tip coordinates that the band over samples holds, of all starts and times but the first.
+
+        On a surface only the coordinates along it count, as the constraint leaves none across.
+        """
+        along = self._tangents()
+        sampled = (self.sampled_tip(model)[..., None, :] @ along)[..., 0, :]
+        logged = (self.tip[..., None, :] @ along)[..., 0, :]
+        band = self.predicted[model].bands(sampled, level)
+        inside = (logged >= band.lower) & (logged <= band.upper)
+        return float(inside[:, 1:].to(self.q.dtype).mean())
+
+    def _tangents(self) -> Tensor:
+        """Orthonormal directions along the surface under the logged tip `(k, T, 3, 2)`, or all axes."""
+        contact = _tip_contact(self.system)
+        if contact is None or contact.frame != self.frame:
+            return torch.eye(3, dtype=self.q.dtype).expand(*self.q.shape[:-1], 3, 3)
+        normal = contact.surface.gradient(self.tip)
+        return torch.linalg.svd(normal[..., None, :]).Vh.mT[..., 1:]
+
+    def _whole(self, values: Tensor) -> Tensor:
+        """Values over the whole time, NaN after all trajectories had diverged."""
+        missing = len(self.t) - values.shape[-2]
+        return torch.nn.functional.pad(values, (0, 0, 0, missing), value=torch.nan)
+
+
+def _tip_contact(system: ConstrainedSystem) -> SurfaceContact | None:
+    return next((c for c in system.contacts if isinstance(c, SurfaceContact)), None)
+
+
+def tip_of(system: ConstrainedSystem) -> tuple[str, Sequence[float]]:
+    """Frame and point of the first contact with a surface, or the origin of the last frame."""
+    contact = _tip_contact(system)
+    return (
+        (system.robot.frame_names[-1], (0.0, 0.0, 0.0)) if contact is None else (contact.frame, contact.point)
+    )
+
+
+def compare(
+    models: Mapping[str, Model],
+    data: Dataset,
+    duration: float,
+    starts: int = 1,
+    samples: int = 0,
+    *,
+    system: ConstrainedSystem | None = None,
+    options: RolloutOptions | None = None,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Roll models forward from logged states under the logged torques, in open loop.
+
+    Args:
+        models: fitted models by name.
+        data: a log in the order of time.
+        duration: of each trajectory [s].
+        starts: how many, evenly spread over the log.
+        samples: function samples of the models that have them.
+        system: robot and contacts of the log; those of the first model by default.
+        options: how the rollouts are computed; a diverging one is kept up to there.
+        progress: called as the models are rolled out.
+
+    Raises:
+        DataError: the log is too short, or not in the order of time.
+    """
+    system = system or next(iter(models.values())).system
+    dt = _period(data)
+    steps = round(duration / dt)
+    first = _starts(data, steps, starts)
+    rows = first[:, None] + torch.arange(steps + 1)
+    options = options or RolloutOptions(dt=dt, on_divergence="keep")
+    predicted = {}
+    for i, (name, model) in enumerate(models.items()):
+        drawn = samples if model.has_function_samples else 0
+        predicted[name] = rollout_model(
+            model,
+            data.q[first],
+            data.qd[first],
+            data.tau[rows],
+            duration,
+            drawn,
+            active=data.active(system.contact_names)[first],
+            options=options,
+            progress=_part(progress, i, len(models)),
+        )
+    return _beside(system, data, rows, dt, predicted)
+
+
+def beside_log(name: str, predicted: Rollout, log: Dataset, dt: float) -> Comparison:
+    """One trajectory that was rolled out from the first row of a log, beside that log.
+
+    Args:
+        name: of the model.
+        predicted: without batch.
+        log: a single trajectory.
+        dt: period of both [s].
+    """
+    rows = torch.arange(len(log))[None]
+    return _beside(predicted.system, log, rows, dt, {name: predicted[None]})
+
+
+def _beside(
+    system: ConstrainedSystem, data: Dataset, rows: Tensor, dt: float, predicted: Mapping[str, Rollout]
+) -> Comparison:
+    frame, point = tip_of(system)
+    logged = data.contact_extras.get("multiplier", {})
+    known = bool(system.contacts) and all(name in logged for name in system.contact_names)
+    multiplier = torch.stack([logged[c][rows] for c in system.contact_names], -1) if known else None
+    t = torch.arange(rows.shape[1], dtype=data.dtype) * dt
+    return Comparison(system, frame, point, t, data.q[rows], multiplier, predicted)
+
+
+def _period(data: Dataset) -> float:
+    return data.header.dt or float((data.t[1:] - data.t[:-1]).median())
+
+
+def _starts(data: Dataset, steps: int, count: int) -> Tensor:
+    """Rows `(count,)` that `steps` further rows of the same trajectory follow, evenly spread."""
+    last = len(data) - 1 - steps
+    fits = torch.arange(max(last + 1, 0))
+    fits = fits[data.segment[fits] == data.segment[fits + steps]]
+    if len(fits) < count or not data.header.ordered:
+        raise DataError(
+            "the log is too short for the rollouts, or not in the order of time",
+            expected=f"{count} starts with {steps} further samples in the same trajectory",
+            got=f"{len(data)} samples, {len(fits)} such starts",
+            hint="a shorter duration, or a log that was not selected from",
+        )
+    return fits[torch.linspace(0, len(fits) - 1, count).round().long()]
+
+
+def _part(progress: Progress | None, part: int, parts: int) -> Progress | None:
+    if progress is None:
+        return None
+    return lambda done, total: progress(part * total + done, parts * total)
