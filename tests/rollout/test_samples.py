@@ -1,0 +1,173 @@
+"""Function samples along a trajectory, the probability of lost contact, and comparisons with a log."""
+
+from functools import cache
+
+import pytest
+import torch
+
+from forcegp.constraints import Baumgarte
+from forcegp.data import Dataset
+from forcegp.errors import DataError, ModelError
+from forcegp.gp.learning import LearningOptions
+from forcegp.gp.pathwise import draw_samples
+from forcegp.gp.priors import states
+from forcegp.models.analytical import AnalyticalModel
+from forcegp.models.base import Model
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.report.rollout_data import RolloutData, rollout_data
+from forcegp.report.rollouts import PAGE, write_rollouts
+from forcegp.rollout import ForceLaw, RolloutOptions, beside_log, compare, contact_loss_probability, rollout
+from rollout_cases import arm, simulated
+
+DRIFT = 1e-4
+"""Bound of the constraint error of every sample with Baumgarte's terms [m]."""
+NEWTON = 1e-8
+"""Largest residual of Newton's equation [N m]; torques are of order a hundred."""
+
+
+def log() -> Dataset:
+    return simulated(viscous_friction=1.0).data
+
+
+@cache
+def fitted(mean: str = "analytical") -> StructuredGP:
+    model = StructuredGP(arm(Baumgarte()), mean=mean, noise_std=0.1)
+    model.fit(log()[torch.arange(0, 288, 7)], options=LearningOptions(max_evaluations=15))
+    return model
+
+
+def test_each_sample_obeys_the_constraint_and_newtons_equation() -> None:
+    data = log()
+    found = fitted().rollout(data.q[0], data.qd[0], data.tau, 0.15, samples=5).need_samples()
+    assert found.q.shape == (5, 37, 7)
+    assert float(found.drift.abs().max()) < DRIFT
+    eom = found.system.equations(found.q, found.qd)
+    assert float(((eom.A @ found.qdd[..., None])[..., 0] - eom.b).abs().max()) < NEWTON
+    # What is left of M q̈ − Aᵀλ is the sampled force, which is the same function at every time.
+    force = (eom.M @ found.qdd[..., None])[..., 0] - (eom.A.mT @ found.multiplier[..., None])[..., 0]
+    drawn = draw_samples(fitted().posterior, 5, torch.Generator().manual_seed(0))
+    for k in (0, 20, 36):
+        active = torch.ones(5, 1, dtype=torch.bool)
+        at = states(found.system, found.q[:, k], found.qd[:, k], found.tau[:, k], active)
+        assert float((drawn.total_force(found.system, at) - force[:, k]).abs().max()) < NEWTON
+
+
+def test_a_seed_fixes_the_samples_and_a_sample_is_a_model_of_its_own() -> None:
+    data, model = log(), fitted()
+
+    def roll(seed: int) -> torch.Tensor:
+        path = model.rollout(data.q[0], data.qd[0], data.tau, 0.05, samples=3, seed=seed)
+        return path.need_samples().q
+
+    assert torch.equal(roll(1), roll(1))
+    assert not torch.equal(roll(1), roll(2))
+    force = model.force_samples(3, torch.Generator().manual_seed(1))
+    start = data.q[0].expand(3, 7)
+    alone = rollout(ForceLaw(force), model.system, start, 0.0 * start + data.qd[0], data.tau, 0.05)
+    assert torch.equal(alone.q, roll(1))
+
+
+def test_batches_of_states_and_samples_keep_their_order() -> None:
+    data, model = log(), fitted()
+    rows = torch.tensor([0, 60])
+    tau = torch.stack([data.tau[r : r + 13] for r in rows.tolist()])
+    both = model.rollout(data.q[rows], data.qd[rows], tau, 0.05, samples=4, seed=3)
+    assert both.need_samples().q.shape == (4, 2, 13, 7)
+    for i in range(2):
+        alone = model.rollout(data.q[rows[i]], data.qd[rows[i]], tau[i], 0.05, samples=4, seed=3)
+        assert torch.allclose(both[i].q, alone.q, atol=1e-10, rtol=0.0)
+        assert torch.allclose(both.need_samples().q[:, i], alone.need_samples().q, atol=1e-9, rtol=0.0)
+
+
+def test_the_spread_of_samples_is_the_posterior_s() -> None:
+    """Before any time has passed, sampled multipliers are draws from N(μ, σ²)."""
+    data, model = log(), fitted("zero")
+    path = model.rollout(data.q[3], data.qd[3], data.tau[3:], 1.0 / 240.0, samples=400)
+    drawn = path.need_samples().multiplier[:, 0, 0]
+    expected = model.predict(data.q[3], data.qd[3], data.tau[3], "multiplier")
+    assert expected.std is not None
+    std = float(expected.std)
+    assert float(drawn.mean()) == pytest.approx(float(expected.mean), abs=4.0 * std / 20.0)
+    assert float(drawn.std()) == pytest.approx(std, rel=0.2)
+    lower, upper, median = path.bands(drawn)
+    assert float(lower) < float(median) < float(upper)
+
+
+def test_probability_of_lost_contact_is_that_of_the_posterior_draws() -> None:
+    """Pulled by the table's own reaction, half of the posterior lies below zero."""
+    data, model = log(), fitted("zero")
+    q, qd, tau = data.q[:3], data.qd[:3], data.tau[:3]
+    found = model.predict(q, qd, tau, "multiplier")
+    assert found.std is not None
+    draws = (
+        found.mean + found.std * torch.randn(20000, 3, 1, generator=torch.Generator().manual_seed(0)).double()
+    )
+    share = (draws < 0.0).double().mean(0)
+    assert torch.allclose(contact_loss_probability(model, q, qd, tau), share, atol=0.02)
+
+
+def test_models_without_a_posterior_say_so() -> None:
+    data, plain = log(), AnalyticalModel(arm(Baumgarte()))
+    with pytest.raises(ModelError, match="no uncertainty of the multiplier"):
+        contact_loss_probability(plain, data.q[0], data.qd[0], data.tau[0])
+    with pytest.raises(ModelError, match="no function samples"):
+        plain.rollout(data.q[0], data.qd[0], data.tau, 0.02, samples=2)
+    with pytest.raises(ModelError, match="pass samples=100"):
+        plain.rollout(data.q[0], data.qd[0], data.tau, 0.02).need_samples()
+
+
+class Freefloating(AnalyticalModel):
+    """A model of accelerations alone, that knows of no surface."""
+
+    def force_field(self) -> None:
+        return None
+
+    def predict(self, q, qd, tau, quantity="qdd", *, active=None, covariance=True):
+        return super().predict(q, qd, tau, "qdd_free", active=active, covariance=covariance)
+
+
+def test_comparison_tells_models_apart_and_the_page_holds_them(tmp_path) -> None:
+    system = arm(Baumgarte())
+    models: dict[str, Model] = {
+        "analytical": AnalyticalModel(system),
+        "nn": Freefloating(system),
+        "sgp-mean": fitted(),
+    }
+    found = compare(models, log(), 0.5, starts=2, samples=3)
+    assert found.error_at("sgp-mean", 0.25) < found.error_at("analytical", 0.25)
+    assert found.error_at("analytical", 0.25) < found.error_at("nn", 0.25)
+    assert 0.0 <= found.coverage("sgp-mean") <= 1.0
+    start = found.predicted_tip("analytical")[:, 0]
+    assert torch.allclose(start, simulated(1.0).position[[0, 167]], atol=1e-12)
+    data = rollout_data(found)
+    assert RolloutData.from_json(data.to_json(), "test", DataError) == data
+    nn = data.models[1]
+    assert nn.multiplier == [] and nn.drift[-1] < -1e-3, "it sinks through the table"
+    page = write_rollouts(tmp_path, "Test", data).read_text()
+    assert (tmp_path / PAGE).stat().st_size < 2_000_000
+    assert page.count("<img") == 4 and "<canvas" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_a_rollout_beside_its_log() -> None:
+    data = log()[:61]
+    path = fitted().rollout(data.q[0], data.qd[0], data.tau, 0.25)
+    found = beside_log("sgp-mean", path, data, 1.0 / 240.0)
+    expected = (path.tip(found.frame, found.point) - found.tip[0]).norm(dim=-1)
+    assert torch.allclose(found.tip_error("sgp-mean")[0], expected)
+
+
+def test_a_selected_log_cannot_be_compared_with() -> None:
+    data = log()
+    models: dict[str, Model] = {"analytical": AnalyticalModel(arm(Baumgarte()))}
+    with pytest.raises(DataError, match="too short"):
+        compare(models, data, 50.0)
+    with pytest.raises(DataError, match="order of time"):
+        compare(models, data[torch.randperm(len(data), generator=torch.Generator().manual_seed(0))], 0.1)
+
+
+def test_projection_holds_every_sample_on_the_surface() -> None:
+    data = log()
+    options = RolloutOptions(stabilization="projection")
+    path = fitted().rollout(data.q[0], data.qd[0], data.tau, 0.1, samples=3, options=options)
+    assert max(float(x.drift[..., 1:, :].abs().max()) for x in (path, path.need_samples())) < 1e-10
