@@ -13,7 +13,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from forcegp import kinematics
-from forcegp.constraints.surface import Surface
+from forcegp.constraints.surface import Surface, check_point
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
 
@@ -63,7 +63,12 @@ class Constraint(ABC):
 
     @abstractmethod
     def check(self, robot: RobotModel) -> None:
-        """Raise `UnknownNameError` where a frame is not the robot's."""
+        """Check that the constraint fits a robot.
+
+        Raises:
+            UnknownNameError: a frame is not the robot's.
+            ForceGPError: a point has not three finite coordinates.
+        """
 
 
 def _moving_point(
@@ -98,6 +103,7 @@ class SurfaceContact(Constraint):
 
     def check(self, robot: RobotModel) -> None:
         robot.frame_index(self.frame)
+        check_point(self.point, f"the touching point of {self.name!r}")
 
     def contact_point(
         self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor
@@ -134,6 +140,8 @@ class PointConnection(Constraint):
         robot.frame_index(self.frame)
         if self.other_frame is not None:
             robot.frame_index(self.other_frame)
+        for point in (self.point, self.other_point):
+            check_point(point, f"an end of {self.name!r}")
 
     def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
         p, _, bias, J = _moving_point(robot, poses, motion, qd, self.frame, self.point)

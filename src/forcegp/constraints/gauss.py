@@ -189,16 +189,20 @@ class ConstrainedSystem:
         """`(*batch, m)` bool from `(*batch, n_contacts)` bool, all active for `None`.
 
         Raises:
-            ShapeError: the last dimension is not the number of contacts.
+            ShapeError: not boolean, or a shape that does not fit the contacts and the batch.
         """
         n, device = len(self.contacts), self.robot.device
         if active is None:
             return torch.ones(*batch, self.m, dtype=torch.bool, device=device)
-        if active.shape[-1:] != (n,):
+        sizes = zip(reversed(active.shape), reversed((*batch, n)), strict=False)
+        fits = (
+            0 < active.ndim <= len(batch) + 1 and active.shape[-1] == n and all(a in (1, b) for a, b in sizes)
+        )
+        if not fits or active.dtype != torch.bool:
             raise ShapeError(
-                "active does not fit the contacts " + ", ".join(self.contact_names),
-                expected=f"shape (*batch, {n})",
-                got=tuple(active.shape),
+                f"active does not fit the contacts {', '.join(self.contact_names) or '(none)'}",
+                expected=f"bool of shape {(*batch, n)}",
+                got=f"{str(active.dtype).removeprefix('torch.')} of shape {tuple(active.shape)}",
             )
         repeats = torch.tensor([contact.rows for contact in self.contacts], dtype=torch.int64, device=device)
         return active.repeat_interleave(repeats, dim=-1).expand(*batch, self.m)
@@ -214,7 +218,9 @@ class ConstrainedSystem:
             ShapeError: an argument does not fit.
         """
         robot = self.robot
-        robot.check_state(qd=qd)
+        robot.check_state(q=q, qd=qd)
+        if q.shape != qd.shape:
+            raise ShapeError("q and qd are not one batch", expected=tuple(q.shape), got=tuple(qd.shape))
         poses = kinematics.link_poses(robot, q)
         motion = kinematics.link_motion(robot, poses, qd)
         links = dynamics.link_inertia(robot, poses)

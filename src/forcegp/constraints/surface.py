@@ -6,6 +6,7 @@ of this file but `ImplicitSurface`, c is the signed distance and the gradient th
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -48,6 +49,12 @@ def _unit(values: Sequence[float], what: str) -> tuple[float, ...]:
     return tuple(float(x) / scale for x in values)
 
 
+def check_point(values: Sequence[float], what: str) -> None:
+    """Raise `ForceGPError` unless the values are three finite coordinates."""
+    if len(values) != 3 or not all(math.isfinite(x) for x in values):
+        raise ForceGPError(f"{what} is no point", expected="three finite coordinates [m]", got=values)
+
+
 def _positive(value: float, what: str) -> None:
     if not 0.0 < value < float("inf"):
         raise ForceGPError(f"{what} is not a length", expected="a positive finite number [m]", got=value)
@@ -62,7 +69,7 @@ class Plane(Surface):
         offset: distance from the world origin along the normal [m].
 
     Raises:
-        ForceGPError: the normal has no direction.
+        ForceGPError: the normal has no direction, or the offset is not finite.
     """
 
     normal: Sequence[float] = (0.0, 0.0, 1.0)
@@ -70,6 +77,10 @@ class Plane(Surface):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "normal", _unit(self.normal, "the plane's normal"))
+        if not math.isfinite(self.offset):
+            raise ForceGPError(
+                "the plane's offset is no distance", expected="a finite number [m]", got=self.offset
+            )
 
     def value(self, p: Vector3) -> Scalars:
         return p @ _vector(self.normal, p) - self.offset
@@ -86,13 +97,14 @@ class Sphere(Surface):
     """The sphere c(p) = |p − center| − radius, touched from outside.
 
     Raises:
-        ForceGPError: the radius is not positive.
+        ForceGPError: the radius is not positive, or the center is no point.
     """
 
     center: Sequence[float]
     radius: float
 
     def __post_init__(self) -> None:
+        check_point(self.center, "the sphere's center")
         _positive(self.radius, "the sphere's radius")
 
     def value(self, p: Vector3) -> Scalars:
@@ -118,7 +130,7 @@ class Cylinder(Surface):
         radius: [m].
 
     Raises:
-        ForceGPError: the axis has no direction, or the radius is not positive.
+        ForceGPError: the axis has no direction, the radius is not positive, or the center is no point.
     """
 
     center: Sequence[float]
@@ -126,6 +138,7 @@ class Cylinder(Surface):
     radius: float
 
     def __post_init__(self) -> None:
+        check_point(self.center, "the cylinder's center")
         _positive(self.radius, "the cylinder's radius")
         object.__setattr__(self, "axis", _unit(self.axis, "the cylinder's axis"))
 
