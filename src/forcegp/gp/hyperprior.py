@@ -1,7 +1,7 @@
 """Initial values, bounds and weak priors of the hyperparameters.
 
 Inputs are standardized, so a length-scale of the order of the square root of their number relates
-typical samples. A log-normal prior around that start, two and a half e-folds wide, keeps the length-scales
+typical samples. A log-normal prior around that start, four e-folds wide, keeps the length-scales
 of inputs that do not matter from drifting to infinity without deciding those that do. The scale of a
 force starts at the root mean square of the force that explains the training residuals by least squares.
 """
@@ -18,10 +18,10 @@ from forcegp.gp.gram import Block
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.priors import ForcePrior
 
-LOG_LENGTHSCALE_BOUNDS = (math.log(0.03), math.log(3e3))
+LOG_LENGTHSCALE_BOUNDS = (math.log(0.03), math.log(3e4))
 LOG_STD_BOUNDS = (math.log(1e-6), math.log(1e6))
 LOG_NOISE_BOUNDS = (math.log(1e-6), math.log(1e4))
-WIDTH = {"log_lengthscale": 2.5, "log_noise_std": 5.0}
+WIDTH = {"log_lengthscale": 4.0, "log_noise_std": 5.0}
 """Standard deviation of the log-normal priors, in e-folds; 3 where not named."""
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import UnknownNameError
+from forcegp.gp.kernels import Linear, SquaredExponential
 from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import Model
@@ -50,9 +51,10 @@ def _structured(mean: str) -> Callable[..., Model]:
 
 
 def contact_priors(system: ConstrainedSystem) -> list[ForcePrior]:
-    """A joint force prior, and a Cartesian friction prior for each contact with a surface."""
+    """A Cartesian prior on the friction of each contact with a surface, linear in velocity and more."""
+    kernel = Linear(("velocity",)) + SquaredExponential()
     surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
-    return [JointForcePrior(), *(ContactForcePrior(name) for name in surfaces)]
+    return [ContactForcePrior(name, kernel) for name in surfaces] or [JointForcePrior()]
 
 
 def _contact(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
@@ -66,7 +68,7 @@ MODELS: dict[str, Entry] = {
     "gp": Entry("one Gaussian process per joint acceleration on (q, qd, tau)", _independent),
     "sgp-zero": Entry("structured GP, all joint forces unknown", _structured("zero")),
     "sgp-mean": Entry("structured GP around the analytical forces", _structured("analytical")),
-    "sgp-contact": Entry("structured GP with mean and a Cartesian prior on contact friction", _contact),
+    "sgp-contact": Entry("structured GP with mean and a prior on the contact's friction alone", _contact),
 }
 """The models, simplest first."""
 
