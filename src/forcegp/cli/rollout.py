@@ -17,20 +17,27 @@ if TYPE_CHECKING:
 def rollout(
     model: ModelFolder,
     data: DataFile,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for rollout.parquet.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the page.")],
     start: Annotated[int, typer.Option(min=0, help="Row of the data to start from.")] = 0,
     duration: Annotated[
         float | None, typer.Option(help="Time to roll out in seconds; default: to the end of the trajectory.")
     ] = None,
     samples: Annotated[int, typer.Option(min=0, help="Functions to draw from the model's posterior.")] = 0,
     stabilization: Annotated[str, typer.Option(help="none, baumgarte or projection.")] = "baumgarte",
+    method: Annotated[
+        str, typer.Option(help="semi_implicit_euler, rk4, rk45 or dop853.")
+    ] = "semi_implicit_euler",
+    unilateral: Annotated[
+        bool, typer.Option("--unilateral", help="Let contacts open where they would pull, and close again.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Simulate forward with a model, from a logged state and under the logged torques.
 
-    The output is a data set: the predicted motion, the logged one as q_logged, and, with samples, the
-    spread of the sampled motions as q_std.
+    The folder gets rollout.parquet: the predicted motion, the logged one as q_logged, and, with samples,
+    the spread of the sampled motions as q_std; and rollout.html with figures and an animation of the arm,
+    the figures as SVG and their data as rollout.json.
 
     [bold]Examples[/bold]
 
@@ -39,7 +46,9 @@ def rollout(
     forcegp rollout -m model/ -d run.parquet --start 2400 --samples 50 -o rollout/
     """
     from forcegp.models.files import load_model
-    from forcegp.rollout import RolloutOptions
+    from forcegp.report.rollout_data import rollout_data
+    from forcegp.report.rollouts import write_rollouts
+    from forcegp.rollout import RolloutOptions, beside_log
 
     regression = load_model(model)
     log = _stretch(data_of_robot(read_data(data), regression.system.robot), start, duration)
@@ -53,7 +62,7 @@ def rollout(
             samples=samples,
             seed=seed,
             active=log.active(regression.system.contact_names)[0],
-            options=RolloutOptions(dt=dt, stabilization=stabilization, on_divergence="keep"),
+            options=RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep"),
             progress=progress,
         )
     length = len(path.t) if not path.diverged else round(path.diverged[0].t / dt) + 1
@@ -68,6 +77,12 @@ def rollout(
     }
     if path.c.shape[-1]:
         figures["largest_constraint_error_m"] = float(path.drift[:length].abs().max())
+    for event in path.events:
+        figures[f"{event.contact}_{'closes' if event.closed else 'opens'}_s"] = event.t
+    title = f"Model {model} rolled out on {data}"
+    figures["page"] = str(
+        write_rollouts(out, title, rollout_data(beside_log(regression.kind, path, log, dt)))
+    )
     show({**figures, "file": str(file)}, as_json)
 
 
