@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import UnknownNameError
+from forcegp.errors import ModelError, UnknownNameError
 from forcegp.gp.priors import States
 
 
@@ -116,8 +116,11 @@ def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[s
 
     Raises:
         UnknownNameError: no such quantity.
+        ModelError: none is named.
     """
     names = [quantity] if isinstance(quantity, str) else list(quantity)
+    if not names:
+        raise ModelError("no quantity is named", expected="one of " + ", ".join(QUANTITIES))
     for name in names:
         if name not in QUANTITIES:
             raise UnknownNameError("quantity", name, QUANTITIES)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forcegp.errors import UnknownNameError
+from forcegp.errors import ModelError, UnknownNameError
 
 Features = Mapping[str, Tensor]
 Parameters = Mapping[str, Tensor]
@@ -80,6 +80,22 @@ def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
     return torch.cat([x[name] for name in names], dim=-1)
 
 
+def _width(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
+    """Number of columns that a kernel reads.
+
+    Raises:
+        UnknownNameError: an input is not given.
+        ModelError: there is no input.
+    """
+    names = tuple(widths) if inputs is None else inputs
+    for name in names:
+        if name not in widths:
+            raise UnknownNameError("kernel input", name, widths)
+    if not names:
+        raise ModelError("a kernel without inputs", expected=f"some of {', '.join(widths)}, or None for all")
+    return sum(widths[name] for name in names)
+
+
 @dataclass(frozen=True)
 class _Stationary(Kernel):
     """σ² g(r) of the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination)."""
@@ -87,8 +103,7 @@ class _Stationary(Kernel):
     inputs: tuple[str, ...] | None = None
 
     def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
-        names = tuple(widths) if self.inputs is None else self.inputs
-        width = sum(widths[name] for name in names)
+        width = _width(self.inputs, widths)
         scale = math.log(math.sqrt(width))
         return {
             "log_lengthscale": torch.full((outputs, width), scale, dtype=torch.float64),
@@ -199,8 +214,7 @@ class Linear(Kernel):
     inputs: tuple[str, ...] | None = None
 
     def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
-        names = tuple(widths) if self.inputs is None else self.inputs
-        width = sum(widths[name] for name in names)
+        width = _width(self.inputs, widths)
         return {
             "log_slope_std": torch.zeros(outputs, width, dtype=torch.float64),
             "log_bias_std": torch.zeros(outputs, dtype=torch.float64),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import UnknownNameError
+from forcegp.errors import ModelError, UnknownNameError
 from forcegp.gp.priors import States
 
 TERMS = ("bias", "gravity", "friction", "actuation")
@@ -24,6 +24,7 @@ class AnalyticalMean:
 
     Raises:
         UnknownNameError: a term does not exist.
+        ModelError: a term is named twice.
     """
 
     terms: tuple[str, ...] = TERMS
@@ -32,6 +33,8 @@ class AnalyticalMean:
         for term in self.terms:
             if term not in TERMS:
                 raise UnknownNameError("term of the analytical mean", term, TERMS)
+            if self.terms.count(term) > 1:
+                raise ModelError(f"term {term!r} of the analytical mean is named twice", got=self.terms)
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """The mean of Q at states, `(n, nq)` [N m, N]."""

@@ -118,7 +118,7 @@ class ForcePosterior:
         )
         cross = cross_gram(self.priors, self.params, self.blocks, [block])
         V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
-        V = V.reshape(-1, n, d).transpose(0, 1)
+        V = V.reshape(len(V), n, d).transpose(0, 1)
         covariance = prior - V.mT @ V
         return 0.5 * (covariance + covariance.mT)
 

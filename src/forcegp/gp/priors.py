@@ -11,9 +11,12 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import ModelError, ShapeError, UnknownNameError
 from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
+
+RESERVED = ("noise", "analytical")
+"""Prefixes of what is learned beside the hyperparameters of the priors."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,35 @@ class States:
 def states(system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> States:
     """Evaluate the equations of motion at a batch of states."""
     return States(q, qd, tau, active, system.equations(q, qd, active))
+
+
+def states_at(
+    system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
+) -> tuple[torch.Size, States]:
+    """The common batch of states `(*batch, nq)`, and the states in one row of it; all contacts by default.
+
+    Raises:
+        ShapeError: an argument does not fit the system, or is not finite.
+    """
+    given = {"q": q, "qd": qd, "tau": tau}
+    system.robot.check_state(**given)
+    for name, x in given.items():
+        if not bool(torch.isfinite(x).all()):
+            raise ShapeError(f"{name} holds values that are not finite", expected="finite numbers")
+    try:
+        batch = torch.broadcast_shapes(*(x.shape[:-1] for x in given.values()))
+    except RuntimeError as cause:
+        got = {name: tuple(x.shape) for name, x in given.items()}
+        raise ShapeError(
+            "q, qd and tau are not one batch", expected="shapes that broadcast", got=got
+        ) from cause
+    contacts = len(system.contacts)
+    if active is None:
+        active = torch.ones(contacts, dtype=torch.bool, device=q.device)
+    system.active_rows(active, batch)
+    rows = batch.numel()
+    flat = [x.expand(*batch, x.shape[-1]).reshape(rows, x.shape[-1]) for x in given.values()]
+    return batch, states(system, *flat, active.expand(*batch, contacts).reshape(rows, contacts))
 
 
 class ForcePrior(ABC):
@@ -64,6 +96,11 @@ class ForcePrior(ABC):
         """Raise a typed error where the prior does not fit the system."""
 
 
+def _check_inputs(prior: JointForcePrior | ContactForcePrior) -> None:
+    if not prior.inputs:
+        raise ModelError(f"force prior {prior.name!r} depends on nothing", expected="one input at least")
+
+
 @dataclass(frozen=True)
 class JointForcePrior(ForcePrior):
     """An independent process for each joint's force Q_i (eq. 31), E = I.
@@ -88,6 +125,7 @@ class JointForcePrior(ForcePrior):
         for name in self.inputs:
             if name not in ("q", "qd", "tau"):
                 raise UnknownNameError("input of a joint force prior", name, ("q", "qd", "tau"))
+        _check_inputs(self)
 
     def outputs(self, robot: RobotModel) -> int:
         return robot.nq
@@ -108,8 +146,8 @@ class JointForcePrior(ForcePrior):
 class ContactForcePrior(ForcePrior):
     """A prior on the Cartesian dissipative force F_z at a contact, tangential to the surface.
 
-    E = J_Eᵀ (1 − n nᵀ) where the contact is closed and 0 elsewhere; the inputs are the position and
-    velocity of the touching point.
+    E = J_Eᵀ (1 − n nᵀ) where the contact is closed and 0 elsewhere, as in a system without contacts; the
+    inputs are the position and velocity of the touching point.
 
     Args:
         contact: name of a surface contact of the system.
@@ -129,6 +167,7 @@ class ContactForcePrior(ForcePrior):
         for name in self.inputs:
             if name not in ("position", "velocity"):
                 raise UnknownNameError("input of a contact force prior", name, ("position", "velocity"))
+        _check_inputs(self)
 
     def check(self, system: ConstrainedSystem) -> None:
         if not isinstance(system.contact(self.contact), SurfaceContact):
@@ -142,10 +181,16 @@ class ContactForcePrior(ForcePrior):
         return 3
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        if not system.contacts:
+            return {name: at.q.new_zeros(len(at.q), 3) for name in self.inputs}
+        self.check(system)
         point = at.eom.contact_points[self.contact]
         return {name: getattr(point, name) for name in self.inputs}
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        if not system.contacts:
+            return at.q.new_zeros(*at.q.shape, 3)
+        self.check(system)
         point = at.eom.contact_points[self.contact]
         n = torch.nn.functional.normalize(point.normal, dim=-1)
         tangential = point.jacobian - n[..., :, None] * (n[..., None, :] @ point.jacobian)
@@ -194,15 +239,21 @@ class OperatorForcePrior(ForcePrior):
 
 
 def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> None:
-    """Check that priors fit a system and have names of their own.
+    """Check that priors fit a system and have names of their own, which prefix their hyperparameters.
 
     Raises:
-        ModelError: no prior is given, or two share a name.
+        ModelError: no prior is given, two share a name, or a name is not one word.
         UnknownNameError: a prior names a contact that the system has not.
     """
     names = [prior.name for prior in priors]
     if not names or len(set(names)) != len(names):
         raise ModelError("force priors need distinct names, and one at least", got=names)
+    for name in names:
+        if not name or "." in name or name in RESERVED:
+            raise ModelError(
+                f"a force prior cannot be named {name!r}",
+                expected=f"a name without dots that is none of {', '.join(RESERVED)}",
+            )
     for prior in priors:
         prior.check(system)
 

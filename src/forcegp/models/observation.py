@@ -81,7 +81,14 @@ def measurement_of(
             f"the noise of {quantity!r} is not known",
             hint=f"pass Observation(data, {quantity!r}, noise_std=…) in the quantity's unit",
         )
-    std = torch.as_tensor(noise, dtype=data.dtype, device=data.device).expand(values.shape[-1]).clone()
+    std = torch.as_tensor(noise, dtype=data.dtype, device=data.device)
+    if std.shape not in ((), (1,), values.shape[-1:]):
+        raise ModelError(
+            f"the noise of {quantity!r} does not fit its components",
+            expected=f"one number, or {values.shape[-1]}",
+            got=f"shape {tuple(std.shape)}",
+        )
+    std = std.expand(values.shape[-1]).clone()
     if not bool((std > 0.0).all()) or not bool(torch.isfinite(std).all()):
         raise ModelError("a noise standard deviation must be positive and finite", got=noise)
     active = data.active(system.contact_names)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.errors import ModelError, UnknownNameError
 from forcegp.gp.affine import affine_map
 from forcegp.gp.exact import negative_log_likelihood
 from forcegp.gp.hyperprior import bounds_of, initial_hyperparameters, negative_log_prior
@@ -21,14 +22,24 @@ from forcegp.gp.learning import Learned, LearningOptions, minimise
 from forcegp.gp.mean import AnalyticalMean, mean_of
 from forcegp.gp.pathwise import draw_samples
 from forcegp.gp.posterior import ForcePosterior, posterior
-from forcegp.gp.priors import ForcePrior, JointForcePrior, Standardization, States, check_priors, states
+from forcegp.gp.priors import (
+    ForcePrior,
+    JointForcePrior,
+    Standardization,
+    States,
+    check_priors,
+    states,
+    states_at,
+)
 from forcegp.gp.whitening import Measurement, WhitenedRows, combine, whiten
 from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction, not_fitted
 from forcegp.models.observation import NoiseStd, Observation, measurement_of
 from forcegp.models.structured_settings import save_structured
 
-NOISE = "noise"
+NOISE = "noise."
 ANALYTICAL = "analytical."
+OWN = (NOISE, ANALYTICAL)
+"""Prefixes of what is learned beside the hyperparameters of the priors."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +112,8 @@ class StructuredGP(Model):
             data: measured accelerations, or any mixture of measurements.
             options: optimiser and its limits.
             learn: names of the priors whose hyperparameters are learned; the others keep the values and
-                input scales of an earlier fit (two-stage training). Default all.
+                input scales of an earlier fit (two-stage training). Default all; with none, and no noise
+                or analytical parameter to learn, the model is only conditioned.
             progress: called after each evaluation.
 
         Raises:
@@ -109,13 +121,19 @@ class StructuredGP(Model):
             NumericalError: the likelihood cannot be computed.
         """
         options = options or LearningOptions()
+        learn = self._learned_priors(learn)
         training = self._training(data, learn)
         start, held = self._start(training, learn)
+        if not start:
+            self._adopt(held, training)
+            return self._result(
+                Learned({}, -self.log_marginal_likelihood(), True, 0, 0.0, "nothing to learn")
+            )
         fixed_rows = None if self._moving() else self._rows(training, {})
 
         def objective(tensors: dict[str, Tensor]) -> Tensor:
             rows = fixed_rows or self._rows(training, tensors)
-            params = {**held, **{k: v for k, v in tensors.items() if not k.startswith((NOISE, ANALYTICAL))}}
+            params = {**held, **{k: v for k, v in tensors.items() if not k.startswith(OWN)}}
             value, _ = negative_log_likelihood(self.force_priors, params, rows.blocks)
             hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL)}
             return value + rows.constant + negative_log_prior(hyper, start)
@@ -139,7 +157,16 @@ class StructuredGP(Model):
         """
         if self.training is None:
             raise not_fitted(self)
-        self._adopt(self.hyperparameters, self._training(data, learn=()))
+        training = self._training(data, learn=())
+        old, new = ([m.quantity for m in t.measurements] for t in (self.training, training))
+        if self.learn_noise and new != old:
+            raise ModelError(
+                "the learned noise belongs to other measurements",
+                expected=", ".join(old),
+                got=", ".join(new),
+                hint="call fit(data, learn=[]), which learns the noise alone",
+            )
+        self._adopt(self.hyperparameters, training)
 
     def log_marginal_likelihood(self) -> float:
         """log p(y | X, θ) of the training data.
@@ -153,14 +180,25 @@ class StructuredGP(Model):
         value, _ = negative_log_likelihood(self.force_priors, self._kernel_parameters(), rows.blocks)
         return -float(value + rows.constant)
 
-    def _training(self, data: Dataset | Sequence[Observation], learn: Iterable[str] | None) -> Training:
+    def _learned_priors(self, learn: Iterable[str] | None) -> tuple[str, ...]:
+        names = tuple(prior.name for prior in self.force_priors)
+        chosen = names if learn is None else tuple(learn)
+        for name in chosen:
+            if name not in names:
+                raise UnknownNameError("force prior to learn", name, names)
+        return chosen
+
+    def _training(self, data: Dataset | Sequence[Observation], learn: Sequence[str]) -> Training:
         observations = [Observation(data)] if isinstance(data, Dataset) else list(data)
+        if not observations:
+            raise ModelError(
+                "there is nothing to learn from", expected="at least one observation", got="none"
+            )
         pairs = [measurement_of(o, self.system, self.noise_std) for o in observations]
         at = [self._states(m) for m, _ in pairs]
-        learned = {prior.name for prior in self.force_priors} if learn is None else set(learn)
         scales = []
         for p, prior in enumerate(self.force_priors):
-            if prior.name not in learned and self.training is not None:
+            if prior.name not in learn and self.training is not None:
                 scales.append(self.training.scales[p])
                 continue
             features = [prior.features(self.system, a) for a in at]
@@ -174,20 +212,17 @@ class StructuredGP(Model):
         """Whether the rows change while learning."""
         return self.learn_noise or self.analytical_parameters is not None
 
-    def _start(
-        self, training: Training, learn: Iterable[str] | None
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _start(self, training: Training, learn: Sequence[str]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Initial values of what is learned, and the hyperparameters that are held."""
         initial = initial_hyperparameters(self.force_priors, self._rows(training, {}).blocks)
-        kept = {} if learn is None else set(learn)
         held = {
             key: self.hyperparameters.get(key, value)
             for key, value in initial.items()
-            if learn is not None and key.split(".")[0] not in kept
+            if not key.startswith(tuple(name + "." for name in learn))
         }
         start = {key: value for key, value in initial.items() if key not in held}
         if self.learn_noise:
-            start |= {f"{NOISE}.{i}.log_noise_std": std.log() for i, std in enumerate(training.noise_std)}
+            start |= {f"{NOISE}{i}.log_noise_std": std.log() for i, std in enumerate(training.noise_std)}
         if self.analytical_parameters is not None:
             named = self.analytical_parameters.named_parameters()
             start |= {ANALYTICAL + name: value.detach().clone() for name, value in named}
@@ -198,7 +233,7 @@ class StructuredGP(Model):
         system = self._system_at(tensors)
         rows = []
         for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
-            key = f"{NOISE}.{i}.log_noise_std"
+            key = f"{NOISE}{i}.log_noise_std"
             noise = tensors[key].exp() if key in tensors else std
             rows.append(whiten(system, self.force_priors, training.scales, self.mean, m, noise))
         return combine(rows)
@@ -210,7 +245,7 @@ class StructuredGP(Model):
         return self.system.with_robot(torch.func.functional_call(self.analytical_parameters, own, ()))
 
     def _kernel_parameters(self) -> dict[str, Tensor]:
-        return {k: v for k, v in self.hyperparameters.items() if not k.startswith((NOISE, ANALYTICAL))}
+        return {k: v for k, v in self.hyperparameters.items() if not k.startswith(OWN)}
 
     def _adopt(self, tensors: dict[str, Tensor], training: Training) -> None:
         """Keep learned values and condition on the training data."""
@@ -301,23 +336,16 @@ class StructuredGP(Model):
         Raises:
             ModelError: the model has not been fitted.
             UnknownNameError: no such quantity.
-            ShapeError: a state does not fit the robot.
+            ShapeError: a state or `active` does not fit the system.
         """
         fitted = self.posterior
         system = system or self.system
-        system.robot.check_state(q=q, qd=qd, tau=tau)
-        batch = torch.broadcast_shapes(q.shape[:-1], qd.shape[:-1], tau.shape[:-1])
-        flat = [x.expand(*batch, x.shape[-1]).reshape(-1, x.shape[-1]) for x in (q, qd, tau)]
-        n_contacts = len(system.contacts)
-        if active is None:
-            active = torch.ones(n_contacts, dtype=torch.bool, device=q.device)
-        active = active.expand(*batch, n_contacts).reshape(-1, n_contacts)
-        at = states(system, flat[0], flat[1], flat[2], active)
+        batch, at = states_at(system, q, qd, tau, active)
         z = affine_map(system, at, quantity)
         mean = fitted.read_mean(system, at, z)
         spread = fitted.read_covariance(system, at, z) if covariance else None
         return Prediction(
-            mean.reshape(*batch, -1),
+            mean.reshape(*batch, z.o.shape[-1]),
             None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
             _parts(system, at, quantity),
         )
