@@ -1,0 +1,111 @@
+"""Tables and readings say what the numbers say, in both directions."""
+
+from __future__ import annotations
+
+import pytest
+
+from forcegp.report.curves import FLOOR
+from forcegp.report.data import paper_numbers
+from forcegp.report.findings import Finding, findings
+from forcegp.report.markdown import results_markdown
+from forcegp.report.tables import curve_table, error_table, number
+from report_samples import band, identification, multiplier, results, score
+
+PAPER = paper_numbers()
+
+
+def reading(topic: str, *args: object) -> Finding:
+    """The finding on a topic."""
+    made = args or (results(), multiplier(), identification())
+    found = findings(made[0], PAPER, made[1], made[2])  # type: ignore[arg-type]
+    return next(f for f in found if f.topic.startswith(topic))
+
+
+def test_the_papers_numbers_cover_its_models_and_sizes() -> None:
+    assert PAPER.points == [100, 200, 400, 600, 800, 1000]
+    assert set(PAPER.noisy_mae) == {"gp", "sgp-zero", "sgp-mean"}
+    assert all(len(values) == len(PAPER.points) for values in PAPER.noisy_mae.values())
+    assert PAPER.noisy_mae["sgp-zero"][-1] == 0.098
+
+
+def test_numbers_are_means_with_half_their_range() -> None:
+    assert number([0.1, 0.3], 2) == "0.20 ± 0.10"
+    assert number([0.25], 3) == "0.250"
+    assert number([None]) == "–"
+    assert number([3e-12, 1e-12]) == "2.0e-12"
+
+
+def test_the_error_table_puts_the_paper_beside_the_same_size_only() -> None:
+    rows = {row[0]: row for row in error_table(results(), PAPER).rows}
+    assert rows["S-GP, zero mean"][1] == "200"
+    assert rows["S-GP, zero mean"][-1] == "0.21"
+    assert rows["Analytical model"][-1] == "–"
+
+
+def test_the_curve_table_has_both_splits_and_the_paper() -> None:
+    table = curve_table(results(), PAPER, "noisy")
+    assert table.head == ("N", "100", "200")
+    rows = {row[0]: row[1:] for row in table.rows}
+    assert rows["GP, paper"] == ("0.45", "0.28")
+    assert rows["GP, held-out stretches"] == ("0.2872", "0.2500")
+    assert not any(
+        row[0].rsplit(", ", 1)[-1] == "paper" for row in curve_table(results(), PAPER, "clean").rows
+    )
+
+
+def test_readings_of_results_that_bear_the_paper_out() -> None:
+    assert reading("Order").agrees and "worse than the GP" in reading("Order").text
+    assert reading("Constraint").agrees
+    assert reading("Multiplier").agrees
+    assert reading("Identification").agrees and "from evaluation 2 on" in reading("Identification").text
+    assert reading("Uncertainty").agrees
+    assert reading("S-GP, analytical mean against").agrees
+    assert f"{FLOOR * 0.1:.4f}" == "0.0798" and "0.0798" in reading("Points").text
+
+
+def test_readings_of_results_that_do_not() -> None:
+    bad = [
+        score("gp", 200, "selection", noisy_mae=0.31),
+        score("gp", 200, "stretches", noisy_mae=0.05, coverage_noisy=0.7),
+        score("sgp-zero", 200, "stretches", noisy_mae=0.5, residual=1e-9),
+        score("sgp-zero", 200, "selection", noisy_mae=0.5),
+    ]
+    args = (results(bad), multiplier(band(inside=0.5)), identification(mass=2.1))
+    for topic in (
+        "GP against",
+        "Order",
+        "Uncertainty",
+        "Constraint",
+        "Multiplier",
+        "Identification",
+        "Points",
+    ):
+        assert reading(topic, *args).agrees is False, topic
+    assert "N = 200: 0.310, paper 0.28" in reading("GP against", *args).text
+
+
+def test_a_zero_mean_is_not_held_to_the_multiplier() -> None:
+    both = multiplier(band(), band("sgp-zero", inside=0.0, smallest=-1.0))
+    found = reading("Multiplier", results(), both, identification())
+    assert found.agrees and "H Aᵀ = 0" in found.text
+
+
+def test_markdown_has_every_reading_and_whole_tables() -> None:
+    text = results_markdown(results(), multiplier(), identification())
+    for finding in findings(results(), PAPER, multiplier(), identification()):
+        assert finding.text in text
+    widths = {}
+    for line in text.splitlines():
+        if line.startswith("|"):
+            # A bar within a cell is written \|.
+            widths.setdefault(line.replace("\\|", "").count("|"), line)
+    assert "nan" not in text and "None" not in text
+    assert all(width >= 3 for width in widths)
+
+
+@pytest.mark.parametrize("missing", ["gp", "sgp-zero"])
+def test_a_missing_model_leaves_out_its_readings_only(missing: str) -> None:
+    kept = [s for s in results().scores if s.model != missing]
+    found = findings(results(kept), PAPER, multiplier(), identification())
+    assert not any(f.topic.startswith("GP against") for f in found) or missing != "gp"
+    assert any(f.topic == "Constraint" for f in found)
