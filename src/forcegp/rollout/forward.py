@@ -21,8 +21,9 @@ from forcegp.rollout.run import Progress, run
 from forcegp.rollout.stabilize import stabilized_system
 from forcegp.rollout.trajectory import DivergedError, Rollout
 
-CLOSED = 1e-6
-"""Where contacts can open, one is closed at the start if its error is below this [m]."""
+CLOSED = 5e-4
+"""Where contacts can open, one is closed at the start if its error is below this [m]: more than the drift of
+a logged contact, less than a distance that anybody would call off the surface."""
 
 Torque = Tensor | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
 """An array over time `(samples, nq)` or `(*batch, samples, nq)`, or a law of (t, q, q̇)."""
