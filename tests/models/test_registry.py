@@ -36,7 +36,7 @@ def test_the_structured_models_differ_in_mean_and_priors() -> None:
         == [prior.name for prior in mean.force_priors]
         == ["joint"]
     )
-    assert [prior.name for prior in contact.force_priors] == ["joint", "contact_table"]
+    assert [prior.name for prior in contact.force_priors] == ["contact_table"]
 
 
 def test_noise_seed_and_options_arrive() -> None:
