@@ -58,6 +58,7 @@ def test_against_pinocchio(seed: int, batch: int) -> None:
         assert relative(ours[k], theirs) < rounding(M[k])
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("batch", [(), (0,), (2, 3)])
 def test_shapes(batch: tuple[int, ...]) -> None:
     robot = random_robot(0)

@@ -199,6 +199,7 @@ def test_batches_broadcast() -> None:
     )
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_wrong_shapes_are_named() -> None:
     robot = forcegp.load_robot("kuka_iiwa")
     q = torch.zeros(4, 7, dtype=torch.float64)

@@ -1,6 +1,6 @@
 """Shape aliases: every batched quantity has its batch dimensions first, `(*batch, …)`.
 
-`nq` joints, `nf` frames, `m` constraint rows, `n` samples, `d` components. The aliases document shapes
+The batches of joint vectors broadcast against each other (`*#batch`). `nq` joints, `nf` frames, `m` constraint rows, `n` samples, `d` components. The aliases document shapes
 in signatures; the test suite enforces them at run time.
 """
 
@@ -12,7 +12,7 @@ from torch import Tensor
 Scalars = Float[Tensor, "*batch"]
 Vector3 = Float[Tensor, "*batch 3"]
 Rotation = Float[Tensor, "*batch 3 3"]
-JointVector = Float[Tensor, "*batch nq"]
+JointVector = Float[Tensor, "*#batch nq"]
 JointMatrix = Float[Tensor, "*batch nq nq"]
 JointVectors3 = Float[Tensor, "*batch nq 3"]
 PointJacobian = Float[Tensor, "*batch 3 nq"]

@@ -1,0 +1,23 @@
+"""Shapes and types of every call are checked while the tests run, and each test process uses one thread."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from jaxtyping import config, install_import_hook
+
+# The hook sees modules that are imported after it, so it comes before any test imports the library.
+install_import_hook("forcegp", "typechecker.check")
+
+import pytest  # noqa: E402
+import torch  # noqa: E402
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """No check of shapes, so that the library's own message on a wrong one is seen."""
+    config.update("jaxtyping_disable", True)
+    yield
+    config.update("jaxtyping_disable", False)
