@@ -66,8 +66,8 @@ def states_at(
         active = torch.ones(contacts, dtype=torch.bool, device=q.device)
     system.active_rows(active, batch)
     rows = batch.numel()
-    flat = [x.expand(*batch, x.shape[-1]).reshape(rows, x.shape[-1]) for x in given.values()]
-    return batch, states(system, *flat, active.expand(*batch, contacts).reshape(rows, contacts))
+    q, qd, tau = (x.expand(*batch, x.shape[-1]).reshape(rows, x.shape[-1]) for x in given.values())
+    return batch, states(system, q, qd, tau, active.expand(*batch, contacts).reshape(rows, contacts))
 
 
 class ForcePrior(ABC):

@@ -36,9 +36,9 @@ from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Predi
 from forcegp.models.observation import NoiseStd, Observation, measurement_of
 from forcegp.models.structured_settings import save_structured
 
-NOISE = "noise."
+NOISE = "noise"
 ANALYTICAL = "analytical."
-OWN = (NOISE, ANALYTICAL)
+OWN = (f"{NOISE}.", ANALYTICAL)
 """Prefixes of what is learned beside the hyperparameters of the priors."""
 
 
@@ -222,7 +222,7 @@ class StructuredGP(Model):
         }
         start = {key: value for key, value in initial.items() if key not in held}
         if self.learn_noise:
-            start |= {f"{NOISE}{i}.log_noise_std": std.log() for i, std in enumerate(training.noise_std)}
+            start |= {f"{NOISE}.{i}.log_noise_std": std.log() for i, std in enumerate(training.noise_std)}
         if self.analytical_parameters is not None:
             named = self.analytical_parameters.named_parameters()
             start |= {ANALYTICAL + name: value.detach().clone() for name, value in named}
@@ -233,7 +233,7 @@ class StructuredGP(Model):
         system = self._system_at(tensors)
         rows = []
         for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
-            key = f"{NOISE}{i}.log_noise_std"
+            key = f"{NOISE}.{i}.log_noise_std"
             noise = tensors[key].exp() if key in tensors else std
             rows.append(whiten(system, self.force_priors, training.scales, self.mean, m, noise))
         return combine(rows)
