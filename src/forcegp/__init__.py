@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from forcegp.models.observation import Observation
     from forcegp.models.structured_gp import StructuredGP
     from forcegp.robot import AnalyticalParameters, RobotModel, load_robot
+    from forcegp.rollout import Rollout, RolloutOptions, TaskSpaceControl, contact_loss_probability
     from forcegp.scene import Scene, load_scene
 
 _HOME = {
@@ -53,12 +54,16 @@ _HOME = {
     "Plane": "constraints",
     "PointConnection": "constraints",
     "RobotModel": "robot",
+    "Rollout": "rollout",
+    "RolloutOptions": "rollout",
     "SavitzkyGolay": "data",
     "Scene": "scene",
     "Sphere": "constraints",
     "StructuredGP": "models.structured_gp",
     "SurfaceContact": "constraints",
+    "TaskSpaceControl": "rollout",
     "compiled": "",
+    "contact_loss_probability": "rollout",
     "derivatives": "",
     "dynamics": "",
     "evaluate": "evaluation",
@@ -90,12 +95,16 @@ __all__ = [
     "Plane",
     "PointConnection",
     "RobotModel",
+    "Rollout",
+    "RolloutOptions",
     "SavitzkyGolay",
     "Scene",
     "Sphere",
     "StructuredGP",
     "SurfaceContact",
+    "TaskSpaceControl",
     "compiled",
+    "contact_loss_probability",
     "derivatives",
     "dynamics",
     "evaluate",
