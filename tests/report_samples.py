@@ -130,6 +130,6 @@ def figures() -> FigureData:
             t=T, planned_position=three, planned_velocity=three, planned_acceleration=three, position=three,
             velocity=three, acceleration=three, waypoints=[[0.4, 0.0, 0.05], [0.5, 0.1, 0.05]],
         ),
-        windows=[window(model, std=model in NOISY) for model in MODELS],
+        windows=[window("nn", std=False), window("sgp-mean")],
         identification=identification(),
     )  # fmt: skip

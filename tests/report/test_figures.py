@@ -16,6 +16,8 @@ from forcegp.report.predictions import common_limit, draw_errors, draw_predictio
 from forcegp.report.style import COLOURS, LABELS, Picture, colour
 from report_samples import MODELS, figures, identification, multiplier, results, window
 
+KINDS = ("noisy", "clean")
+
 
 def all_pictures() -> list[Picture]:
     """Every figure there is."""
@@ -31,7 +33,7 @@ def all_pictures() -> list[Picture]:
         draw_predictions(window()),
         draw_errors(window(), limit=0.5),
         draw_errors(window("nn", std=False, clean=False)),
-        *(draw_learning_curve(results(), paper, split, kind) for split in SPLITS for kind in ("noisy", "clean")),
+        *(draw_learning_curve(results(), paper, split, kind) for split in SPLITS for kind in KINDS),
         draw_residual(results(), paper, "stretches"),
         *draw_identification(identification()),
     ]  # fmt: skip
