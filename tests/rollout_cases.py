@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from contextlib import closing
 from functools import cache
 
 import torch
@@ -10,9 +12,13 @@ from torch import Tensor
 import forcegp
 from forcegp.constraints import Baumgarte, ConstrainedSystem, Plane, SurfaceContact
 from forcegp.constraints.projection import project_state
+from forcegp.data import Dataset
 from forcegp.gp.mean import AnalyticalMean
 from forcegp.rollout import ForceLaw
-from forcegp.simulate import SimulationConfig, SimulationResult, simulate
+from forcegp.simulate import SimulationConfig, SimulationResult, make_engine, simulate
+from forcegp.simulate.plan import make_plan
+from forcegp.simulate.result import make_result
+from forcegp.simulate.run import _follow as follow
 
 SLIDER_MASS = 2.0
 GRAVITY = 9.81
@@ -63,3 +69,19 @@ def on_manifold(system: ConstrainedSystem, seed: int, speed: float = 0.5) -> tup
     generator = torch.Generator().manual_seed(seed)
     q = simulated().data.q[10 * seed] + 0.02 * torch.randn(7, dtype=torch.float64, generator=generator)
     return project_state(system, q, speed * torch.randn(7, dtype=torch.float64, generator=generator))
+
+
+@cache
+def pulled_off(viscous_friction: float = 0.0) -> Dataset:
+    """The arm pressed on the table, ever less and then pulled: contact is lost gradually."""
+    system, config = (
+        arm(Baumgarte()),
+        SimulationConfig(duration=0.7, seed=3, viscous_friction=viscous_friction, noise_std=0.0),
+    )
+    generator = torch.Generator().manual_seed(config.seed)
+    plan = make_plan(system, config, generator)
+    ramp = torch.linspace(40.0, -30.0, config.steps, dtype=torch.float64)
+    plan = dataclasses.replace(plan, targets=plan.targets._replace(push=ramp))
+    with torch.no_grad(), closing(make_engine(system.robot, config.dt)) as engine:
+        log = follow(system, config, plan, engine, None)
+        return make_result(system, config, plan, log, engine.name, generator).data

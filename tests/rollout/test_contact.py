@@ -8,7 +8,7 @@ import torch
 from forcegp.constraints import Baumgarte
 from forcegp.errors import ModelError
 from forcegp.rollout import AccelerationLaw, RolloutOptions, rollout
-from rollout_cases import ANALYTICAL, GRAVITY, SLIDER_MASS, arm, simulated, slider
+from rollout_cases import ANALYTICAL, GRAVITY, SLIDER_MASS, arm, pulled_off, simulated, slider
 
 WEIGHT = SLIDER_MASS * GRAVITY
 EVENT_TOLERANCE = 1e-7
@@ -101,8 +101,31 @@ def test_sliding_motions_lose_no_contact() -> None:
     assert torch.equal(found.q, bilateral.q)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_law_without_forces_cannot_lose_contact() -> None:
     data = simulated().data
     law = AccelerationLaw(None)  # type: ignore[arg-type]
     with pytest.raises(ModelError, match="no multiplier"):
         rollout(law, arm(), data.q[0], data.qd[0], data.tau, 0.1, options=unilateral())
+
+
+def test_lift_off_of_the_arm_is_the_simulator_s() -> None:
+    """Pulled off ever harder in open loop, within two steps of PyBullet's loss."""
+    data = pulled_off()
+    closed = data.contact["table"]
+    lost = int((~closed).nonzero()[0, 0])
+    assert 60 < lost < 140
+    start = lost - 50
+    found = rollout(
+        ANALYTICAL,
+        arm(Baumgarte()),
+        data.q[start],
+        data.qd[start],
+        data.tau[start:],
+        0.25,
+        options=unilateral(),
+    )
+    (event,) = found.events
+    assert not event.closed
+    assert abs(event.t * 240 - 50) <= 2.0
+    assert float((found.q[:60] - data.q[start : start + 60]).abs().max()) < 1e-4
