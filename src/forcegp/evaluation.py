@@ -15,11 +15,12 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.models.base import Model
-from forcegp.models.structured_gp import NOISE, StructuredGP
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_problem import NOISE
 
 CHUNK_STATES = 2000
 """States predicted at a time, which bounds the memory."""
-LEARNED_NOISE = f"{NOISE}.0.log_noise_std"
+LEARNED_NOISE = f"{NOISE}0.log_noise_std"
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Probabilities of the central intervals whose coverage is counted."""
 

@@ -33,6 +33,10 @@ class LearningOptions:
         learning_rate: of ADAM, for the hyperparameters θ_M.
         analytical_learning_rate: of ADAM, for the analytical parameters θ_A.
         patience: evaluations without improvement after which ADAM stops.
+        warm_start: where there are more than twice as many samples, learn on about so many first and go
+            on from there with all; `None` learns on all from the start.
+        restarts: further random starts, of which the best end is kept.
+        seed: of the random starts.
     """
 
     optimizer: Literal["lbfgs", "adam"] = "lbfgs"
@@ -41,6 +45,9 @@ class LearningOptions:
     learning_rate: float = 0.2
     analytical_learning_rate: float = 0.2
     patience: int = 50
+    warm_start: int | None = 200
+    restarts: int = 0
+    seed: int = 0
 
     def __post_init__(self) -> None:
         if self.optimizer not in OPTIMIZERS:

@@ -12,7 +12,8 @@ from forcegp.gp.mean import AnalyticalMean
 from forcegp.gp.priors import Standardization
 from forcegp.gp.whitening import Measurement
 from forcegp.models.folder import ModelHeader, settings_of
-from forcegp.models.structured_gp import StructuredGP, Training
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_problem import Training
 from forcegp.models.structured_settings import COLUMNS, StructuredSettings
 
 

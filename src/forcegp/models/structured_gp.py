@@ -5,8 +5,8 @@ q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and likewise for every other quantit
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -16,9 +16,9 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.gp.affine import affine_map
-from forcegp.gp.exact import negative_log_likelihood
-from forcegp.gp.hyperprior import bounds_of, initial_hyperparameters, negative_log_prior
-from forcegp.gp.learning import Learned, LearningOptions, minimise
+from forcegp.gp.checkpoint import Checkpoint
+from forcegp.gp.exact import target_of
+from forcegp.gp.learning import Learned, LearningOptions
 from forcegp.gp.mean import AnalyticalMean, mean_of
 from forcegp.gp.pathwise import draw_samples
 from forcegp.gp.posterior import ForcePosterior, posterior
@@ -31,30 +31,11 @@ from forcegp.gp.priors import (
     states,
     states_at,
 )
-from forcegp.gp.whitening import Measurement, WhitenedRows, combine, whiten
+from forcegp.gp.whitening import Measurement
 from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction, not_fitted
 from forcegp.models.observation import NoiseStd, Observation, measurement_of
+from forcegp.models.structured_problem import Problem, Training, analytical_parameters, kernel_parameters
 from forcegp.models.structured_settings import save_structured
-
-NOISE = "noise"
-ANALYTICAL = "analytical."
-OWN = (f"{NOISE}.", ANALYTICAL)
-"""Prefixes of what is learned beside the hyperparameters of the priors."""
-
-
-@dataclass(frozen=True)
-class Training:
-    """What a fitted model keeps of its training data.
-
-    Attributes:
-        measurements: the values conditioned on.
-        noise_std: of each measurement, as given `(d,)`.
-        scales: standardization of each prior's inputs.
-    """
-
-    measurements: tuple[Measurement, ...]
-    noise_std: tuple[Tensor, ...]
-    scales: tuple[Standardization, ...]
 
 
 class StructuredGP(Model):
@@ -105,6 +86,7 @@ class StructuredGP(Model):
         options: LearningOptions | None = None,
         learn: Iterable[str] | None = None,
         progress: FitProgress | None = None,
+        checkpoint: str | Path | None = None,
     ) -> FitResult:
         """Learn hyperparameters (and analytical parameters) by maximum a posteriori, then condition.
 
@@ -115,38 +97,38 @@ class StructuredGP(Model):
                 input scales of an earlier fit (two-stage training). Default all; with none, and no noise
                 or analytical parameter to learn, the model is only conditioned.
             progress: called after each evaluation.
+            checkpoint: file that keeps the best values of a long fit; a fit that finds it goes on from
+                there, and removes it at its end.
 
         Raises:
-            ModelError, DataError, UnknownNameError: the data do not fit the model.
+            ModelError, DataError, UnknownNameError: the data, or the checkpoint, do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
         options = options or LearningOptions()
         learn = self._learned_priors(learn)
-        training = self._training(data, learn)
-        start, held = self._start(training, learn)
+        problem = self._problem(self._training(data, learn))
+        start = problem.initial(self.learn_noise)
+        held = {
+            key: self.hyperparameters.get(key, value)
+            for key, value in kernel_parameters(start).items()
+            if not key.startswith(tuple(name + "." for name in learn))
+        }
+        start = {key: value for key, value in start.items() if key not in held}
         if not start:
-            self._adopt(held, training)
+            self._adopt(problem, held)
             return self._result(
                 Learned({}, -self.log_marginal_likelihood(), True, 0, 0.0, "nothing to learn")
             )
-        fixed_rows = None if self._moving() else self._rows(training, {})
-
-        def objective(tensors: dict[str, Tensor]) -> Tensor:
-            rows = fixed_rows or self._rows(training, tensors)
-            params = {**held, **{k: v for k, v in tensors.items() if not k.startswith(OWN)}}
-            value, _ = negative_log_likelihood(self.force_priors, params, rows.blocks)
-            hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL)}
-            return value + rows.constant + negative_log_prior(hyper, start)
-
-        analytical = frozenset(key for key in start if key.startswith(ANALYTICAL))
-        bounds = bounds_of({key: value for key, value in start.items() if key not in analytical})
 
         def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
             if progress is not None:
                 progress(evaluations, options.max_evaluations, value)
 
-        learned = minimise(objective, start, options, analytical, bounds, report)
-        self._adopt({**held, **learned.tensors}, training)
+        saved = None if checkpoint is None else self._checkpoint(Path(checkpoint), problem, options, start)
+        learned = problem.solve(start, held, options, report, saved)
+        self._adopt(problem, {**held, **learned.tensors})
+        if saved is not None:
+            saved.remove()
         return self._result(learned)
 
     def condition(self, data: Dataset | Sequence[Observation]) -> None:
@@ -166,7 +148,7 @@ class StructuredGP(Model):
                 got=", ".join(new),
                 hint="call fit(data, learn=[]), which learns the noise alone",
             )
-        self._adopt(self.hyperparameters, training)
+        self._adopt(self._problem(training), self.hyperparameters)
 
     def log_marginal_likelihood(self) -> float:
         """log p(y | X, θ) of the training data.
@@ -176,9 +158,10 @@ class StructuredGP(Model):
         """
         if self.training is None:
             raise not_fitted(self)
-        rows = self._rows(self.training, self.hyperparameters)
-        value, _ = negative_log_likelihood(self.force_priors, self._kernel_parameters(), rows.blocks)
-        return -float(value + rows.constant)
+        rows = self._problem(self.training).rows(self.hyperparameters)
+        fit, y = self.posterior.conditioned, target_of(rows.blocks)
+        half = 0.5 * (y @ fit.alpha) + fit.L.diagonal().log().sum() + 0.5 * len(y) * math.log(2.0 * math.pi)
+        return -float(half + rows.constant)
 
     def _learned_priors(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         names = tuple(prior.name for prior in self.force_priors)
@@ -208,58 +191,28 @@ class StructuredGP(Model):
     def _states(self, m: Measurement) -> States:
         return states(self.system, m.q, m.qd, m.tau, m.active)
 
-    def _moving(self) -> bool:
-        """Whether the rows change while learning."""
-        return self.learn_noise or self.analytical_parameters is not None
+    def _problem(self, training: Training) -> Problem:
+        return Problem(self.system, self.force_priors, self.mean, training, self.analytical_parameters)
 
-    def _start(self, training: Training, learn: Sequence[str]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Initial values of what is learned, and the hyperparameters that are held."""
-        initial = initial_hyperparameters(self.force_priors, self._rows(training, {}).blocks)
-        held = {
-            key: self.hyperparameters.get(key, value)
-            for key, value in initial.items()
-            if not key.startswith(tuple(name + "." for name in learn))
-        }
-        start = {key: value for key, value in initial.items() if key not in held}
-        if self.learn_noise:
-            start |= {f"{NOISE}.{i}.log_noise_std": std.log() for i, std in enumerate(training.noise_std)}
-        if self.analytical_parameters is not None:
-            named = self.analytical_parameters.named_parameters()
-            start |= {ANALYTICAL + name: value.detach().clone() for name, value in named}
-        return start, held
+    def _checkpoint(
+        self, path: Path, problem: Problem, options: LearningOptions, start: dict[str, Tensor]
+    ) -> Checkpoint:
+        data = [
+            getattr(m, name) for m in problem.training.measurements for name in ("q", "qd", "tau", "values")
+        ]
+        return Checkpoint(path, Checkpoint.key_of(self.mean, self.force_priors, options, list(start), *data))
 
-    def _rows(self, training: Training, tensors: dict[str, Tensor]) -> WhitenedRows:
-        """Whitened rows at given noise and analytical parameters."""
-        system = self._system_at(tensors)
-        rows = []
-        for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
-            key = f"{NOISE}.{i}.log_noise_std"
-            noise = tensors[key].exp() if key in tensors else std
-            rows.append(whiten(system, self.force_priors, training.scales, self.mean, m, noise))
-        return combine(rows)
-
-    def _system_at(self, tensors: dict[str, Tensor]) -> ConstrainedSystem:
-        own = {k.removeprefix(ANALYTICAL): v for k, v in tensors.items() if k.startswith(ANALYTICAL)}
-        if self.analytical_parameters is None or not own:
-            return self.system
-        return self.system.with_robot(torch.func.functional_call(self.analytical_parameters, own, ()))
-
-    def _kernel_parameters(self) -> dict[str, Tensor]:
-        return {k: v for k, v in self.hyperparameters.items() if not k.startswith(OWN)}
-
-    def _adopt(self, tensors: dict[str, Tensor], training: Training) -> None:
+    def _adopt(self, problem: Problem, tensors: dict[str, Tensor]) -> None:
         """Keep learned values and condition on the training data."""
-        self.hyperparameters, self.training = tensors, training
+        self.hyperparameters, self.training = tensors, problem.training
         if self.analytical_parameters is not None:
-            own = {k.removeprefix(ANALYTICAL): v for k, v in tensors.items() if k.startswith(ANALYTICAL)}
-            self.analytical_parameters.load_state_dict(own, strict=False)
+            self.analytical_parameters.load_state_dict(analytical_parameters(tensors), strict=False)
             with torch.no_grad():
                 self.system = self.system.with_robot(self.analytical_parameters())
         with torch.no_grad():
-            rows = self._rows(training, tensors)
-            self._posterior = posterior(
-                self.force_priors, training.scales, self._kernel_parameters(), rows.blocks, self.mean
-            )
+            blocks = problem.rows(tensors).blocks
+            scales, params = problem.training.scales, kernel_parameters(tensors)
+            self._posterior = posterior(self.force_priors, scales, params, blocks, self.mean)
 
     @torch.no_grad()
     def restore(self, training: Training, hyperparameters: dict[str, Tensor], alpha: Tensor) -> None:
@@ -269,11 +222,11 @@ class StructuredGP(Model):
             ValueError: the weights `alpha` do not fit the training data.
         """
         self.training, self.hyperparameters = training, hyperparameters
-        blocks = self._rows(training, hyperparameters).blocks
+        blocks = self._problem(training).rows(hyperparameters).blocks
         rows = sum(block.rows for block in blocks)
         if alpha.shape != (rows,) or not bool(torch.isfinite(alpha).all()):
             raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
-        params = self._kernel_parameters()
+        params = kernel_parameters(hyperparameters)
         self._posterior = ForcePosterior(self.force_priors, training.scales, params, blocks, self.mean, alpha)
 
     def _result(self, learned: Learned) -> FitResult:

@@ -1,0 +1,185 @@
+"""The learning problem of a structured Gaussian process: its rows, its objective, where it starts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor, nn
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.gp.checkpoint import Checkpoint
+from forcegp.gp.exact import negative_log_likelihood
+from forcegp.gp.hyperprior import bounds_of, initial_hyperparameters, negative_log_prior
+from forcegp.gp.learning import Learned, LearningOptions, Progress, minimise
+from forcegp.gp.priors import ForcePrior, Standardization
+from forcegp.gp.whitening import ForceMean, Measurement, WhitenedRows, combine, whiten
+
+NOISE = "noise."
+ANALYTICAL = "analytical."
+OWN = (NOISE, ANALYTICAL)
+"""Prefixes of what is learned beside the hyperparameters of the priors."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a fitted model keeps of its training data.
+
+    Attributes:
+        measurements: the values conditioned on.
+        noise_std: of each measurement, as given `(d,)`.
+        scales: standardization of each prior's inputs.
+    """
+
+    measurements: tuple[Measurement, ...]
+    noise_std: tuple[Tensor, ...]
+    scales: tuple[Standardization, ...]
+
+    @property
+    def samples(self) -> int:
+        """Number of samples in all measurements."""
+        return sum(len(m.q) for m in self.measurements)
+
+    def thinned(self, samples: int) -> Training:
+        """About so many samples, evenly spaced over the rows of each measurement."""
+        step = max(1, round(self.samples / samples))
+        thin = tuple(
+            Measurement(
+                m.quantity, *(getattr(m, name)[::step] for name in ("q", "qd", "tau", "active", "values"))
+            )
+            for m in self.measurements
+        )
+        return dataclasses.replace(self, measurements=thin)
+
+
+def kernel_parameters(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The hyperparameters of the priors among learned tensors."""
+    return {key: value for key, value in tensors.items() if not key.startswith(OWN)}
+
+
+def analytical_parameters(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The analytical parameters θ_A among learned tensors, by their name in the module."""
+    return {k.removeprefix(ANALYTICAL): v for k, v in tensors.items() if k.startswith(ANALYTICAL)}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What the likelihood of a structured Gaussian process is made of.
+
+    Attributes:
+        system: robot and contacts, with the robot as it is where θ_A is not learned.
+        priors: the force priors.
+        mean: prior mean of Q.
+        training: measurements, noise and input scales.
+        parameters: module whose `forward()` gives the robot at θ_A, or `None`.
+    """
+
+    system: ConstrainedSystem
+    priors: tuple[ForcePrior, ...]
+    mean: ForceMean
+    training: Training
+    parameters: nn.Module | None = None
+
+    def system_at(self, tensors: dict[str, Tensor]) -> ConstrainedSystem:
+        """The system with the robot at the analytical parameters among the tensors."""
+        own = analytical_parameters(tensors)
+        if self.parameters is None or not own:
+            return self.system
+        return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
+
+    def rows(self, tensors: dict[str, Tensor]) -> WhitenedRows:
+        """Whitened rows at the noise and analytical parameters among the tensors."""
+        system, training = self.system_at(tensors), self.training
+        rows = []
+        for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
+            key = f"{NOISE}{i}.log_noise_std"
+            noise = tensors[key].exp() if key in tensors else std
+            rows.append(whiten(system, self.priors, training.scales, self.mean, m, noise))
+        return combine(rows)
+
+    @cached_property
+    def fixed_rows(self) -> WhitenedRows:
+        """The rows at the noise and robot as given."""
+        return self.rows({})
+
+    def initial(self, learn_noise: bool) -> dict[str, Tensor]:
+        """Where learning starts from, everything included."""
+        start = initial_hyperparameters(self.priors, self.fixed_rows.blocks)
+        if learn_noise:
+            noise = self.training.noise_std
+            start |= {f"{NOISE}{i}.log_noise_std": std.log() for i, std in enumerate(noise)}
+        if self.parameters is not None:
+            named = self.parameters.named_parameters()
+            start |= {ANALYTICAL + name: value.detach().clone() for name, value in named}
+        return start
+
+    def objective(
+        self, tensors: dict[str, Tensor], held: dict[str, Tensor], center: dict[str, Tensor]
+    ) -> Tensor:
+        """Negative log posterior: the likelihood of the rows, and weak priors around `center`."""
+        moving = any(key.startswith(OWN) for key in tensors)
+        rows = self.rows(tensors) if moving else self.fixed_rows
+        value, _ = negative_log_likelihood(self.priors, {**held, **kernel_parameters(tensors)}, rows.blocks)
+        hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL)}
+        return value + rows.constant + negative_log_prior(hyper, center)
+
+    def solve(
+        self,
+        start: dict[str, Tensor],
+        held: dict[str, Tensor],
+        options: LearningOptions,
+        progress: Progress | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> Learned:
+        """Learn: on a part of the data first where there is much, from several starts where asked for.
+
+        Args:
+            start: initial values of what is learned.
+            held: hyperparameters that keep their values.
+            options: how to learn.
+            progress: called after each evaluation on all data.
+            checkpoint: where the best values are kept, and taken from if they are there.
+        """
+        analytical = frozenset(key for key in start if key.startswith(ANALYTICAL))
+        bounds = bounds_of({key: value for key, value in start.items() if key not in analytical})
+
+        def run(problem: Problem, begin: dict[str, Tensor], note: Progress | None) -> Learned:
+            def objective(tensors: dict[str, Tensor]) -> Tensor:
+                return problem.objective(tensors, held, start)
+
+            return minimise(objective, begin, options, analytical, bounds, note)
+
+        saved = checkpoint.read(start) if checkpoint is not None else None
+        note = checkpoint.noting(progress) if checkpoint is not None else progress
+        begins = [saved] if saved is not None else self._begins(start, options)
+        best: Learned | None = None
+        for begin in begins:
+            if (
+                saved is None
+                and options.warm_start is not None
+                and self.training.samples > 2 * options.warm_start
+            ):
+                small = dataclasses.replace(self, training=self.training.thinned(options.warm_start))
+                begin = run(small, begin, None).tensors
+            learned = run(self, begin, note)
+            best = learned if best is None or learned.value < best.value else best
+        assert best is not None
+        return best
+
+    def _begins(self, start: dict[str, Tensor], options: LearningOptions) -> Sequence[dict[str, Tensor]]:
+        """The start, and as many random ones around its hyperparameters as there are restarts."""
+        generator = torch.Generator().manual_seed(options.seed)
+        begins = [start]
+        for _ in range(options.restarts):
+            begins.append(
+                {
+                    key: value
+                    if key.startswith(OWN)
+                    else value + torch.randn(value.shape, dtype=torch.float64, generator=generator).to(value)
+                    for key, value in start.items()
+                }
+            )
+        return begins
