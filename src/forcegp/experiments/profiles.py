@@ -22,6 +22,7 @@ class Profile:
         main: training points of the GP models in the figures over time.
         baseline_points: training points of the analytical model and the neural networks.
         networks: which networks are trained.
+        paper_split_seeds: simulated runs that are scored on the paper's split too.
         stretch: duration of a held-out stretch, and of the window of figures 4 and 5 [s].
         test_samples: at most so many test samples are predicted for the scores.
         multiplier_seconds: length of the multiplier figure [s].
@@ -36,6 +37,7 @@ class Profile:
     main: int
     baseline_points: int
     networks: tuple[str, ...]
+    paper_split_seeds: int = 1
     stretch: float = 3.0
     test_samples: int = 2000
     multiplier_seconds: float = 10.0

@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 from forcegp.errors import DataError, ForceGPError
 from forcegp.files import Header, atomic_directory, write_text
@@ -25,6 +25,7 @@ FORMAT = 1
 """Raised where the files that stages leave change."""
 
 
+@runtime_checkable
 class Advance(Protocol):
     """Moves a progress bar; `note` is a word on how it goes, such as the objective."""
 
