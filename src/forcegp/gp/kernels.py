@@ -304,6 +304,18 @@ class Product(Sum):
         return self.left.diagonal(sub(params, "left"), x) * self.right.diagonal(sub(params, "right"), x)
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+        # A sum is multiplied out: its terms have features of unequal number and size, and those of a term
+        # with few would seldom be drawn among those of the other.
+        for side, other in (("left", "right"), ("right", "left")):
+            inner = getattr(self, side)
+            if isinstance(inner, Sum) and not isinstance(inner, Product):
+                rest = {f"right.{key}": value for key, value in sub(params, other).items()}
+                terms = []
+                for part in ("left", "right"):
+                    own = {f"left.{k}": v for k, v in sub(params, f"{side}.{part}").items()}
+                    product = Product(getattr(inner, part), getattr(self, other))
+                    terms.append(product.draw(own | rest, features, generator))
+                return _SumDraw(terms[0], terms[1])
         # Features of the two factors are paired at random, so that their number does not multiply.
         left = self.left.draw(sub(params, "left"), features, generator)
         right = self.right.draw(sub(params, "right"), features, generator)
