@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from forcegp.constraints import ConstrainedSystem
 from forcegp.gp.affine import affine_map
 from forcegp.gp.kernels import sub
 from forcegp.gp.priors import states
@@ -19,23 +20,31 @@ from forcegp.models.structured_gp import StructuredGP
 
 def squared_exponential(params: dict[str, Tensor], x1: Tensor, x2: Tensor) -> Tensor:
     """`(k, n, n')` from explicit differences."""
-    difference = (x1[None, :, None, :] - x2[None, None, :, :]) / params["log_lengthscale"].exp()[:, None, None]
+    difference = (x1[None, :, None, :] - x2[None, None, :, :]) / params["log_lengthscale"].exp()[
+        :, None, None
+    ]
     return params["log_std"].exp()[:, None, None] ** 2 * torch.exp(-0.5 * (difference**2).sum(-1))
 
 
 class Textbook:
     """A dense Gaussian process over several quantities with the hyperparameters of a fitted model."""
 
-    def __init__(self, model: StructuredGP, params: dict[str, Tensor] | None = None) -> None:
+    def __init__(
+        self,
+        model: StructuredGP,
+        params: dict[str, Tensor] | None = None,
+        system: ConstrainedSystem | None = None,
+    ) -> None:
         self.model, self.params = model, params or model.hyperparameters
+        self.system = system or model.system
 
     def _inputs(self, at: object, p: int) -> Tensor:
         prior, scale = self.model.force_priors[p], self.model.training.scales[p]
-        features = scale.apply(prior.features(self.model.system, at))
+        features = scale.apply(prior.features(self.system, at))
         return torch.cat(list(features.values()), dim=-1)
 
     def _maps(self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor, quantity: str) -> tuple:
-        system = self.model.system
+        system = self.system
         at = states(system, q, qd, tau, active)
         z = affine_map(system, at, quantity)
         mean = z.o + torch.einsum("nab,nb->na", z.B_Q, self.model.mean(system, at))
@@ -58,7 +67,10 @@ class Textbook:
     def data(self) -> tuple[Tensor, Tensor, list[tuple]]:
         """Residual `(rows,)`, noise variance `(rows,)`, and the maps of each measurement."""
         maps, residual, noise = [], [], []
-        for m, std in zip(self.model.training.measurements, self.model.training.noise_std, strict=True):
+        training = self.model.training
+        for i, (m, given) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
+            learned = self.params.get(f"noise.{i}.log_noise_std")
+            std = given if learned is None else learned.exp()
             maps.append(self._maps(m.q, m.qd, m.tau, m.active, m.quantity))
             residual.append((m.values - maps[-1][0]).reshape(-1))
             noise.append((std**2).expand_as(m.values).reshape(-1))

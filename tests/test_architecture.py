@@ -1,0 +1,153 @@
+"""Imports run one way, without cycles; what is public is documented and typed."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+from pathlib import Path
+
+import pytest
+
+import forcegp
+
+ROOT = Path(forcegp.__file__).parent
+
+LAYERS = (
+    ("errors", "types", "files", "linalg", "batchlast"),
+    ("robot",),
+    ("kinematics", "friction", "dynamics"),
+    ("compiled", "derivatives", "identification"),
+    ("constraints",),
+    ("data",),
+    ("gp",),
+    ("simulate",),
+    ("scene",),
+    ("models",),
+    ("rollout",),
+    ("evaluation",),
+    ("report",),
+    ("experiments",),
+    ("cli",),
+)
+"""From the lowest to the highest: a part imports parts of its own row and of rows above it in this list."""
+
+RANK = {name: rank for rank, row in enumerate(LAYERS) for name in row}
+
+
+def modules() -> dict[str, Path]:
+    """Every module but the package itself, whose names are loaded when they are first used."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        if name:
+            found[name] = path
+    return found
+
+
+def imports(path: Path) -> set[str]:
+    """Modules of the library that a module imports when it is loaded, by their name in the library."""
+    known, found = modules(), set()
+
+    def note(base: str, names: list[str]) -> None:
+        for name in names:
+            full = f"{base}.{name}".strip(".")
+            found.add(full if full in known else base)
+
+    def visit(body: list[ast.stmt]) -> None:
+        for node in body:
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "forcegp":
+                note(node.module.partition(".")[2], [alias.name for alias in node.names])
+            elif isinstance(node, ast.Import):
+                own = [a.name for a in node.names if a.name.startswith("forcegp.")]
+                found.update(name.partition(".")[2] for name in own)
+            elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+                visit(node.orelse)
+            elif isinstance(node, ast.If | ast.Try):
+                visit([*node.body, *node.orelse])
+
+    visit(ast.parse(path.read_text(encoding="utf-8")).body)
+    return found - {""}
+
+
+@pytest.mark.parametrize("name", modules())
+def test_a_module_imports_only_lower_layers(name: str) -> None:
+    part = name.split(".")[0]
+    assert part in RANK, f"{part!r} has no place in the order of layers"
+    for other in imports(modules()[name]):
+        assert RANK[other.split(".")[0]] <= RANK[part], f"{name} imports {other}, which is a higher layer"
+
+
+def test_no_cycles() -> None:
+    graph = {name: imports(path) - {name} for name, path in modules().items()}
+    assert sum(map(len, graph.values())) > 200, "the imports were found"
+    done: set[str] = set()
+
+    def walk(name: str, trail: tuple[str, ...]) -> None:
+        assert name not in trail, "cycle: " + " → ".join([*trail[trail.index(name) :], name])
+        if name not in done:
+            for other in sorted(graph.get(name, ())):
+                walk(other, (*trail, name))
+            done.add(name)
+
+    for name in graph:
+        walk(name, ())
+
+
+def public_definitions(path: Path) -> list[ast.ClassDef | ast.FunctionDef]:
+    """Public classes and functions of a module, with the public methods that classes define."""
+    found: list[ast.ClassDef | ast.FunctionDef] = []
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+            found.append(node)
+    return found
+
+
+@pytest.mark.parametrize("name", modules())
+def test_public_things_have_docstrings(name: str) -> None:
+    path = modules()[name]
+    text = path.read_text(encoding="utf-8")
+    assert not text.strip() or ast.get_docstring(ast.parse(text)), f"module {name} has no docstring"
+    missing = [node.name for node in public_definitions(path) if not ast.get_docstring(node)]
+    assert not missing, f"{name}: no docstring on {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("name", modules())
+def test_public_functions_are_typed(name: str) -> None:
+    for node in public_definitions(modules()[name]):
+        functions = [node] if isinstance(node, ast.FunctionDef) else node.body
+        for function in functions:
+            if not isinstance(function, ast.FunctionDef) or (
+                function.name.startswith("_") and function.name != "__init__"
+            ):
+                continue
+            arguments = [
+                a
+                for a in [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+                if a.arg not in ("self", "cls")
+            ]
+            untyped = [a.arg for a in arguments if a.annotation is None]
+            assert not untyped, f"{name}.{function.name}: no type on {', '.join(untyped)}"
+            assert function.returns is not None, f"{name}.{function.name}: no return type"
+
+
+def test_nothing_is_unpickled_or_evaluated() -> None:
+    for name, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                names = {a.name for a in node.names} | {getattr(node, "module", None)}
+                assert not names & {"pickle", "shelve", "marshal", "joblib", "dill"}, name
+            if isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                assert called not in ("eval", "exec", "torch.load", "torch.save"), f"{name} calls {called}"
+
+
+def test_public_names_exist_and_are_documented() -> None:
+    assert set(forcegp.__all__) <= set(dir(forcegp))
+    for name in forcegp.__all__:
+        thing = getattr(forcegp, name)
+        assert inspect.getdoc(thing), f"forcegp.{name} has no docstring"
+    with pytest.raises(AttributeError, match="no attribute 'StructuredGp'"):
+        forcegp.StructuredGp  # noqa: B018
+    assert importlib.import_module("forcegp.gp")
