@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+from torch import Tensor
 
 from forcegp.compiled.expression import Graph, Scalar
 from forcegp.robot.model import BASE, RobotModel
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a × b of expressions."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def skew(v: np.ndarray) -> np.ndarray:
+    """[v]× of expressions."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -83,7 +86,8 @@ class Links:
         return chain
 
 
-def numbers(x) -> np.ndarray:
+def numbers(x: Tensor) -> np.ndarray:
+    """A tensor as numbers that are folded into the expressions."""
     return x.detach().cpu().double().numpy()
 
 
