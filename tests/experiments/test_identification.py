@@ -23,7 +23,7 @@ from forcegp.simulate import simulate
 def test_the_start_is_wrong_by_what_is_said() -> None:
     robot = load_scene("kuka_plane").robot()
     wrong = wrong_parameters(robot)()
-    assert float(wrong.mass[-1]) == pytest.approx(WRONG_MASS) and float(robot.mass[-1]) == pytest.approx(2.0)
+    assert wrong.mass[-1].item() == pytest.approx(WRONG_MASS) and robot.mass[-1].item() == pytest.approx(2.0)
     off = wrong.placement_position - robot.placement_position
     assert torch.allclose(off[-1], torch.full((3,), WRONG_OFFSET, dtype=off.dtype)) and not off[:-1].any()
     assert torch.equal(wrong.mass[:-1], robot.mass[:-1])
