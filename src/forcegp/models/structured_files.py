@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
@@ -48,7 +49,27 @@ def load_structured(
             )
             for prior, constant in zip(priors, settings.constant, strict=True)
         )
-        model.restore(Training(measurements, noise, scales), _below(tensors, "hyper."), tensors["alpha"])
+        hyperparameters = _below(tensors, "hyper.")
+        _check(model, scales, hyperparameters, tensors)
+        model.restore(Training(measurements, noise, scales), hyperparameters, tensors["alpha"])
     except (KeyError, RuntimeError, ValueError, IndexError) as cause:
         raise ModelError(f"{source}: the model's tensors do not fit its settings", got=str(cause)) from cause
     return model
+
+
+def _check(
+    model: StructuredGP,
+    scales: Sequence[Standardization],
+    hyperparameters: Mapping[str, Tensor],
+    tensors: Mapping[str, Tensor],
+) -> None:
+    """Raise `ValueError` where a number is not finite, or hyperparameters are not those of the kernels."""
+    for name, value in tensors.items():
+        if not bool(torch.isfinite(value).all()):
+            raise ValueError(f"tensor {name!r} holds values that are not finite")
+    for prior, scale in zip(model.force_priors, scales, strict=True):
+        widths = {name: x.shape[-1] for name, x in scale.mean.items()}
+        for key, value in prior.kernel.initial(prior.outputs(model.system.robot), widths).items():
+            found = hyperparameters[f"{prior.name}.{key}"]
+            if found.shape != value.shape:
+                raise ValueError(f"hyperparameter '{prior.name}.{key}' has shape {tuple(found.shape)}")
