@@ -1,0 +1,451 @@
+"""Structured Gaussian processes: edge cases, transfer, two-stage training, files, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from torch import Tensor
+
+import forcegp
+from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
+from forcegp.errors import DataError, ForceGPError, ModelError, ShapeError, UnknownNameError
+from forcegp.gp.affine import QUANTITIES
+from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
+from forcegp.gp.learning import LearningOptions
+from forcegp.gp.priors import ContactForcePrior, JointForcePrior, OperatorForcePrior
+from forcegp.models.observation import Observation
+from forcegp.models.structured_gp import StructuredGP
+from gp.cases import all_priors, conditioned, draw, logged, mixed_contacts, two_contacts
+from gp.textbook import Textbook
+from random_data import random_data, table_system
+
+SHORT = LearningOptions(max_evaluations=4)
+POSTERIOR = 1e-8
+RESIDUAL = 1e-9
+"""|A q̈ − b| of predicted means, relative to the acceleration."""
+table = table_system()
+data = random_data(table, 20)
+both = (JointForcePrior(), ContactForcePrior("table"))
+
+
+def fitted(
+    rows: forcegp.Dataset = data, options: LearningOptions = SHORT, **settings: object
+) -> StructuredGP:
+    model = StructuredGP(table, **{"mean": "analytical", "force_priors": both, **settings})  # type: ignore[arg-type]
+    model.fit(rows, options=options)
+    return model
+
+
+@pytest.fixture(scope="module")
+def model() -> StructuredGP:
+    return fitted()
+
+
+# -- edge cases -----------------------------------------------------------------------------------
+
+
+def is_right(model: StructuredGP) -> None:
+    """Finite, PSD, on the constraint, and equal to the textbook's answer."""
+    q, qd, tau = draw(3, seed=11)
+    active = torch.tensor([[True], [True], [False]])
+    found = model.predict(q, qd, tau, active=active)
+    mean, covariance = Textbook(model).predict(q, qd, tau, active, "qdd")
+    assert float((found.mean - mean).abs().max()) < POSTERIOR * float(mean.abs().max())
+    assert float((found.covariance - covariance).abs().max()) < POSTERIOR * float(covariance.abs().max())
+    eigenvalues = torch.linalg.eigvalsh(found.covariance)
+    assert float(eigenvalues.min()) > -1e-9 * float(eigenvalues.max())
+    eom = model.system.equations(q, qd, active)
+    residual = (eom.A @ found.mean[..., None])[..., 0] - eom.b
+    assert float(residual.abs().max()) < RESIDUAL * float(found.mean.abs().max())
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_few_samples(n: int) -> None:
+    is_right(fitted(data[:n]))
+
+
+def test_duplicated_rows() -> None:
+    model = fitted(data[torch.tensor([0, 0, 0, 1, 1, 2])])
+    assert model.posterior.conditioned.jitter == 0.0
+    is_right(model)
+
+
+def test_all_samples_free() -> None:
+    rows = data[~data.contact["table"]]
+    assert len(rows) > 3
+    is_right(fitted(rows))
+
+
+def test_a_joint_that_never_moves_is_reported_and_left_unscaled() -> None:
+    q, qd = data.q.clone(), data.qd.clone()
+    q[:, 2], qd[:, 2] = 0.4, 0.0
+    active = data.active(["table"])
+    qdd = table.equations(q, qd, active).acceleration(data.tau)
+    still = dataclasses.replace(data, q=q, qd=qd, qdd=qdd, extras={})
+    model = StructuredGP(table, "analytical", both)
+    result = model.fit(still, options=SHORT)
+    assert result.constant_inputs == ("joint.q[2]", "joint.qd[2]")
+    is_right(model)
+
+
+def test_badly_scaled_inputs_are_standardized() -> None:
+    """A torque in other units only rescales its input."""
+    model = fitted(force_priors=[JointForcePrior(inputs=("q", "tau"))])
+    scale = model.training.scales[0]
+    assert float(scale.std["tau"].max() / scale.std["q"].min()) > 1.0
+    features = scale.apply({"q": data.q, "tau": data.tau})
+    for x in features.values():
+        assert torch.allclose(x.std(0, correction=0), torch.ones(7, dtype=torch.float64))
+        assert float(x.mean(0).abs().max()) < 1e-12
+
+
+@pytest.mark.parametrize("std", [1e-3, 1e-6])
+def test_little_noise(std: float) -> None:
+    """The mean passes through noise-free accelerations, or the jitter says how much noise was assumed."""
+    clean = dataclasses.replace(data, qdd=data.qdd_clean)
+    model = StructuredGP(table, "analytical", both, noise_std=std)
+    result = model.fit(clean, options=SHORT)
+    found = model.predict(data.q, data.qd, data.tau, active=data.active(["table"]))
+    effective = std * math.sqrt(1.0 + result.jitter)
+    assert float((found.mean - clean.qdd).abs().max()) < 100.0 * effective
+    assert math.isfinite(result.log_marginal_likelihood or math.nan)
+
+
+def test_contradicting_duplicates_without_noise_report_their_jitter() -> None:
+    rows = data[torch.tensor([0] * 6 + [1] * 6)]
+    result = StructuredGP(table, "zero", both, noise_std=1e-7).fit(rows, options=SHORT)
+    assert result.jitter > 0.0
+
+
+# -- prediction -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (4,), (2, 3), (0,), (2, 0)])
+@pytest.mark.parametrize("quantity", list(QUANTITIES))
+def test_batch_shapes(model: StructuredGP, batch: tuple[int, ...], quantity: str) -> None:
+    d = {"multiplier": 1, "contact_force": 3}.get(quantity, 7)
+    q, qd, tau = (x[: math.prod(batch)].reshape(*batch, 7) for x in (data.q, data.qd, data.tau))
+    found = model.predict(q, qd, tau, quantity)
+    assert found.mean.shape == (*batch, d)
+    assert found.covariance is not None and found.covariance.shape == (*batch, d, d)
+    assert found.std is not None and found.std.shape == (*batch, d)
+    assert found.parts == {quantity: slice(0, d)}
+    without = model.predict(q, qd, tau, quantity, covariance=False)
+    assert torch.equal(without.mean, found.mean)
+    assert without.covariance is None and without.variance is None and without.std is None
+
+
+def test_states_broadcast_and_each_is_predicted_by_itself(model: StructuredGP) -> None:
+    wide = model.predict(data.q[:2, None], data.qd[:3], data.tau[0])
+    assert wide.mean.shape == (2, 3, 7)
+    one = model.predict(data.q[1], data.qd[2], data.tau[0])
+    assert torch.allclose(wide.mean[1, 2], one.mean, rtol=1e-10, atol=1e-10)
+    assert torch.allclose(wide.covariance[1, 2], one.covariance, rtol=1e-9, atol=1e-10)  # type: ignore[index]
+
+
+def test_transfer_to_another_surface_and_to_free_motion() -> None:
+    """The forces are learned, not the accelerations: read on a slope, and with no contact at all."""
+    model = fitted(random_data(table, 40), options=LearningOptions(max_evaluations=25))
+    slope = SurfaceContact("table", "lbr_iiwa_link_7", (0.0, 0.0, 0.1), Plane((0.3, 0.1, 1.0), 0.2))
+    new = random_data(ConstrainedSystem(table.robot, [slope]), 30, seed=5)
+    closed = new.active(["table"])
+    found = model.predict(
+        new.q, new.qd, new.tau, active=closed, system=ConstrainedSystem(table.robot, [slope])
+    )
+    eom = ConstrainedSystem(table.robot, [slope]).equations(new.q, new.qd, closed)
+    residual = (eom.A @ found.mean[..., None])[..., 0] - eom.b
+    assert float(residual.abs().max()) < RESIDUAL * float(found.mean.abs().max())
+    known = eom.acceleration(eom.Q_K + new.tau)
+    error = [float((x - new.qdd_clean)[closed[:, 0]].abs().mean()) for x in (found.mean, known)]
+    assert error[0] < 0.5 * error[1], "friction learned on the table helps on the slope"
+    free = model.predict(new.q, new.qd, new.tau, system=ConstrainedSystem(table.robot))
+    opened = model.predict(new.q, new.qd, new.tau, active=torch.zeros(1, dtype=torch.bool))
+    assert torch.allclose(free.mean, opened.mean, rtol=1e-9, atol=1e-9)
+    assert torch.allclose(free.covariance, opened.covariance, rtol=1e-8, atol=1e-9)  # type: ignore[arg-type]
+    none = model.predict(new.q, new.qd, new.tau, "multiplier", system=ConstrainedSystem(table.robot))
+    assert none.mean.shape == (30, 0) and none.covariance is not None and none.covariance.shape == (30, 0, 0)
+
+
+def test_transfer_without_the_contact_of_a_prior_is_refused(model: StructuredGP) -> None:
+    other = dataclasses.replace(table.contacts[0], name="floor")  # type: ignore[type-var]
+    with pytest.raises(UnknownNameError, match=r"unknown contact 'table'[\s\S]*floor"):
+        model.predict(data.q, data.qd, data.tau, system=ConstrainedSystem(table.robot, [other]))
+
+
+# -- learning -------------------------------------------------------------------------------------
+
+
+def test_two_stages_hold_the_first_prior_and_its_scales() -> None:
+    free, closed = data[~data.contact["table"]], data[data.contact["table"]]
+    model = StructuredGP(table, "analytical", both)
+    model.fit(free, options=SHORT, learn=["joint"])
+    first, scale = dict(model.hyperparameters), model.training.scales[0]
+    assert bool((model.predict(data.q, data.qd, data.tau, "contact_friction").mean == 0.0).all())
+    model.fit(closed, options=SHORT, learn=["contact_table"])
+    for key, value in first.items():
+        assert torch.equal(model.hyperparameters[key], value) == key.startswith("joint."), key
+    assert model.training.scales[0] is scale
+    position = model.training.scales[1].mean["position"]
+    point = table.equations(closed.q, closed.qd).contact_points["table"].position
+    assert torch.allclose(position, point.mean(0))
+    both_again = model.hyperparameters
+    model.condition([Observation(free), Observation(closed)])
+    assert model.hyperparameters == both_again
+    assert float(model.predict(data.q, data.qd, data.tau, "contact_friction").mean.abs().max()) > 0.0
+    is_right(model)
+
+
+def test_conditioning_on_other_data_is_a_fit_that_learns_nothing(model: StructuredGP) -> None:
+    other, again = random_data(table, 6, seed=3), fitted()
+    again.condition(other)
+    for key, value in model.hyperparameters.items():
+        assert torch.equal(again.hyperparameters[key], value)
+    assert again.training.scales[0].mean["q"].tolist() == model.training.scales[0].mean["q"].tolist()
+    mean = again.predict(other.q, other.qd, other.tau).mean
+    result = again.fit(other, learn=[])
+    assert (result.converged, result.evaluations, result.message) == (True, 0, "nothing to learn")
+    assert torch.equal(again.predict(other.q, other.qd, other.tau).mean, mean)
+    assert result.log_marginal_likelihood == again.log_marginal_likelihood()
+
+
+def test_learned_noise_and_honest_flags() -> None:
+    rows = random_data(table, 60, seed=2)
+    model = StructuredGP(table, "analytical", both, noise_std=0.3, learn_noise=True)
+    result = model.fit(rows, options=LearningOptions(max_evaluations=40))
+    noise = model.hyperparameters["noise.0.log_noise_std"].exp()
+    assert noise.shape == (7,)
+    # Sixty samples leave room to take some noise of single joints for force.
+    assert abs(float(noise.log().mean()) - math.log(0.1)) < 0.4, "the data have noise of 0.1"
+    assert result.evaluations == len(result.history) and result.seconds > 0.0
+    assert result.log_marginal_likelihood == pytest.approx(model.log_marginal_likelihood())
+    assert not StructuredGP(table).fit(rows, options=LearningOptions(max_evaluations=2)).converged
+    with pytest.raises(
+        ModelError, match=r"learned noise belongs to other measurements[\s\S]*expected: qdd\n"
+    ):
+        model.condition([Observation(rows), Observation(rows)])
+
+
+def test_progress_is_reported() -> None:
+    seen: list[tuple[int, int, float]] = []
+    StructuredGP(table).fit(data, options=SHORT, progress=lambda *args: seen.append(args))
+    assert [n for n, _, _ in seen] == list(range(1, len(seen) + 1))
+    assert {most for _, most, _ in seen} == {4}
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def same(one: StructuredGP, two: object, seed: int = 1) -> None:
+    assert isinstance(two, StructuredGP)
+    (q, qd, tau), n = draw(5, seed), len(one.system.contacts)
+    active = mixed_contacts(5)[:, :n]
+    for quantity in ("qdd", "multiplier", "contact_friction"):
+        a, b = (m.predict(q, qd, tau, quantity, active=active) for m in (one, two))
+        assert torch.equal(a.mean, b.mean) and torch.equal(a.covariance, b.covariance)  # type: ignore[arg-type]
+    assert one.log_marginal_likelihood() == two.log_marginal_likelihood()
+
+
+def test_saved_models_are_exact_whatever_they_are_made_of(tmp_path: Path) -> None:
+    kernel = SquaredExponential(("q",)) * Matern52(("qd",)) + Linear(("qd", "tau"))
+    priors = [JointForcePrior(kernel, periodic=False, name="noisy"), *all_priors()[1:]]
+    noise = {"noise_std": [0.1, 0.2, 0.3, 0.1, 0.1, 0.1, 0.2], "learn_noise": True}
+    observations = [
+        Observation(logged(two_contacts(), 6)),
+        Observation(logged(two_contacts(), 5, seed=4), "multiplier", [1.0, 2.0]),
+    ]
+    model = conditioned(observations, force_priors=priors, mean=forcegp.AnalyticalMean(("gravity",)), **noise)
+    model.save(tmp_path / "model")
+    same(model, forcegp.load_model(tmp_path / "model"))
+
+
+def test_saved_models_keep_learned_analytical_parameters(tmp_path: Path) -> None:
+    theta = forcegp.AnalyticalParameters(
+        table.robot, {"mass": table.robot.joint_names[-2:], "damping": "all"}
+    )
+    model = fitted(analytical_parameters=theta)
+    assert not torch.equal(model.system.robot.mass, table.robot.mass)
+    assert torch.equal(model.system.robot.mass, theta().mass)
+    model.save(tmp_path / "model")
+    read = forcegp.load_model(tmp_path / "model")
+    assert torch.equal(read.system.robot.mass, model.system.robot.mass)
+    same(model, read)
+
+
+def test_models_of_python_code_are_not_saved(tmp_path: Path) -> None:
+    own = OperatorForcePrior(
+        "own", 7, lambda system, at: torch.eye(7, dtype=torch.float64).expand(len(at.q), 7, 7)
+    )
+    with pytest.raises(ModelError, match=r"'own' of type OperatorForcePrior holds Python code"):
+        fitted(force_priors=[own]).save(tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+
+
+def rewrite(folder: Path, change: Callable[[dict, dict[str, Tensor]], None]) -> None:
+    """Change a saved model and mend its checksum, as someone hostile would."""
+    header = json.loads((folder / "model.json").read_text())
+    tensors = safetensors.torch.load_file(folder / "model.safetensors")
+    change(header, tensors)
+    content = safetensors.torch.save(tensors)
+    header["sha256"] = hashlib.sha256(content).hexdigest()
+    (folder / "model.safetensors").write_bytes(content)
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(50_000)
+    (folder / "model.json").write_text(json.dumps(header))
+    sys.setrecursionlimit(limit)
+
+
+def deep(header: dict, tensors: dict, depth: int = 200) -> None:
+    kernel = {"type": "linear", "inputs": None}
+    for _ in range(depth):
+        kernel = {"type": "sum", "left": kernel, "right": {"type": "linear", "inputs": None}}
+    header["settings"]["priors"][0]["kernel"] = kernel
+
+
+HOSTILE: dict[str, Callable[[dict, dict], object]] = {
+    "unknown kernel": lambda h, t: h["settings"]["priors"][0]["kernel"].update(type="__import__"),
+    "unknown contact": lambda h, t: h["settings"]["priors"][1].update(contact="wall"),
+    "unknown mean": lambda h, t: h["settings"].update(mean=["magic"]),
+    "unknown quantity": lambda h, t: h["settings"].update(measured=["luck"]),
+    "more measurements": lambda h, t: h["settings"].update(measured=["qdd"] * 3),
+    "no measurement": lambda h, t: h["settings"].update(measured=[]),
+    "no prior": lambda h, t: h["settings"].update(priors=[]),
+    "negative noise": lambda h, t: h["settings"].update(noise_std="much"),
+    "extra setting": lambda h, t: h["settings"].update(code="import os"),
+    "deep kernel": deep,
+    "kernel beyond recursion": lambda h, t: deep(h, t, 4000),
+    "no alpha": lambda h, t: t.pop("alpha"),
+    "short alpha": lambda h, t: t.update(alpha=t["alpha"][:-1]),
+    "alpha not finite": lambda h, t: t.update(alpha=t["alpha"] * float("nan")),
+    "hyperparameter missing": lambda h, t: t.pop("hyper.joint.log_std"),
+    "hyperparameter of another shape": lambda h, t: t.update(
+        {"hyper.joint.log_std": t["hyper.joint.log_std"][:2]}
+    ),
+    "hyperparameter not finite": lambda h, t: t["hyper.joint.log_std"].fill_(float("nan")),
+    "data of another shape": lambda h, t: t.update({"data.0.q": t["data.0.q"][:, :5].contiguous()}),
+    "data not finite": lambda h, t: t["data.0.values"].fill_(float("inf")),
+    "data in single precision": lambda h, t: t.update({"data.0.q": t["data.0.q"].float()}),
+    "contacts as numbers": lambda h, t: t.update({"data.0.active": t["data.0.active"].double()}),
+    "no scale": lambda h, t: t.pop("scale.joint.mean.q"),
+}
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("change", HOSTILE.values(), ids=HOSTILE.keys())
+def test_hostile_files_are_refused_when_they_are_read(
+    model: StructuredGP, change: Callable, tmp_path: Path
+) -> None:
+    folder = tmp_path / "model"
+    model.save(folder)
+    rewrite(folder, change)
+    with pytest.raises(ForceGPError):
+        forcegp.load_model(folder)
+
+
+# -- what is refused ------------------------------------------------------------------------------
+
+REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
+    "no prior": (
+        lambda: StructuredGP(table, force_priors=[]),
+        ModelError,
+        "distinct names, and one at least",
+    ),
+    "same names": (
+        lambda: StructuredGP(table, force_priors=[both[0], both[0]]),
+        ModelError,
+        "distinct names",
+    ),
+    "name": (
+        lambda: StructuredGP(table, force_priors=[JointForcePrior(name="noise")]),
+        ModelError,
+        "'noise'",
+    ),
+    "dots": (
+        lambda: StructuredGP(table, force_priors=[JointForcePrior(name="a.b")]),
+        ModelError,
+        "without dots",
+    ),
+    "mean": (lambda: StructuredGP(table, "analytcal"), UnknownNameError, r"did you mean 'analytical'"),
+    "terms": (lambda: forcegp.AnalyticalMean(("bias", "bias")), ModelError, "'bias'.*twice"),
+    "term": (lambda: forcegp.AnalyticalMean(("gravty",)), UnknownNameError, "did you mean 'gravity'"),
+    "contact": (
+        lambda: fitted(force_priors=[ContactForcePrior("tabel")]),
+        UnknownNameError,
+        "did you mean 'table'",
+    ),
+    "inputs": (
+        lambda: JointForcePrior(inputs=("qdd",)),
+        UnknownNameError,
+        "unknown input of a joint force prior",
+    ),
+    "no inputs": (lambda: JointForcePrior(inputs=()), ModelError, "depends on nothing"),
+    "kernel": (
+        lambda: fitted(force_priors=[JointForcePrior(Linear(("x",)))]),
+        UnknownNameError,
+        "kernel input 'x'",
+    ),
+    "learn": (
+        lambda: StructuredGP(table).fit(data, learn=["jont"]),
+        UnknownNameError,
+        "did you mean 'joint'",
+    ),
+    "noise length": (lambda: fitted(noise_std=[0.1, 0.2]), ModelError, r"one number, or 7[\s\S]*\(2,\)"),
+    "noise zero": (lambda: fitted(noise_std=0.0), ModelError, "must be positive and finite"),
+    "no rows": (lambda: fitted(data[:0]), ModelError, "nothing to learn from"),
+    "no observation": (lambda: StructuredGP(table).fit([]), ModelError, "nothing to learn from"),
+    "noise of a sensor": (
+        lambda: StructuredGP(table).fit([Observation(data, "joint_force")]),
+        DataError,
+        "'Q' is not logged",
+    ),
+    "quantity": (
+        lambda: StructuredGP(table).fit([Observation(data, "qdd_free")]),
+        UnknownNameError,
+        "qdd_free",
+    ),
+    "sensor": (
+        lambda: StructuredGP(table).fit([Observation(data, "multiplier", 1.0)]),
+        UnknownNameError,
+        "unknown contact with a logged multiplier 'table'",
+    ),
+    "not fitted": (lambda: StructuredGP(table).predict(data.q, data.qd, data.tau), ModelError, "model.fit"),
+    "not fitted, save": (lambda: StructuredGP(table).save("nowhere"), ModelError, "has not been fitted"),
+    "not fitted, condition": (lambda: StructuredGP(table).condition(data), ModelError, "has not been fitted"),
+}
+
+
+@pytest.mark.parametrize(("make", "error", "message"), REFUSED.values(), ids=REFUSED.keys())
+def test_what_does_not_fit_is_refused(
+    make: Callable[[], object], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_states_that_do_not_fit_are_refused(model: StructuredGP) -> None:
+    q, qd, tau = data.q, data.qd, data.tau
+    with pytest.raises(ShapeError, match=r"q does not fit robot 'kuka_iiwa'[\s\S]*got: \(20, 6\)"):
+        model.predict(q[:, :6], qd, tau)
+    with pytest.raises(ShapeError, match=r"q, qd and tau are not one batch[\s\S]*'qd': \(3, 7\)"):
+        model.predict(q, qd[:3], tau)
+    with pytest.raises(ShapeError, match="tau holds values that are not finite"):
+        model.predict(q, qd, tau * float("nan"))
+    with pytest.raises(ShapeError, match=r"torch.float64 on cpu[\s\S]*hint: convert q"):
+        model.predict(q.float(), qd, tau)
+    with pytest.raises(
+        ShapeError, match=r"active does not fit the contacts table[\s\S]*bool of shape \(20, 1\)"
+    ):
+        model.predict(q, qd, tau, active=torch.ones(20, 2, dtype=torch.bool))
+    with pytest.raises(UnknownNameError, match=r"unknown quantity 'qddd'[\s\S]*did you mean 'qdd'"):
+        model.predict(q, qd, tau, "qddd")
+    with pytest.raises(ModelError, match="no quantity is named"):
+        model.predict(q, qd, tau, [])
