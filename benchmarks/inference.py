@@ -1,0 +1,211 @@
+"""Speed and memory of inference, beside the dense nq·N formula with autograd, and the cost of whole fits.
+
+    python benchmarks/inference.py --json result.json            # likelihood, prediction and fits, N = 1000
+    python benchmarks/inference.py --samples 400 --no-fits
+
+Each likelihood runs in a process of its own, so that peak memory is its own; ratios are of one run on one
+machine. The data are a simulated minute of the paper's task.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import platform
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from torch import Tensor
+
+import forcegp
+from forcegp.data import split_by_stretches
+from forcegp.gp.exact import negative_log_likelihood
+from forcegp.gp.priors import states
+from forcegp.models.structured_problem import kernel_parameters
+from forcegp.simulate import simulate
+
+REPEATS = 3
+
+
+def training_data(folder: Path, samples: int) -> tuple[forcegp.Dataset, forcegp.Dataset]:
+    """Training and test rows of the simulated run, simulated once."""
+    path = folder / "run.parquet"
+    scene = forcegp.load_scene("kuka_plane")
+    if not path.is_file():
+        print("simulating a minute of motion", flush=True)
+        simulate(scene.system(), scene.simulation).data.write(path)
+    data = forcegp.Dataset.read(path)
+    split = split_by_stretches(data, samples)
+    return data[split.train], data[split.test]
+
+
+def unfitted(mean: str = "zero") -> forcegp.StructuredGP:
+    """The paper's model: one squared-exponential prior per joint."""
+    return forcegp.StructuredGP(forcegp.load_scene("kuka_plane").system(), mean=mean)
+
+
+def start_of(data: forcegp.Dataset) -> tuple[forcegp.StructuredGP, object, dict[str, Tensor]]:
+    model = unfitted()
+    problem = model._problem(model._training(data, ("joint",)))
+    return model, problem, problem.initial(learn_noise=False)
+
+
+def projected(data: forcegp.Dataset) -> Callable[[], float]:
+    """One likelihood with gradient, as this library computes it."""
+    model, problem, start = start_of(data)
+    blocks, constant = problem.fixed_rows.blocks, float(problem.fixed_rows.constant)
+
+    def evaluate() -> float:
+        leaves = {key: value.clone().requires_grad_() for key, value in kernel_parameters(start).items()}
+        value, _ = negative_log_likelihood(model.force_priors, leaves, blocks)
+        torch.autograd.grad(value, list(leaves.values()))
+        return float(value.detach()) + constant
+
+    return evaluate
+
+
+def dense(data: forcegp.Dataset) -> Callable[[], float]:
+    """One likelihood with gradient by the paper's formula: einsum, nq·N rows, autograd through Cholesky."""
+    model, problem, start = start_of(data)
+    m, std = problem.training.measurements[0], problem.training.noise_std[0]
+    at = states(model.system, m.q, m.qd, m.tau, m.active)
+    prior, scale = model.force_priors[0], problem.training.scales[0]
+    x = torch.cat(list(scale.apply(prior.features(model.system, at)).values()), dim=-1)
+    H = at.eom.H
+    y = (m.values - (at.eom.L @ at.eom.b[..., None])[..., 0]).reshape(-1)
+
+    def evaluate() -> float:
+        leaves = {key: value.clone().requires_grad_() for key, value in start.items()}
+        a = x * torch.exp(-leaves["joint.log_lengthscale"])[:, None, :]
+        r2 = torch.cdist(a, a, compute_mode="use_mm_for_euclid_dist").square()
+        k = torch.exp(2.0 * leaves["joint.log_std"])[:, None, None] * torch.exp(-0.5 * r2)
+        kQ = torch.diag_embed(k.permute(1, 2, 0))
+        K = torch.einsum("iab,ijbc,jdc->iajd", H, kQ, H).reshape(len(y), len(y))
+        L = torch.linalg.cholesky(K + torch.diag((std**2).repeat(len(x))))
+        alpha = torch.cholesky_solve(y[:, None], L)[:, 0]
+        value = 0.5 * y @ alpha + L.diagonal().log().sum() + 0.5 * len(y) * math.log(2.0 * math.pi)
+        torch.autograd.grad(value, list(leaves.values()))
+        return float(value.detach())
+
+    return evaluate
+
+
+def _measure(make: str, folder: str, samples: int, repeats: int, result: object) -> None:
+    data, _ = training_data(Path(folder), samples)
+    evaluate = {"projected": projected, "dense": dense}[make](data)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    seconds, value = [], math.nan
+    for _ in range(repeats):
+        began = time.perf_counter()
+        value = evaluate()
+        seconds.append(time.perf_counter() - began)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    result.put({"seconds": seconds, "value": value, "peak_mib": (peak - before) / 1024})
+
+
+def measure(make: str, folder: Path, samples: int, repeats: int) -> dict:
+    """Seconds, value and peak memory above the start of one likelihood, in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=_measure, args=(make, str(folder), samples, repeats, queue))
+    process.start()
+    result = queue.get()
+    process.join()
+    return result
+
+
+def median_seconds(call: Callable[[], object], repeats: int) -> float:
+    call()
+    seconds = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - began)
+    return statistics.median(seconds)
+
+
+def likelihoods(folder: Path, samples: int) -> dict:
+    """One likelihood with gradient, both ways, turn by turn."""
+    training_data(folder, samples)
+    ours, reference = (measure(name, folder, samples, REPEATS) for name in ("projected", "dense"))
+    result = {
+        "samples": samples,
+        "seconds": min(ours["seconds"]),
+        "dense_seconds": min(reference["seconds"]),
+        "peak_mib": ours["peak_mib"],
+        "dense_peak_mib": reference["peak_mib"],
+        "relative_difference": abs(ours["value"] - reference["value"]) / abs(reference["value"]),
+    }
+    result["speed_ratio"] = result["dense_seconds"] / result["seconds"]
+    result["memory_ratio"] = result["peak_mib"] / result["dense_peak_mib"]
+    return result
+
+
+def fit_and_predict(folder: Path, samples: int, mean: str) -> dict:
+    """A whole fit to convergence, its errors on held-out stretches, and the cost of predictions."""
+    train, test = training_data(folder, samples)
+    model = unfitted(mean)
+    began = time.perf_counter()
+    fit = model.fit(train)
+    fit_seconds = time.perf_counter() - began
+    test = test[:: max(1, len(test) // 1000)][:1000]
+    one = [x[:1] for x in (test.q, test.qd, test.tau)]
+    many = (test.q, test.qd, test.tau)
+    began = time.perf_counter()
+    prediction = model.predict(*many)
+    all_seconds = time.perf_counter() - began
+    clean, noisy = (prediction.mean - test.qdd_clean).abs(), (prediction.mean - test.qdd).abs()
+    std = prediction.variance
+    return {
+        "samples": samples,
+        "mean": mean,
+        "fit_seconds": fit_seconds,
+        "evaluations": fit.evaluations,
+        "converged": fit.converged,
+        "one_mean_ms": 1e3 * median_seconds(lambda: model.predict(*one, covariance=False), 50),
+        "one_covariance_ms": 1e3 * median_seconds(lambda: model.predict(*one), 5),
+        "thousand_seconds": all_seconds,
+        "clean_mae": float(clean.mean()),
+        "noisy_mae": float(noisy.mean()),
+        "coverage_noisy": float((noisy < 2.0 * (std + 0.01).sqrt()).double().mean()),
+        "coverage_clean": float((clean < 2.0 * std.sqrt()).double().mean()),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--samples", type=int, default=1000)
+    parser.add_argument("--fits", type=int, nargs="*", default=[200, 400, 1000])
+    parser.add_argument("--no-fits", action="store_true")
+    parser.add_argument("--mean", default="zero")
+    parser.add_argument("--folder", type=Path, help="where the simulated run is kept, to be used again")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    with TemporaryDirectory() as temporary:
+        folder = options.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        result: dict = {
+            "machine": platform.processor() or platform.machine(),
+            "threads": torch.get_num_threads(),
+        }
+        result["likelihood"] = likelihoods(folder, options.samples)
+        print(json.dumps(result["likelihood"], indent=2), flush=True)
+        result["fits"] = []
+        for samples in [] if options.no_fits else options.fits:
+            result["fits"].append(fit_and_predict(folder, samples, options.mean))
+            print(json.dumps(result["fits"][-1], indent=2), flush=True)
+    if options.json is not None:
+        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
