@@ -28,7 +28,7 @@ reproduce: $(READY)  ## the main job: simulate, select, train, report
 	$(BIN)/forcegp reproduce --profile $(PROFILE) --out $(OUT)/$(PROFILE)
 
 test: lint types $(READY)  ## lint, types and tests
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 	@echo "[test] all passed: see the summary above"
 
 lint: $(READY)   ## ruff, check and format
