@@ -182,3 +182,17 @@ def test_noise_of_the_dense_formula_matters() -> None:
     data = logged(two_contacts(), 6)
     one, two = (conditioned(data, noise_std=std) for std in (0.1, 0.101))
     assert abs(one.log_marginal_likelihood() - two.log_marginal_likelihood()) > 1e-3
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-2])
+def test_redundant_and_nearly_redundant_contacts(angle: float) -> None:
+    """Two contacts at one point whose normals differ by an angle: one row or two, never in between."""
+    first, _ = two_contacts().contacts
+    again = forcegp.SurfaceContact("ball", first.frame, first.point, forcegp.Plane((angle, 0.2, 1), 0.055))
+    system = forcegp.ConstrainedSystem(two_contacts().robot, [first, again], forcegp.Baumgarte())
+    data = logged(system, 6)
+    model = forcegp.StructuredGP(system, "analytical", noise_std=0.1)
+    model.fit(data, learn=[])
+    expected = -float(Textbook(model).negative_log_likelihood())
+    # Dropping a row leaves an error of the order of the angle.
+    assert model.log_marginal_likelihood() == pytest.approx(expected, rel=1e-5)

@@ -19,7 +19,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.gp.affine import AffineMap, affine_map
 from forcegp.gp.gram import Block
 from forcegp.gp.priors import ForcePrior, Standardization, States, states
-from forcegp.linalg import RANK_TOLERANCE, null_space_basis
+from forcegp.linalg import null_space_basis
 
 ForceMean = Callable[[ConstrainedSystem, States], Tensor]
 """Prior mean of the joint force Q at states, `(n, nq)`."""
@@ -70,8 +70,16 @@ def prior_mean(system: ConstrainedSystem, at: States, z: AffineMap, mean: ForceM
 
 
 def _split(A: Tensor, rank: int) -> tuple[Tensor, Tensor]:
-    """Null-space basis of A, and A⁺."""
-    return null_space_basis(A, rank), torch.linalg.pinv(A, rtol=RANK_TOLERANCE)
+    """Null-space basis of A, and A⁺, both with the rank that the equations of motion count.
+
+    Of nearly redundant rows, A⁺ with another rank would magnify what they contradict each other.
+    """
+    if rank == A.shape[-2]:
+        return null_space_basis(A, rank), torch.linalg.pinv(A)
+    # Fixed combinations of rows have the solutions, and so the derivative, of all rows that are consistent.
+    W = torch.linalg.svd(A.detach(), full_matrices=False).U[..., :rank]
+    rows = W.mT @ A
+    return null_space_basis(rows, rank), torch.linalg.pinv(rows) @ W.mT
 
 
 def whiten(
