@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from forcegp.errors import NumericalError, UnknownNameError
+from forcegp.errors import ModelError, NumericalError, UnknownNameError
 from forcegp.gp.learning import LearningOptions, minimise
 
 START = {"a": torch.tensor([3.0, -2.0], dtype=torch.float64), "b": torch.tensor(1.5, dtype=torch.float64)}
@@ -46,6 +46,7 @@ def test_the_optimum_is_found(options: LearningOptions, close: float) -> None:
 def test_running_out_of_evaluations_is_no_convergence(optimizer: str) -> None:
     learned = minimise(rosenbrock, START, LearningOptions(optimizer, max_evaluations=6))  # type: ignore[arg-type]
     assert not learned.converged
+    assert learned.evaluations == 6
     assert learned.message
     assert learned.value < learned.history[0]
 
@@ -91,6 +92,8 @@ def test_what_cannot_be_learned_is_refused() -> None:
         minimise(lambda x: bowl(x) * float("nan"), START, LearningOptions(max_evaluations=3))
     with pytest.raises(UnknownNameError, match=r"unknown optimizer 'lbfg'[\s\S]*did you mean 'lbfgs'"):
         _unchecked("lbfg")
+    with pytest.raises(ModelError, match=r"max_evaluations ≥ 1\n.*got: 0"):
+        LearningOptions(max_evaluations=0)
 
 
 def _unchecked(name: str) -> LearningOptions:

@@ -12,7 +12,7 @@ import scipy.optimize
 import torch
 from torch import Tensor
 
-from forcegp.errors import NumericalError, UnknownNameError
+from forcegp.errors import ModelError, NumericalError, UnknownNameError
 
 Objective = Callable[[dict[str, Tensor]], Tensor]
 Progress = Callable[[int, float, dict[str, Tensor]], None]
@@ -52,6 +52,10 @@ class LearningOptions:
     def __post_init__(self) -> None:
         if self.optimizer not in OPTIMIZERS:
             raise UnknownNameError("optimizer", self.optimizer, OPTIMIZERS)
+        if self.max_evaluations < 1:
+            raise ModelError(
+                "learning takes an evaluation", expected="max_evaluations ≥ 1", got=self.max_evaluations
+            )
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,10 @@ class Learned:
     seconds: float
     message: str
     history: list[float] = field(default_factory=list)
+
+
+class _SpentError(Exception):
+    """The evaluations allowed are spent."""
 
 
 class _Recorder:
@@ -150,25 +158,23 @@ def _lbfgs(
         return tensors
 
     def function(x: np.ndarray) -> tuple[float, np.ndarray]:
+        # SciPy counts between iterations only, so a line search would go on beyond the limit.
+        if len(recorder.history) >= options.max_evaluations:
+            raise _SpentError
         value, grads = recorder(unflatten(x))
         flat = torch.cat([grads[key].reshape(-1) for key in shapes])
         return value, flat.to("cpu", torch.float64).numpy()
 
     box = [bounds.get(key, (None, None)) for key, shape in shapes.items() for _ in range(shape.numel())]
-    result = scipy.optimize.minimize(
-        function,
-        torch.cat([value.detach().reshape(-1) for value in start.values()]).cpu().double().numpy(),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=box,
-        options={
-            "maxfun": options.max_evaluations,
-            "maxiter": options.max_evaluations,
-            "ftol": options.tolerance,
-            "gtol": 1e-5,
-            "maxcor": 30,
-        },
-    )
+    x = torch.cat([value.detach().reshape(-1) for value in start.values()]).cpu().double().numpy()
+    limits = {"maxfun": options.max_evaluations, "maxiter": options.max_evaluations}
+    tolerances = {"ftol": options.tolerance, "gtol": 1e-5, "maxcor": 30}
+    try:
+        result = scipy.optimize.minimize(
+            function, x, jac=True, method="L-BFGS-B", bounds=box, options=limits | tolerances
+        )
+    except _SpentError:
+        return False, f"stopped after {options.max_evaluations} evaluations"
     message = result.message if isinstance(result.message, str) else result.message.decode()
     return bool(result.success), message
 
