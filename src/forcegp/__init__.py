@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from forcegp.evaluation import Evaluation, evaluate
     from forcegp.gp.learning import LearningOptions
     from forcegp.gp.mean import AnalyticalMean
-    from forcegp.gp.priors import ContactForcePrior, JointForcePrior, OperatorForcePrior
+    from forcegp.gp.priors import ContactForcePrior, JointForcePrior, NormalForcePrior, OperatorForcePrior
     from forcegp.models.analytical import AnalyticalModel
     from forcegp.models.files import load_model
     from forcegp.models.independent_gp import IndependentGP
@@ -49,6 +49,7 @@ _HOME = {
     "JointForcePrior": "gp.priors",
     "LearningOptions": "gp.learning",
     "NeuralNetwork": "models.neural",
+    "NormalForcePrior": "gp.priors",
     "Observation": "models.observation",
     "OperatorForcePrior": "gp.priors",
     "Plane": "constraints",
@@ -90,6 +91,7 @@ __all__ = [
     "JointForcePrior",
     "LearningOptions",
     "NeuralNetwork",
+    "NormalForcePrior",
     "Observation",
     "OperatorForcePrior",
     "Plane",

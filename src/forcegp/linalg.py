@@ -49,7 +49,7 @@ def cholesky(K: Tensor) -> tuple[Tensor, float]:
 
 
 def cholesky_inverse_(L: Tensor) -> Tensor:
-    """Lower triangle of (L Lᵀ)⁻¹, written over the factor L (LAPACK potri); the upper triangle is undefined."""
+    """Lower triangle of (L Lᵀ)⁻¹, written over the factor L (LAPACK potri); the upper one is undefined."""
     if L.device.type != "cpu":
         return torch.cholesky_inverse(L)
     if L.shape[0] == 0:

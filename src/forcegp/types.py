@@ -1,7 +1,8 @@
 """Shape aliases: every batched quantity has its batch dimensions first, `(*batch, …)`.
 
-The batches of joint vectors broadcast against each other (`*#batch`). `nq` joints, `nf` frames, `m` constraint rows, `n` samples, `d` components. The aliases document shapes
-in signatures; the test suite enforces them at run time.
+The batches of joint vectors broadcast against each other (`*#batch`). `nq` joints, `nf` frames, `m`
+constraint rows, `n` samples, `d` components. The aliases document shapes in signatures; the test suite
+enforces them at run time.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class Textbook:
     def _covariance(self, one: tuple, two: tuple) -> Tensor:
         total = 0.0
         for p, prior in enumerate(self.model.force_priors):
-            k = squared_exponential(sub(self.params, prior.name), one[2][p], two[2][p])
+            k = squared_exponential(sub(self.params, prior.prefix), one[2][p], two[2][p])
             kQ = torch.diag_embed(k.permute(1, 2, 0))
             total = total + torch.einsum("iab,ijbc,jdc->iajd", one[1][p], kQ, two[1][p])
         n, a, m, d = total.shape

@@ -64,6 +64,11 @@ def _add_rows(out: Tensor, W1: Tensor, k: Tensor, W2: Tensor, lower: bool) -> No
         out[i * r : j * r, : n * W2.shape[1]] += (W1[i:j] @ weighted.flatten(2)).flatten(0, 1)
 
 
+def _silent(one: Block, two: Block, p: int) -> bool:
+    """Whether prior p contributes nothing between two blocks."""
+    return not (bool(one.operators[p].any()) and bool(two.operators[p].any()))
+
+
 def cross_gram(
     priors: Sequence[ForcePrior], params: Parameters, blocks1: Sequence[Block], blocks2: Sequence[Block]
 ) -> Tensor:
@@ -72,9 +77,11 @@ def cross_gram(
     like = blocks1[0].target
     K = torch.zeros(starts1[-1], starts2[-1], dtype=like.dtype, device=like.device)
     for p, prior in enumerate(priors):
-        own = sub(params, prior.name)
+        own = sub(params, prior.prefix)
         for g, one in enumerate(blocks1):
             for h, two in enumerate(blocks2):
+                if _silent(one, two, p):
+                    continue
                 k = prior.kernel.covariance(own, one.features[p], two.features[p])
                 part = K[starts1[g] : starts1[g + 1], starts2[h] : starts2[h + 1]]
                 _add_rows(part, one.operators[p], k, two.operators[p], lower=False)
@@ -87,10 +94,12 @@ def gram(priors: Sequence[ForcePrior], params: Parameters, blocks: Sequence[Bloc
     like = blocks[0].target
     K = torch.zeros(starts[-1], starts[-1], dtype=like.dtype, device=like.device)
     for p, prior in enumerate(priors):
-        own = sub(params, prior.name)
+        own = sub(params, prior.prefix)
         for g, one in enumerate(blocks):
             for h in range(g + 1):
                 two = blocks[h]
+                if _silent(one, two, p):
+                    continue
                 k = prior.kernel.covariance(own, one.features[p], two.features[p])
                 part = K[starts[g] : starts[g + 1], starts[h] : starts[h + 1]]
                 _add_rows(part, one.operators[p], k, two.operators[p], lower=g == h)
@@ -139,10 +148,12 @@ def gram_gradient(
         [[torch.zeros_like(W) for W in block.operators] for block in blocks],
     )
     for p, prior in enumerate(priors):
-        own = sub(params, prior.name)
+        own = sub(params, prior.prefix)
         for g, one in enumerate(blocks):
             for h in range(g + 1):
                 two = blocks[h]
+                if _silent(one, two, p):
+                    continue
                 leaves, k = _kernel_with_leaves(prior, own, one.features[p], two.features[p], with_operators)
                 into = (result.operators[g][p], result.operators[h][p]) if with_operators else None
                 dk = _kernel_gradient(
@@ -158,7 +169,7 @@ def gram_gradient(
                     if grad is None:
                         continue
                     if kind == "param":
-                        result.params[f"{prior.name}.{key}"] += grad
+                        result.params[f"{prior.prefix}.{key}"] += grad
                     else:
                         result.features[g if kind == "one" else h][p][key] += grad
     return result

@@ -30,6 +30,8 @@ def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block
     params: dict[str, Tensor] = {}
     like = blocks[0].target
     for p, prior in enumerate(priors):
+        if prior.prefix != prior.name:
+            continue  # The hyperparameters are those of another prior.
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
         scale = _force_scale(p, blocks)
         for name, value in prior.kernel.initial(len(scale), widths).items():

@@ -57,7 +57,7 @@ class PosteriorSamples:
             `(samples, n, components)`, or `(n, components)` where `sample` is given.
         """
         prior = self.posterior.priors[p]
-        own = sub(self.posterior.params, prior.name)
+        own = sub(self.posterior.params, prior.prefix)
         terms = [(self.draws[p].basis(features), self.feature_weights[p])]
         for block, weights in zip(self.posterior.blocks, self.data_weights[p], strict=True):
             terms.append((prior.kernel.covariance(own, features, block.features[p]), weights))
@@ -136,7 +136,7 @@ def draw_samples(
         torch.zeros(len(like), count, dtype=like.dtype, device=like.device),
     )
     for p, prior in enumerate(posterior.priors):
-        draw = prior.kernel.draw(sub(posterior.params, prior.name), features, generator)
+        draw = prior.kernel.draw(sub(posterior.params, prior.prefix), features, generator)
         size = draw.basis(posterior.blocks[0].features[p]).shape
         w = torch.randn(size[0], size[2], count, dtype=torch.float64, generator=generator).to(like)
         rows = [

@@ -61,7 +61,7 @@ class ForcePosterior:
     def kernels_to_data(self) -> list[list[Callable[[Features], Tensor]]]:
         """By prior and block, x ↦ k(x, X)."""
         return [
-            [prior.kernel.towards(sub(self.params, prior.name), block.features[p]) for block in self.blocks]
+            [prior.kernel.towards(sub(self.params, prior.prefix), block.features[p]) for block in self.blocks]
             for p, prior in enumerate(self.priors)
         ]
 
@@ -123,7 +123,7 @@ class ForcePosterior:
         return 0.5 * (covariance + covariance.mT)
 
     def _prior_variance(self, p: int, features: Features) -> Tensor:
-        return self.priors[p].kernel.diagonal(sub(self.params, self.priors[p].name), features)
+        return self.priors[p].kernel.diagonal(sub(self.params, self.priors[p].prefix), features)
 
 
 def posterior(

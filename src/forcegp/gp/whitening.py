@@ -21,6 +21,9 @@ from forcegp.gp.gram import Block
 from forcegp.gp.priors import ForcePrior, Standardization, States, states
 from forcegp.linalg import null_space_basis
 
+VANISHING = 1e-12
+"""Products of two operators below this fraction of their largest entries are zero in exact arithmetic."""
+
 ForceMean = Callable[[ConstrainedSystem, States], Tensor]
 """Prior mean of the joint force Q at states, `(n, nq)`."""
 
@@ -60,8 +63,17 @@ class WhitenedRows:
 def prior_operators(
     priors: Sequence[ForcePrior], system: ConstrainedSystem, at: States, z: AffineMap
 ) -> list[Tensor]:
-    """B(x) E(x) of each prior, from its components to the quantity, `(n, d, components)`."""
-    return [(z.B_z if p.in_contact_only else z.B_Q) @ p.operator(system, at) for p in priors]
+    """B(x) E(x) of each prior, from its components to the quantity, `(n, d, components)`.
+
+    What is zero but for rounding (H Aᵀ) is made exactly zero, so that it costs nothing.
+    """
+    operators = []
+    for prior in priors:
+        B, E = z.B_z if prior.in_contact_only else z.B_Q, prior.operator(system, at)
+        W = B @ E
+        bound = VANISHING * B.abs().amax() * E.abs().amax() if W.numel() else 0.0
+        operators.append(torch.where(W.abs().amax() > bound, W, 0.0) if W.numel() else W)
+    return operators
 
 
 def prior_mean(system: ConstrainedSystem, at: States, z: AffineMap, mean: ForceMean) -> Tensor:

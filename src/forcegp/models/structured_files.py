@@ -70,6 +70,6 @@ def _check(
     for prior, scale in zip(model.force_priors, scales, strict=True):
         widths = {name: x.shape[-1] for name, x in scale.mean.items()}
         for key, value in prior.kernel.initial(prior.outputs(model.system.robot), widths).items():
-            found = hyperparameters[f"{prior.name}.{key}"]
+            found = hyperparameters[f"{prior.prefix}.{key}"]
             if found.shape != value.shape:
-                raise ValueError(f"hyperparameter '{prior.name}.{key}' has shape {tuple(found.shape)}")
+                raise ValueError(f"hyperparameter '{prior.prefix}.{key}' has shape {tuple(found.shape)}")

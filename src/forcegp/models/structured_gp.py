@@ -25,6 +25,7 @@ from forcegp.gp.posterior import ForcePosterior, posterior
 from forcegp.gp.priors import (
     ForcePrior,
     JointForcePrior,
+    NormalForcePrior,
     Standardization,
     States,
     check_priors,
@@ -38,13 +39,20 @@ from forcegp.models.structured_problem import Problem, Training, analytical_para
 from forcegp.models.structured_settings import save_structured
 
 
+def default_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
+    """A joint force prior, with what accelerations do not show left open where there are contacts."""
+    joint = JointForcePrior()
+    return (joint, NormalForcePrior(joint)) if system.m else (joint,)
+
+
 class StructuredGP(Model):
     """A structured Gaussian process (S-GP): priors on the unknown forces of a constrained system.
 
     Args:
         system: robot and contacts.
         mean: `"zero"`, `"analytical"`, or an `AnalyticalMean` with some terms left out.
-        force_priors: priors on the unknown forces; one `JointForcePrior` by default.
+        force_priors: priors on the unknown forces; by default a `JointForcePrior`, and in contact its
+            `NormalForcePrior`, which changes no acceleration and keeps multipliers honest.
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one a joint.
         learn_noise: whether the noise is a hyperparameter too, starting from `noise_std`.
         analytical_parameters: a module whose `forward()` gives the robot with its analytical
@@ -68,7 +76,7 @@ class StructuredGP(Model):
     ) -> None:
         self.system = system
         self.mean = mean_of(mean)
-        self.force_priors = tuple(force_priors) if force_priors is not None else (JointForcePrior(),)
+        self.force_priors = default_priors(system) if force_priors is None else tuple(force_priors)
         self.noise_std = noise_std
         self.learn_noise = learn_noise
         self.analytical_parameters = analytical_parameters

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from forcegp.errors import ModelError
 from forcegp.gp import kernels
-from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior
+from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior, NormalForcePrior
 from forcegp.models.base import not_fitted
 from forcegp.models.folder import Settings, write_model
 
@@ -77,13 +77,24 @@ class ContactPrior(Settings):
         return ContactForcePrior(self.contact, self.kernel.build(), self.inputs, self.name)
 
 
+class NormalPrior(Settings):
+    """A `NormalForcePrior`."""
+
+    type: Literal["normal"] = "normal"
+    like: JointPrior
+
+    def build(self) -> ForcePrior:
+        like = self.like
+        return NormalForcePrior(JointForcePrior(like.kernel.build(), like.inputs, like.periodic, like.name))
+
+
 class StructuredSettings(Settings):
     """What is kept of a structured Gaussian process beside its tensors."""
 
     mean: tuple[str, ...]
     noise_std: float | tuple[float, ...]
     learn_noise: bool
-    priors: tuple[Annotated[JointPrior | ContactPrior, Field(discriminator="type")], ...]
+    priors: tuple[Annotated[JointPrior | ContactPrior | NormalPrior, Field(discriminator="type")], ...]
     measured: tuple[str, ...]
     constant: tuple[tuple[str, ...], ...]
 
@@ -103,15 +114,22 @@ def _kernel_settings(kernel: kernels.Kernel) -> LeafKernel | PairKernel:
     )
 
 
-def _prior_settings(prior: ForcePrior) -> JointPrior | ContactPrior:
+def _joint_settings(prior: JointForcePrior) -> JointPrior:
+    kernel = _kernel_settings(prior.kernel)
+    return JointPrior(name=prior.name, kernel=kernel, inputs=prior.inputs, periodic=prior.periodic)
+
+
+def _prior_settings(prior: ForcePrior) -> JointPrior | ContactPrior | NormalPrior:
     kernel = _kernel_settings(prior.kernel)
     if type(prior) is JointForcePrior:
-        return JointPrior(name=prior.name, kernel=kernel, inputs=prior.inputs, periodic=prior.periodic)
+        return _joint_settings(prior)
+    if type(prior) is NormalForcePrior:
+        return NormalPrior(like=_joint_settings(prior.like))
     if type(prior) is ContactForcePrior:
         return ContactPrior(name=prior.name, contact=prior.contact, kernel=kernel, inputs=prior.inputs)
     raise ModelError(
         f"force prior {prior.name!r} of type {type(prior).__name__} holds Python code and cannot be saved",
-        expected="JointForcePrior or ContactForcePrior",
+        expected="JointForcePrior, NormalForcePrior or ContactForcePrior",
     )
 
 
