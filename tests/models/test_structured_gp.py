@@ -19,6 +19,7 @@ import forcegp
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.errors import DataError, ForceGPError, ModelError, ShapeError, UnknownNameError
 from forcegp.gp.affine import QUANTITIES
+from forcegp.gp.checkpoint import Checkpoint
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
 from forcegp.gp.learning import LearningOptions
 from forcegp.gp.priors import ContactForcePrior, JointForcePrior, OperatorForcePrior
@@ -449,3 +450,82 @@ def test_states_that_do_not_fit_are_refused(model: StructuredGP) -> None:
         model.predict(q, qd, tau, "qddd")
     with pytest.raises(ModelError, match="no quantity is named"):
         model.predict(q, qd, tau, [])
+
+
+class Interrupted(Exception):
+    pass
+
+
+def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, path = logged(two_contacts(), 12), tmp_path / "fit.safetensors"
+    monkeypatch.setattr("forcegp.gp.checkpoint.INTERVAL", 0.0)
+    seen: list[float] = []
+
+    def stop(evaluations: int, most: int, value: float) -> None:
+        seen.append(value)
+        if evaluations == 6:
+            raise Interrupted
+
+    model = forcegp.StructuredGP(two_contacts())
+    with pytest.raises(Interrupted):
+        model.fit(data, progress=stop, checkpoint=path)
+    assert path.is_file()
+    again: list[float] = []
+    model.fit(data, progress=lambda e, m, value: again.append(value), checkpoint=path)
+    assert again[0] == pytest.approx(min(seen), rel=1e-9)
+    assert not path.exists()
+
+
+def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "fit.safetensors"
+    Checkpoint(path, "another").noting(None)(1, 0.0, {"joint.log_std": torch.zeros(7, dtype=torch.float64)})
+    with pytest.raises(ModelError, match="belongs to another fit"):
+        forcegp.StructuredGP(two_contacts()).fit(logged(two_contacts(), 5), checkpoint=path)
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(ModelError, match="damaged"):
+        forcegp.StructuredGP(two_contacts()).fit(logged(two_contacts(), 5), checkpoint=path)
+
+
+def test_warm_start_ends_as_well_and_restarts_no_worse() -> None:
+    data = logged(two_contacts(), 24)
+    cold, warm, many = (
+        forcegp.StructuredGP(two_contacts()).fit(data, options=forcegp.LearningOptions(**options))
+        for options in ({"warm_start": None}, {"warm_start": 8}, {"warm_start": None, "restarts": 1})
+    )
+    assert cold.converged and warm.converged
+    assert warm.objective < cold.objective + 1.0  # a different optimum may be found, not a worse one by much
+    assert many.objective <= cold.objective
+
+
+def test_the_normal_force_prior_changes_multipliers_alone() -> None:
+    data = logged(two_contacts(), 10)
+    joint = forcegp.JointForcePrior()
+    plain = forcegp.StructuredGP(two_contacts(), force_priors=[joint])
+    open_ = forcegp.StructuredGP(two_contacts(), force_priors=[joint, forcegp.NormalForcePrior(joint)])
+    options = forcegp.LearningOptions(max_evaluations=5)
+    plain.fit(data, options=options), open_.fit(data, options=options)
+    for key, value in plain.hyperparameters.items():
+        torch.testing.assert_close(open_.hyperparameters[key], value)
+    state = (data.q, data.qd, data.tau)
+    a, b = plain.predict(*state), open_.predict(*state)
+    torch.testing.assert_close(a.mean, b.mean)
+    torch.testing.assert_close(a.covariance, b.covariance)
+    a, b = plain.predict(*state, "multiplier"), open_.predict(*state, "multiplier")
+    torch.testing.assert_close(a.mean, b.mean)
+    assert bool((b.variance > a.variance).all())
+
+
+def test_contact_data_alone_tell_the_sum_of_two_forces() -> None:
+    """Two priors on the same force cannot be told apart; one on free motion too can."""
+    system = two_contacts()
+    same = forcegp.OperatorForcePrior(
+        "shadow",
+        7,
+        lambda s, at: torch.eye(7, dtype=at.q.dtype).expand(len(at.q), -1, -1),
+        in_contact_only=True,
+    )
+    closed = logged(system, 12, active=torch.ones(12, 2, dtype=torch.bool))
+    model = forcegp.StructuredGP(system, force_priors=[forcegp.JointForcePrior(), same])
+    held = model.fit(closed, options=forcegp.LearningOptions(max_evaluations=2))
+    assert held.force_correlation is not None
+    assert held.force_correlation < -0.2

@@ -17,6 +17,9 @@ from forcegp.errors import ModelError
 from forcegp.files import atomic_file
 from forcegp.gp.learning import Progress
 
+INTERVAL = 10.0
+"""Least time between two writings [s]."""
+
 
 @dataclass
 class Checkpoint:
@@ -27,13 +30,11 @@ class Checkpoint:
     Args:
         path: the file.
         key: what is being learned; a file that was written for something else is refused.
-        seconds: the least time between two writings.
     """
 
     path: Path
     key: str
-    seconds: float = 10.0
-    _written: float = field(default=0.0, init=False)
+    _written: float = field(default=float("-inf"), init=False)
 
     @staticmethod
     def key_of(*values: object) -> str:
@@ -76,7 +77,7 @@ class Checkpoint:
         """A progress callback that writes the best tensors now and then, and calls another."""
 
         def note(evaluations: int, value: float, best: dict[str, Tensor]) -> None:
-            if time.monotonic() - self._written >= self.seconds:
+            if time.monotonic() - self._written >= INTERVAL:
                 self._write(best)
             if progress is not None:
                 progress(evaluations, value, best)

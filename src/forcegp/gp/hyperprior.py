@@ -34,11 +34,8 @@ def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block
             continue  # The hyperparameters are those of another prior.
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
         scale = _force_scale(p, blocks)
-        for name, value in prior.kernel.initial(len(scale), widths).items():
-            value = value.to(like)
-            if name.endswith("_std"):
-                value = value + scale.log().reshape(-1, *[1] * (value.ndim - 1))
-            params[f"{prior.name}.{name}"] = value
+        initial = prior.kernel.initial(len(scale), widths, scale.log().cpu().double())
+        params |= {f"{prior.name}.{name}": value.to(like) for name, value in initial.items()}
     return params
 
 

@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, UnknownNameError
+from forcegp.gp.draws import Features, FourierDraw, FunctionDraw, LinearDraw, ProductDraw, SumDraw, stacked
 
-Features = Mapping[str, Tensor]
 Parameters = Mapping[str, Tensor]
+Initial = dict[str, Tensor]
 
 LARGEST_EXPONENT = 300.0
 """exp(−300) is far below rounding and far above the denormal numbers that slow processors down."""
@@ -33,8 +34,14 @@ class Kernel(ABC):
     """A covariance function of `k` independent outputs."""
 
     @abstractmethod
-    def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
-        """Initial log-hyperparameters for `outputs` outputs and features of the given widths."""
+    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
+        """Initial log-hyperparameters.
+
+        Args:
+            outputs: number of outputs.
+            widths: columns of each feature.
+            log_std: logarithm of the standard deviation of the functions, one or one an output.
+        """
 
     @abstractmethod
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
@@ -59,25 +66,10 @@ class Kernel(ABC):
         return Product(self, other)
 
 
-class FunctionDraw(ABC):
-    """Random functions drawn from a prior; evaluated anywhere."""
-
-    @abstractmethod
-    def basis(self, x: Features) -> Tensor:
-        """φ(x) `(k, n, features)` with E[φ φ′ᵀ] = k(x, x′)."""
-
-
-def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
-    """The named features side by side, `(n, w)`.
-
-    Raises:
-        UnknownNameError: a feature is not given.
-    """
-    names = tuple(x) if inputs is None else inputs
-    for name in names:
-        if name not in x:
-            raise UnknownNameError("kernel input", name, x)
-    return torch.cat([x[name] for name in names], dim=-1)
+def _sides(left: Initial, right: Initial) -> Initial:
+    """The hyperparameters of two kernels in one dictionary."""
+    sides = {"left": left, "right": right}
+    return {f"{side}.{key}": value for side, part in sides.items() for key, value in part.items()}
 
 
 def _width(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
@@ -102,12 +94,12 @@ class _Stationary(Kernel):
 
     inputs: tuple[str, ...] | None = None
 
-    def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
+    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = _width(self.inputs, widths)
         scale = math.log(math.sqrt(width))
         return {
             "log_lengthscale": torch.full((outputs, width), scale, dtype=torch.float64),
-            "log_std": torch.zeros(outputs, dtype=torch.float64),
+            "log_std": torch.zeros(outputs, dtype=torch.float64) + log_std,
         }
 
     @abstractmethod
@@ -141,23 +133,9 @@ class _Stationary(Kernel):
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         lengthscale = params["log_lengthscale"].exp()
         k, width = lengthscale.shape
-        device = lengthscale.device
-        omega = self.frequencies((k, features, width), generator).to(device) / lengthscale[:, None, :]
+        omega = self.frequencies((k, features, width), generator).to(lengthscale) / lengthscale[:, None, :]
         phase = 2.0 * math.pi * torch.rand(k, features, dtype=torch.float64, generator=generator)
-        return _FourierDraw(self.inputs, omega, phase.to(device), params["log_std"].exp())
-
-
-@dataclass(frozen=True)
-class _FourierDraw(FunctionDraw):
-    inputs: tuple[str, ...] | None
-    omega: Tensor
-    phase: Tensor
-    std: Tensor
-
-    def basis(self, x: Features) -> Tensor:
-        angle = stacked(x, self.inputs) @ self.omega.mT + self.phase[:, None, :]
-        scale = self.std * math.sqrt(2.0 / self.phase.shape[-1])
-        return scale[:, None, None] * torch.cos(angle)
+        return FourierDraw(self.inputs, omega, phase.to(lengthscale), params["log_std"].exp())
 
 
 @dataclass(frozen=True)
@@ -213,12 +191,11 @@ class Linear(Kernel):
 
     inputs: tuple[str, ...] | None = None
 
-    def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
+    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = _width(self.inputs, widths)
-        return {
-            "log_slope_std": torch.zeros(outputs, width, dtype=torch.float64),
-            "log_bias_std": torch.zeros(outputs, dtype=torch.float64),
-        }
+        # Standardized inputs have unit variance: every column and the bias get the same share.
+        share = torch.zeros(outputs, dtype=torch.float64) + log_std - 0.5 * math.log(width + 1.0)
+        return {"log_slope_std": share[:, None].repeat(1, width), "log_bias_std": share}
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         slope = params["log_slope_std"].exp()[:, None, :]
@@ -230,18 +207,7 @@ class Linear(Kernel):
         return (scaled * scaled).sum(-1) + torch.exp(2.0 * params["log_bias_std"])[:, None]
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return _LinearDraw(self.inputs, params["log_slope_std"].exp(), params["log_bias_std"].exp())
-
-
-@dataclass(frozen=True)
-class _LinearDraw(FunctionDraw):
-    inputs: tuple[str, ...] | None
-    slope: Tensor
-    bias: Tensor
-
-    def basis(self, x: Features) -> Tensor:
-        scaled = stacked(x, self.inputs) * self.slope[:, None, :]
-        return torch.cat([scaled, self.bias[:, None, None].expand(-1, scaled.shape[1], 1)], dim=-1)
+        return LinearDraw(self.inputs, params["log_slope_std"].exp(), params["log_bias_std"].exp())
 
 
 @dataclass(frozen=True)
@@ -251,13 +217,9 @@ class Sum(Kernel):
     left: Kernel
     right: Kernel
 
-    def initial(self, outputs: int, widths: Mapping[str, int]) -> dict[str, Tensor]:
-        sides = {"left": self.left, "right": self.right}
-        return {
-            f"{side}.{key}": value
-            for side, kernel in sides.items()
-            for key, value in kernel.initial(outputs, widths).items()
-        }
+    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
+        half = log_std - 0.5 * math.log(2.0)
+        return _sides(self.left.initial(outputs, widths, half), self.right.initial(outputs, widths, half))
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         left = self.left.covariance(sub(params, "left"), x1, x2)
@@ -272,24 +234,18 @@ class Sum(Kernel):
         return self.left.diagonal(sub(params, "left"), x) + self.right.diagonal(sub(params, "right"), x)
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return _SumDraw(
+        return SumDraw(
             self.left.draw(sub(params, "left"), features, generator),
             self.right.draw(sub(params, "right"), features, generator),
         )
 
 
 @dataclass(frozen=True)
-class _SumDraw(FunctionDraw):
-    left: FunctionDraw
-    right: FunctionDraw
-
-    def basis(self, x: Features) -> Tensor:
-        return torch.cat([self.left.basis(x), self.right.basis(x)], dim=-1)
-
-
-@dataclass(frozen=True)
 class Product(Sum):
-    """k = k_1 k_2."""
+    """k = k_1 k_2; the second factor starts at unit size."""
+
+    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
+        return _sides(self.left.initial(outputs, widths, log_std), self.right.initial(outputs, widths))
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         left = self.left.covariance(sub(params, "left"), x1, x2)
@@ -315,25 +271,8 @@ class Product(Sum):
                     own = {f"left.{k}": v for k, v in sub(params, f"{side}.{part}").items()}
                     product = Product(getattr(inner, part), getattr(self, other))
                     terms.append(product.draw(own | rest, features, generator))
-                return _SumDraw(terms[0], terms[1])
+                return SumDraw(terms[0], terms[1])
         # Features of the two factors are paired at random, so that their number does not multiply.
         left = self.left.draw(sub(params, "left"), features, generator)
         right = self.right.draw(sub(params, "right"), features, generator)
-        return _ProductDraw(left, right, features, int(torch.randint(2**31, (1,), generator=generator)))
-
-
-@dataclass(frozen=True)
-class _ProductDraw(FunctionDraw):
-    left: FunctionDraw
-    right: FunctionDraw
-    features: int
-    seed: int
-
-    def basis(self, x: Features) -> Tensor:
-        left, right = self.left.basis(x), self.right.basis(x)
-        generator = torch.Generator().manual_seed(self.seed)
-        n_left, n_right = left.shape[-1], right.shape[-1]
-        i = torch.randint(n_left, (self.features,), generator=generator).to(left.device)
-        j = torch.randint(n_right, (self.features,), generator=generator).to(left.device)
-        scale = math.sqrt(n_left * n_right / self.features)
-        return scale * left[..., i] * right[..., j]
+        return ProductDraw(left, right, features, int(torch.randint(2**31, (1,), generator=generator)))

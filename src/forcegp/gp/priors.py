@@ -81,6 +81,11 @@ class ForcePrior(ABC):
     in_contact_only: bool
 
     @property
+    def measurable(self) -> bool:
+        """Whether accelerations in contact or in free motion show the force."""
+        return True
+
+    @property
     def prefix(self) -> str:
         """Prefix of the hyperparameters; another prior's name where they are shared."""
         return self.name
@@ -170,6 +175,10 @@ class NormalForcePrior(ForcePrior):
     @property
     def kernel(self) -> Kernel:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.like.kernel
+
+    @property
+    def measurable(self) -> bool:
+        return False
 
     @property
     def prefix(self) -> str:

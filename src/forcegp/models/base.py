@@ -64,10 +64,14 @@ class FitResult:
         seconds: how long the fit took.
         objective: final value (mean squared error, or negative log posterior of the hyperparameters).
         log_marginal_likelihood: of the training data, `None` for models without one.
-        jitter: added to the covariance's diagonal to factorise it, relative to unit noise.
+        jitter: added to the covariance's diagonal to factorise it, relative to unit noise: the noise that
+            the model works with is √(1 + jitter) times the one that it was told.
         constant_inputs: inputs that do not vary in the training data and were left unscaled.
         message: why the optimiser stopped.
         history: the objective at each evaluation.
+        force_correlation: mean posterior correlation of the joint force Q and the contact's force Q_z at
+            training states: near −1 the data tell their sum only, near 0 they tell both. `None` for
+            models that do not have both.
     """
 
     converged: bool
@@ -79,6 +83,7 @@ class FitResult:
     constant_inputs: tuple[str, ...] = ()
     message: str = ""
     history: tuple[float, ...] = ()
+    force_correlation: float | None = None
 
 
 class Model(ABC):

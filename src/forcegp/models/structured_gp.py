@@ -32,11 +32,15 @@ from forcegp.gp.priors import (
     states,
     states_at,
 )
+from forcegp.gp.separation import force_correlation
 from forcegp.gp.whitening import Measurement
 from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction, not_fitted
 from forcegp.models.observation import NoiseStd, Observation, measurement_of
 from forcegp.models.structured_problem import Problem, Training, analytical_parameters, kernel_parameters
 from forcegp.models.structured_settings import save_structured
+
+CORRELATION_STATES = 50
+"""Training states at which the correlation of Q and Q_z is looked at after a fit."""
 
 
 def default_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
@@ -205,10 +209,11 @@ class StructuredGP(Model):
     def _checkpoint(
         self, path: Path, problem: Problem, options: LearningOptions, start: dict[str, Tensor]
     ) -> Checkpoint:
-        data = [
-            getattr(m, name) for m in problem.training.measurements for name in ("q", "qd", "tau", "values")
-        ]
-        return Checkpoint(path, Checkpoint.key_of(self.mean, self.force_priors, options, list(start), *data))
+        columns = ("q", "qd", "tau", "active", "values")
+        data = [getattr(m, name) for m in problem.training.measurements for name in columns]
+        priors = [(type(prior).__name__, prior.name, prior.kernel) for prior in self.force_priors]
+        settings = (self.mean, priors, options, list(start))
+        return Checkpoint(path, Checkpoint.key_of(*settings, *data, *problem.training.noise_std))
 
     def _adopt(self, problem: Problem, tensors: dict[str, Tensor]) -> None:
         """Keep learned values and condition on the training data."""
@@ -255,7 +260,16 @@ class StructuredGP(Model):
             constant_inputs=tuple(constant),
             message=learned.message,
             history=tuple(learned.history),
+            force_correlation=self._mean_correlation(training),
         )
+
+    @torch.no_grad()
+    def _mean_correlation(self, training: Training) -> float | None:
+        """Mean correlation of Q and Q_z over some of the training states, where both are unknown."""
+        if len({prior.in_contact_only for prior in self.force_priors if prior.measurable}) < 2:
+            return None
+        m = training.thinned(CORRELATION_STATES).measurements[0]
+        return float(force_correlation(self.posterior, self.system, self._states(m)).mean())
 
     # -- prediction -------------------------------------------------------------------------------
 

@@ -147,10 +147,15 @@ class Problem:
         bounds = bounds_of({key: value for key, value in start.items() if key not in analytical})
 
         def run(problem: Problem, begin: dict[str, Tensor], note: Progress | None) -> Learned:
-            def objective(tensors: dict[str, Tensor]) -> Tensor:
-                return problem.objective(tensors, held, start)
+            # The tolerance is relative to the objective: what no hyperparameter changes is left out of it.
+            constant = float(problem.fixed_rows.constant)
 
-            return minimise(objective, begin, options, analytical, bounds, note)
+            def objective(tensors: dict[str, Tensor]) -> Tensor:
+                return problem.objective(tensors, held, start) - constant
+
+            learned = minimise(objective, begin, options, analytical, bounds, note)
+            history = [value + constant for value in learned.history]
+            return dataclasses.replace(learned, value=learned.value + constant, history=history)
 
         saved = checkpoint.read(start) if checkpoint is not None else None
         note = checkpoint.noting(progress) if checkpoint is not None else progress
