@@ -33,8 +33,8 @@ class LearningOptions:
         learning_rate: of ADAM, for the hyperparameters θ_M.
         analytical_learning_rate: of ADAM, for the analytical parameters θ_A.
         patience: evaluations without improvement after which ADAM stops.
-        warm_start: where there are more than twice as many samples, learn on about so many first and go
-            on from there with all; `None` learns on all from the start.
+        warm_start: where there are more than twice as many samples, learn on about so many first, then on
+            twice as many and so on, and at last on all; `None` learns on all from the start.
         restarts: further random starts, of which the best end is kept.
         seed: of the random starts.
     """

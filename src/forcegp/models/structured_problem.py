@@ -162,17 +162,22 @@ class Problem:
         begins = [saved] if saved is not None else self._begins(start, options)
         best: Learned | None = None
         for begin in begins:
-            if (
-                saved is None
-                and options.warm_start is not None
-                and self.training.samples > 2 * options.warm_start
-            ):
-                small = dataclasses.replace(self, training=self.training.thinned(options.warm_start))
+            for samples in [] if saved is not None else self._fewer(options.warm_start):
+                small = dataclasses.replace(self, training=self.training.thinned(samples))
                 begin = run(small, begin, None).tensors
             learned = run(self, begin, note)
             best = learned if best is None or learned.value < best.value else best
         assert best is not None
         return best
+
+    def _fewer(self, first: int | None) -> list[int]:
+        """Numbers of samples to learn on first, each twice the one before, up to half of all."""
+        sizes: list[int] = []
+        size = first
+        while size is not None and self.training.samples > 2 * size:
+            sizes.append(size)
+            size *= 2
+        return sizes
 
     def _begins(self, start: dict[str, Tensor], options: LearningOptions) -> Sequence[dict[str, Tensor]]:
         """The start, and as many random ones around its hyperparameters as there are restarts."""
