@@ -25,14 +25,14 @@ def covariance_blocks(model: StructuredGP, data: Dataset, name: str) -> Covarian
     """
     system, fitted = model.system, model.posterior
     at = states(system, data.q, data.qd, data.tau, data.active(system.contact_names))
-    pairs = list(zip(fitted.priors, fitted.scales, strict=True))
+    # What no acceleration shows, a force along the constraint, is left out of the picture.
+    pairs = [pair for pair in zip(fitted.priors, fitted.scales, strict=True) if pair[0].measurable]
+    priors = [prior for prior, _ in pairs]
     features = tuple(scale.apply(prior.features(system, at)) for prior, scale in pairs)
-    E = tuple(prior.operator(system, at) for prior in fitted.priors)
+    E = tuple(prior.operator(system, at) for prior in priors)
     force = Block(features, E, torch.zeros_like(at.q))
     acceleration = Block(features, tuple(at.eom.H @ operator for operator in E), torch.zeros_like(at.q))
-    k_Q, k_qdd = (
-        cross_gram(fitted.priors, fitted.params, [block], [block]) for block in (force, acceleration)
-    )
+    k_Q, k_qdd = (cross_gram(priors, fitted.params, [block], [block]) for block in (force, acceleration))
     eigenvalues = torch.linalg.eigvalsh(k_qdd)
     return CovarianceData(
         model=name,
