@@ -34,7 +34,7 @@ def test_the_structured_models_differ_in_mean_and_priors() -> None:
     assert (
         [prior.name for prior in zero.force_priors]
         == [prior.name for prior in mean.force_priors]
-        == ["joint"]
+        == ["joint", "joint_normal"]
     )
     assert [prior.name for prior in contact.force_priors] == ["contact_table"]
 
