@@ -26,10 +26,11 @@ $(READY): pyproject.toml constraints.txt
 
 reproduce: $(READY)  ## the main job: simulate, select, train, report
 	$(BIN)/forcegp reproduce --profile $(PROFILE) --out $(OUT)/$(PROFILE)
+	@echo "[reproduce] open $(OUT)/$(PROFILE)/report.html"
 
 test: lint types $(READY)  ## lint, types and tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
-	@echo "[test] all passed: see the summary above"
+	@echo "[test] all passed: lint, types and the tests summed up above"
 
 lint: $(READY)   ## ruff, check and format
 	$(BIN)/ruff check .
@@ -40,7 +41,10 @@ types: $(READY)  ## pyright
 
 benchmark: $(READY)  ## every benchmark, results as JSON under out/benchmarks
 	@mkdir -p $(OUT)/benchmarks
-	@for f in benchmarks/*.py; do $(BIN)/python $$f --json $(OUT)/benchmarks/$$(basename $$f .py).json; done
+	@for name in dynamics inference rollout separation; do \
+	  echo "[benchmark] $$name"; $(BIN)/python benchmarks/$$name.py --json $(OUT)/benchmarks/$$name.json || exit 1; \
+	done
+	@echo "[benchmark] results are in $(OUT)/benchmarks"
 
 clean:           ## remove what the targets made
 	rm -rf $(VENV) $(OUT) build dist .pytest_cache .ruff_cache
