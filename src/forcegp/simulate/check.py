@@ -69,7 +69,8 @@ def check_engine(
         return scale * torch.randn(states, robot.nq, dtype=torch.float64, generator=generator).to(robot.dtype)
 
     with torch.no_grad():
-        q, qd, qdd, force = draw(1.0).clamp(-1.0, 1.0) * math.pi, draw(1.0), draw(5.0), draw(20.0)
+        turns = torch.rand(states, robot.nq, dtype=torch.float64, generator=generator).to(robot.dtype)
+        q, qd, qdd, force = math.pi * (2.0 * turns - 1.0), draw(1.0), draw(5.0), draw(20.0)
         eom = system.equations(q, qd)
         Q_bar = eom.Q_K + force
         free = dynamics.forward_dynamics(robot, q, qd, force)
