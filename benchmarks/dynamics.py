@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from dynamics_peers import Adam, Call, DifferentiableRobotModel, Mujoco, Pinocchio, torch_call
+from results_page import write_section
 from torch import Tensor
 
 import forcegp
@@ -254,16 +255,6 @@ def markdown(result: dict) -> str:
     return "\n".join(lines)
 
 
-def write_section(path: Path, text: str) -> None:
-    """Put the text between the marks of this section, at the end of the file where there are none."""
-    begin, end = "<!-- dynamics: begin -->", "<!-- dynamics: end -->"
-    old = path.read_text(encoding="utf-8") if path.exists() else "# Benchmarks\n"
-    if begin not in old:
-        old = f"{old.rstrip()}\n\n{begin}\n{end}\n"
-    head, tail = old.split(begin)[0], old.split(end)[1]
-    path.write_text(f"{head}{begin}\n{text}\n{end}{tail}", encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="write all figures to this file")
@@ -283,7 +274,7 @@ def main() -> None:
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     if options.docs:
-        write_section(options.docs, markdown(result))
+        write_section(options.docs, "dynamics", markdown(result))
     print(markdown(result))
 
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
+from results_page import table, write_section
 from torch import Tensor
 
 import forcegp
@@ -179,6 +180,46 @@ def fit_and_predict(folder: Path, samples: int, mean: str) -> dict:
     }
 
 
+def markdown(result: dict) -> str:
+    """The section of the page of results."""
+    one = result["likelihood"]
+    rows = [
+        [
+            str(fit["samples"]),
+            f"{fit['fit_seconds']:.1f} ({fit['evaluations']})",
+            "yes" if fit["converged"] else "no",
+            f"{fit['one_mean_ms']:.1f}",
+            f"{fit['one_covariance_ms']:.1f}",
+            f"{fit['thousand_seconds']:.2f}",
+            f"{fit['clean_mae']:.4f}",
+            f"{fit['coverage_noisy']:.3f}",
+            f"{fit['coverage_clean']:.3f}",
+        ]
+        for fit in result["fits"]
+    ]
+    header = ["N", "fit [s] (evaluations)", "converged", "one mean [ms]", "one mean and covariance [ms]"]
+    header += ["1000 means and covariances [s]", "clean error [rad/s²]", "±2 std holds noisy", "clean"]
+    return "\n".join(
+        [
+            "## Inference",
+            "",
+            f"Zero-mean S-GP of the KUKA iiwa on the plane, float64, {result['machine']}, "
+            f"{result['threads']} threads; `python benchmarks/inference.py --json FILE --docs "
+            "docs/benchmarks.md` measures it again.",
+            "",
+            f"One likelihood with gradient at N = {one['samples']}: {one['seconds']:.1f} s and "
+            f"{one['peak_mib']:.0f} MiB, against {one['dense_seconds']:.1f} s and "
+            f"{one['dense_peak_mib']:.0f} MiB for the dense nq·N formula with autograd: "
+            f"{one['speed_ratio']:.1f} times as fast with {100 * one['memory_ratio']:.0f} % of the memory, "
+            f"equal to {one['relative_difference']:.0e} relative.",
+            "",
+            "Whole fits to convergence, and predictions on held-out stretches:",
+            "",
+            table(header, rows),
+        ]
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -188,7 +229,8 @@ def main() -> None:
     parser.add_argument("--no-fits", action="store_true")
     parser.add_argument("--mean", default="zero")
     parser.add_argument("--folder", type=Path, help="where the simulated run is kept, to be used again")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="write all figures to this file")
+    parser.add_argument("--docs", type=Path, help="write the tables into this Markdown file")
     options = parser.parse_args()
     with TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
@@ -205,6 +247,8 @@ def main() -> None:
             print(json.dumps(result["fits"][-1], indent=2), flush=True)
     if options.json is not None:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    if options.docs is not None:
+        write_section(options.docs, "inference", markdown(result))
 
 
 if __name__ == "__main__":

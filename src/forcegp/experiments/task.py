@@ -17,7 +17,6 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, Split, split_by_selection, split_by_stretches
 from forcegp.experiments.profiles import Profile
 from forcegp.experiments.stages import Advance, Stage, Stages
-from forcegp.experiments.threads import one_thread
 from forcegp.files import Header, write_json, write_text
 from forcegp.scene import load_scene
 from forcegp.simulate import SimulationConfig, check_engine, make_engine, simulate
@@ -114,8 +113,7 @@ def make_task(stages: Stages, profile: Profile, seed: int) -> Task:
 
 
 def _simulate(system: ConstrainedSystem, config: SimulationConfig, folder: Path, advance: Advance) -> None:
-    with one_thread():
-        result = simulate(system, config, progress=lambda done, _: advance(done))
+    result = simulate(system, config, progress=lambda done, _: advance(done))
     result.data.write(folder / LOG)
     planned = result.reference
     save_file(

@@ -15,6 +15,7 @@ from forcegp.simulate.control import control_torque, tool_motion
 from forcegp.simulate.engine import Engine, make_engine
 from forcegp.simulate.plan import Plan, make_plan
 from forcegp.simulate.result import Log, SimulationResult, make_result
+from forcegp.simulate.threads import one_thread
 from forcegp.simulate.touch import any_row, contact_forces, land
 
 RUNAWAY_SPEED = 50.0
@@ -56,7 +57,7 @@ def simulate(
     """
     system = system.with_robot(system.robot.to(device="cpu"))
     generator = torch.Generator().manual_seed(config.seed)
-    with torch.no_grad():
+    with torch.no_grad(), one_thread():
         plan = make_plan(system, config, generator)
         with closing(make_engine(system.robot, config.dt, config.engine)) as engine:
             log = _follow(system, config, plan, engine, progress)
