@@ -4,7 +4,7 @@ from forcegp.data.dataset import Dataset, NotLoggedError, RobotMismatchWarning
 from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.header import DataHeader
 from forcegp.data.noise import with_noise
-from forcegp.data.selection import farthest_points, select_points, standardized_inputs
+from forcegp.data.selection import farthest_points, select_points, standardized, standardized_inputs
 from forcegp.data.split import Split, complement, split_by_selection, split_by_stretches
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "select_points",
     "split_by_selection",
     "split_by_stretches",
+    "standardized",
     "standardized_inputs",
     "with_noise",
 ]

@@ -17,7 +17,11 @@ INPUTS = ("q", "qd", "tau")
 
 def standardized_inputs(data: Dataset) -> Float[Tensor, "n d"]:
     """(q, q̇, τ) of each sample with zero mean and unit variance a column; constant columns become zero."""
-    x = torch.cat([getattr(data, name) for name in INPUTS], dim=-1)
+    return standardized(torch.cat([getattr(data, name) for name in INPUTS], dim=-1))
+
+
+def standardized(x: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
+    """Columns with zero mean and unit variance; constant columns become zero."""
     centred = x - x.mean(0)
     # Rounding leaves a constant column a spread of some units in the last place.
     noise = x.abs().amax(0) * torch.finfo(x.dtype).eps * 16.0

@@ -18,6 +18,7 @@ from forcegp.models.base import Model
 from forcegp.models.files import load_model
 from forcegp.models.neural import NeuralNetwork
 from forcegp.models.registry import create
+from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.data import Score
 
 MODEL, FIT, SCORE = "model", "fit.json", "score.json"
@@ -77,21 +78,40 @@ def noise_std_of(task: Task) -> float:
     return noise
 
 
-def fit_model(stages: Stages, task: Task, name: str, split: str, points: int) -> Fit:
-    """Fit a model on the first training points of a split, or take up what was done before."""
+def fit_model(
+    stages: Stages, task: Task, name: str, split: str, points: int, before: Fit | None = None
+) -> Fit:
+    """Fit a model on the first training points of a split, or take up what was done before.
+
+    Args:
+        stages: where it is kept.
+        task: the simulated run.
+        name: of the model.
+        split: where the training points come from.
+        points: how many.
+        before: the same model on fewer points, at whose hyperparameters a structured GP begins.
+    """
+    begins = [] if before is None else [before.stage]
     stage = stages.run(
         f"fit/seed-{task.seed}/{split}/{name}-{points}",
-        lambda folder, advance: _fit(task, name, split, points, folder, advance),
+        lambda folder, advance: _fit(task, name, split, points, before, folder, advance),
         settings={"model": name, "points": points, "noise_std": noise_std_of(task), "seed": task.seed},
-        inputs=[task.simulated, task.selected],
+        inputs=[task.simulated, task.selected, *begins],
     )
     return Fit(name, points, split, task, stage)
 
 
-def _fit(task: Task, name: str, split: str, points: int, folder: Path, advance: Advance) -> None:
+def _fit(
+    task: Task, name: str, split: str, points: int, before: Fit | None, folder: Path, advance: Advance
+) -> None:
     model = make_model(name, task)
     resettable = reset_peak()
-    result = model.fit(task.train(split, points), progress=fit_progress(advance))
+    data, progress = task.train(split, points), fit_progress(advance)
+    smaller = None if before is None else before.load()
+    if isinstance(model, StructuredGP) and isinstance(smaller, StructuredGP):
+        result = model.fit(data, begin=smaller.hyperparameters, progress=progress)
+    else:
+        result = model.fit(data, progress=progress)
     model.save(folder / MODEL)
     memory = peak_memory() if resettable else None
     record = FitRecord(

@@ -8,6 +8,8 @@ from forcegp.errors import UnknownNameError
 
 STRUCTURED = ("sgp-zero", "sgp-mean", "sgp-contact")
 GP_MODELS = ("gp", *STRUCTURED)
+PAPER_KERNELS = ("sgp-zero-se", "sgp-mean-se")
+"""The paper's structured models with its kernel alone."""
 
 
 @dataclass(frozen=True)
@@ -19,6 +21,7 @@ class Profile:
         duration: simulated motion [s].
         seeds: number of simulated runs, each with its own split.
         sizes: training points of the GP models.
+        paper_kernels_up_to: largest size at which the structured GPs have the paper's kernel alone, too.
         main: training points of the GP models in the figures over time.
         baseline_points: training points of the analytical model and the neural networks.
         networks: which networks are trained.
@@ -34,6 +37,7 @@ class Profile:
     duration: float
     seeds: int
     sizes: tuple[int, ...]
+    paper_kernels_up_to: int
     main: int
     baseline_points: int
     networks: tuple[str, ...]
@@ -46,9 +50,16 @@ class Profile:
 
 
 PROFILES = {
-    "quick": Profile("quick", 60.0, 1, (50, 100, 200), 200, 5000, ("nn",), identification_points=100),
+    "quick": Profile("quick", 60.0, 1, (50, 100, 200), 200, 200, 5000, ("nn",), identification_points=100),
     "paper": Profile(
-        "paper", 600.0, 3, (100, 200, 400, 600, 800, 1000), 1000, 10_000, ("nn", "nn-30-20", "nn-200x4")
+        "paper",
+        600.0,
+        3,
+        (100, 200, 400, 600, 800, 1000),
+        400,
+        1000,
+        10_000,
+        ("nn", "nn-30-20", "nn-200x4"),
     ),
 }
 

@@ -12,7 +12,7 @@ import torch
 
 from forcegp.experiments.figures import all_figures
 from forcegp.experiments.fits import Fit, fit_model, noise_std_of, score_fit
-from forcegp.experiments.profiles import GP_MODELS, Profile, profile_of
+from forcegp.experiments.profiles import GP_MODELS, PAPER_KERNELS, Profile, profile_of
 from forcegp.experiments.stages import Progress, Stages, silent
 from forcegp.experiments.task import Task, make_task
 from forcegp.files import write_text
@@ -21,6 +21,8 @@ from forcegp.report.markdown import results_markdown
 from forcegp.report.page import write_page
 
 PAGE, RESULTS, MARKDOWN = "report.html", "results.json", "results.md"
+LARGE = 400
+"""Fits of structured GPs to so many points or more are where those to yet more points begin."""
 PACKAGES = ("forcegp", "torch", "numpy", "scipy", "pybullet", "mujoco", "matplotlib")
 
 
@@ -96,13 +98,19 @@ def run(
 
 
 def _fits(stages: Stages, sizes: Profile, task: Task, splits: list[str]) -> list[Fit]:
-    """Every model on some splits: baselines at one size, GP models at all sizes."""
+    """Every model on some splits: baselines at one size, GP models at all sizes, smaller ones first."""
     fits = []
     for split in splits:
         for name in ("analytical", *sizes.networks):
             fits.append(fit_model(stages, task, name, split, sizes.baseline_points))
+        large: dict[str, Fit] = {}
         for points in sizes.sizes:
-            fits += [fit_model(stages, task, name, split, points) for name in GP_MODELS]
+            models = (*GP_MODELS, *PAPER_KERNELS) if points <= sizes.paper_kernels_up_to else GP_MODELS
+            for name in models:
+                fit = fit_model(stages, task, name, split, points, large.get(name))
+                fits.append(fit)
+                if points >= LARGE:
+                    large[name] = fit
     return fits
 
 

@@ -1,9 +1,10 @@
 """Initial values, bounds and weak priors of the hyperparameters.
 
 Inputs are standardized, so a length-scale of the order of the square root of their number relates
-typical samples. A log-normal prior around that start, four e-folds wide, keeps the length-scales
-of inputs that do not matter from drifting to infinity without deciding those that do. The scale of a
-force starts at the root mean square of the force that explains the training residuals by least squares.
+typical samples. A prior around that start, log-normal with another width on either side, keeps the
+length-scales of inputs that do not matter from drifting to infinity (four e-folds), and asks for evidence
+before a force varies on a scale so short that it can follow the noise (one e-fold). The scale of a force
+starts at the root mean square of the force that explains the training residuals by least squares.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from forcegp.gp.priors import ForcePrior
 LOG_LENGTHSCALE_BOUNDS = (math.log(0.03), math.log(3e4))
 LOG_STD_BOUNDS = (math.log(1e-6), math.log(1e6))
 LOG_NOISE_BOUNDS = (math.log(1e-6), math.log(1e4))
-WIDTH = {"log_lengthscale": 4.0, "log_noise_std": 5.0}
-"""Standard deviation of the log-normal priors, in e-folds; 3 where not named."""
+WIDTH = {"log_lengthscale": (1.0, 4.0), "log_noise_std": (5.0, 5.0)}
+"""Standard deviations of the log-normal priors below and above the start, in e-folds; 3 where not named."""
 
 
 def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block]) -> dict[str, Tensor]:
@@ -56,8 +57,9 @@ def bounds_of(params: Parameters) -> dict[str, tuple[float, float]]:
 
 def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tensor:
     """Σ ½ ((θ − θ_start)/width)², the weak prior on log-hyperparameters up to a constant."""
-    terms = [
-        0.5 * (((value - start[key]) / WIDTH.get(key.rsplit(".", 1)[-1], 3.0)) ** 2).sum()
-        for key, value in params.items()
-    ]
+    terms = []
+    for key, value in params.items():
+        below, above = WIDTH.get(key.rsplit(".", 1)[-1], (3.0, 3.0))
+        apart = value - start[key]
+        terms.append((0.5 * (apart / torch.where(apart < 0.0, below, above)) ** 2).sum())
     return torch.stack(terms).sum()

@@ -187,15 +187,20 @@ class Matern52(_Matern):
 
 @dataclass(frozen=True)
 class Linear(Kernel):
-    """k = Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs."""
+    """k = Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs.
+
+    With `ard=False` all inputs share one σ: fewer hyperparameters to overfit, and no slope that learning
+    takes for zero.
+    """
 
     inputs: tuple[str, ...] | None = None
+    ard: bool = True
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = _width(self.inputs, widths)
         # Standardized inputs have unit variance: every column and the bias get the same share.
         share = torch.zeros(outputs, dtype=torch.float64) + log_std - 0.5 * math.log(width + 1.0)
-        return {"log_slope_std": share[:, None].repeat(1, width), "log_bias_std": share}
+        return {"log_slope_std": share[:, None].repeat(1, width if self.ard else 1), "log_bias_std": share}
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         slope = params["log_slope_std"].exp()[:, None, :]

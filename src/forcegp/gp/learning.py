@@ -41,7 +41,7 @@ class LearningOptions:
 
     optimizer: Literal["lbfgs", "adam"] = "lbfgs"
     max_evaluations: int = 300
-    tolerance: float = 1e-6
+    tolerance: float = 1e-5
     learning_rate: float = 0.2
     analytical_learning_rate: float = 0.2
     patience: int = 50

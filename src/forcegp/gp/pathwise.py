@@ -32,7 +32,7 @@ class PosteriorSamples:
         posterior: what they are drawn from.
         draws: random features of each prior.
         feature_weights: of each prior, `(components, features, samples)`.
-        data_weights: of each prior and block, `(components, n, samples)`.
+        data_weights: of each prior and block, `(components, n, samples)`; none where no row shows the force.
     """
 
     posterior: ForcePosterior
@@ -56,15 +56,18 @@ class PosteriorSamples:
         Returns:
             `(samples, n, components)`, or `(n, components)` where `sample` is given.
         """
-        prior = self.posterior.priors[p]
-        own = sub(self.posterior.params, prior.prefix)
-        terms = [(self.draws[p].basis(features), self.feature_weights[p])]
-        for block, weights in zip(self.posterior.blocks, self.data_weights[p], strict=True):
-            terms.append((prior.kernel.covariance(own, features, block.features[p]), weights))
+        weights = (self.feature_weights[p], *self.data_weights[p])
+        terms = list(zip(self._bases(p, features), weights, strict=True))
         if sample is None:
             return sum((k @ w for k, w in terms[1:]), start=terms[0][0] @ terms[0][1]).permute(2, 1, 0)
         rows = torch.stack([torch.einsum("knj,kjn->nk", k, w[..., sample]) for k, w in terms])
         return rows.sum(0)
+
+    def _bases(self, p: int, features: Features) -> list[Tensor]:
+        """Random features of prior p, and its covariances with the data that show it."""
+        measured = self.posterior.measured[p]
+        kernels = self.posterior.kernels_to_data[p] if measured else []
+        return [self.draws[p].basis(features), *(kernel(features) for kernel in kernels)]
 
     def forces(
         self, system: ConstrainedSystem, at: States, sample: Tensor | None = None
@@ -106,11 +109,9 @@ class PosteriorSamples:
         """
         Q_bar = self.posterior.mean(system, at)
         for p, features in enumerate(self.posterior.features(system, at)):
-            terms = [self.draws[p].basis(features)]
-            terms += [kernel(features) for kernel in self.posterior.kernels_to_data[p]]
             parts = [
                 k.unflatten(1, (self.count, -1)) @ w
-                for k, w in zip(terms, self._weights_by_sample[p], strict=True)
+                for k, w in zip(self._bases(p, features), self._weights_by_sample[p], strict=True)
             ]
             force = sum(parts[1:], start=parts[0])[..., 0].flatten(1).mT
             E = self.posterior.priors[p].operator(system, at)
@@ -155,5 +156,6 @@ def draw_samples(
         own = alpha[first : first + block.rows].unflatten(0, block.target.shape)
         first += block.rows
         for p, W in enumerate(block.operators):
-            data_weights[p].append(torch.einsum("nak,nas->kns", W, own))
+            if posterior.measured[p]:
+                data_weights[p].append(torch.einsum("nak,nas->kns", W, own))
     return PosteriorSamples(posterior, tuple(draws), tuple(weights), tuple(tuple(w) for w in data_weights))

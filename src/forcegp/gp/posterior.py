@@ -67,8 +67,18 @@ class ForcePosterior:
 
     def features(self, system: ConstrainedSystem, at: States) -> tuple[dict[str, Tensor], ...]:
         """Standardized kernel inputs of each prior at states."""
-        pairs = zip(self.priors, self.scales, strict=True)
-        return tuple(scale.apply(prior.features(system, at)) for prior, scale in pairs)
+        return tuple(self.features_of(p, system, at) for p in range(len(self.priors)))
+
+    def features_of(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        """Standardized kernel inputs of prior p at states."""
+        return self.scales[p].apply(self.priors[p].features(system, at))
+
+    @cached_property
+    def measured(self) -> tuple[bool, ...]:
+        """Of each prior, whether any row shows its force; the data change nothing about the others."""
+        return tuple(
+            any(bool(block.operators[p].any()) for block in self.blocks) for p in range(len(self.priors))
+        )
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
         """Posterior mean of the force of prior p, without its prior mean, `(n, components)`."""
@@ -81,16 +91,20 @@ class ForcePosterior:
     def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Posterior mean of Q̄ = m + Σ E f, `(n, nq)`: the force field of a rollout."""
         force = self.mean(system, at)
-        for p, (prior, x) in enumerate(zip(self.priors, self.features(system, at), strict=True)):
-            force = force + (prior.operator(system, at) @ self.latent_mean(p, x)[..., None])[..., 0]
+        for p, prior in enumerate(self.priors):
+            if self.measured[p]:
+                latent = self.latent_mean(p, self.features_of(p, system, at))
+                force = force + (prior.operator(system, at) @ latent[..., None])[..., 0]
         return force
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
         """Posterior mean of a quantity, o + B(m + Σ E f), `(n, d)`."""
         mean = prior_mean(system, at, z, self.mean)
-        operators = prior_operators(self.priors, system, at, z)
-        for p, (W, x) in enumerate(zip(operators, self.features(system, at), strict=True)):
-            mean = mean + (W @ self.latent_mean(p, x)[..., None])[..., 0]
+        for p, prior in enumerate(self.priors):
+            if self.measured[p]:
+                (W,) = prior_operators([prior], system, at, z)
+                latent = self.latent_mean(p, self.features_of(p, system, at))
+                mean = mean + (W @ latent[..., None])[..., 0]
         return mean
 
     def read_covariance(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:

@@ -46,6 +46,11 @@ class Measurement:
     active: Tensor
     values: Tensor
 
+    def __getitem__(self, rows: Tensor) -> Measurement:
+        """The values at some of the states."""
+        parts = (self.q, self.qd, self.tau, self.active, self.values)
+        return Measurement(self.quantity, *(part[rows] for part in parts))
+
 
 @dataclass(frozen=True)
 class WhitenedRows:

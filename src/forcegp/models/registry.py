@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
-from forcegp.gp.kernels import Linear, SquaredExponential
-from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior
+from forcegp.gp.kernels import Kernel
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import Model
+from forcegp.models.default_priors import PAPER, contact_priors, default_priors
 from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.neural import NeuralNetwork
 from forcegp.models.observation import NoiseStd
@@ -43,18 +43,13 @@ def _independent(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **op
     return IndependentGP(system, noise_std=noise_std, **options)
 
 
-def _structured(mean: str) -> Callable[..., Model]:
+def _structured(mean: str, kernel: Kernel | None = None) -> Callable[..., Model]:
     def make(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
-        return StructuredGP(system, mean=mean, noise_std=noise_std, **options)
+        options = {"mean": mean} | options
+        options.setdefault("force_priors", default_priors(system, options["mean"], kernel))
+        return StructuredGP(system, noise_std=noise_std, **options)
 
     return make
-
-
-def contact_priors(system: ConstrainedSystem) -> list[ForcePrior]:
-    """A Cartesian prior on the friction of each contact with a surface, linear in velocity and more."""
-    kernel = Linear(("velocity",)) + SquaredExponential()
-    surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
-    return [ContactForcePrior(name, kernel) for name in surfaces] or [JointForcePrior()]
 
 
 def _contact(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
@@ -68,6 +63,8 @@ MODELS: dict[str, Entry] = {
     "gp": Entry("one Gaussian process per joint acceleration on (q, qd, tau)", _independent),
     "sgp-zero": Entry("structured GP, all joint forces unknown", _structured("zero")),
     "sgp-mean": Entry("structured GP around the analytical forces", _structured("analytical")),
+    "sgp-zero-se": Entry("sgp-zero with the paper's kernel alone", _structured("zero", PAPER)),
+    "sgp-mean-se": Entry("sgp-mean with the paper's kernel alone", _structured("analytical", PAPER)),
     "sgp-contact": Entry("structured GP with mean and a prior on the contact's friction alone", _contact),
 }
 """The models, simplest first."""

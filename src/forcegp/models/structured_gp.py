@@ -6,7 +6,7 @@ q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and likewise for every other quantit
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -22,19 +22,11 @@ from forcegp.gp.learning import Learned, LearningOptions
 from forcegp.gp.mean import AnalyticalMean, mean_of
 from forcegp.gp.pathwise import draw_samples
 from forcegp.gp.posterior import ForcePosterior, posterior
-from forcegp.gp.priors import (
-    ForcePrior,
-    JointForcePrior,
-    NormalForcePrior,
-    Standardization,
-    States,
-    check_priors,
-    states,
-    states_at,
-)
+from forcegp.gp.priors import ForcePrior, Standardization, States, check_priors, states, states_at
 from forcegp.gp.separation import force_correlation
 from forcegp.gp.whitening import Measurement
 from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction, not_fitted
+from forcegp.models.default_priors import default_priors
 from forcegp.models.observation import NoiseStd, Observation, measurement_of
 from forcegp.models.structured_problem import Problem, Training, analytical_parameters, kernel_parameters
 from forcegp.models.structured_settings import save_structured
@@ -43,20 +35,14 @@ CORRELATION_STATES = 50
 """Training states at which the correlation of Q and Q_z is looked at after a fit."""
 
 
-def default_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """A joint force prior, with what accelerations do not show left open where there are contacts."""
-    joint = JointForcePrior()
-    return (joint, NormalForcePrior(joint)) if system.m else (joint,)
-
-
 class StructuredGP(Model):
     """A structured Gaussian process (S-GP): priors on the unknown forces of a constrained system.
 
     Args:
         system: robot and contacts.
         mean: `"zero"`, `"analytical"`, or an `AnalyticalMean` with some terms left out.
-        force_priors: priors on the unknown forces; by default a `JointForcePrior`, and in contact its
-            `NormalForcePrior`, which changes no acceleration and keeps multipliers honest.
+        force_priors: priors on the unknown forces; by default `default_priors`: a `JointForcePrior`, and
+            in contact its `NormalForcePrior`, which changes no acceleration and keeps multipliers honest.
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one a joint.
         learn_noise: whether the noise is a hyperparameter too, starting from `noise_std`.
         analytical_parameters: a module whose `forward()` gives the robot with its analytical
@@ -80,7 +66,7 @@ class StructuredGP(Model):
     ) -> None:
         self.system = system
         self.mean = mean_of(mean)
-        self.force_priors = default_priors(system) if force_priors is None else tuple(force_priors)
+        self.force_priors = default_priors(system, self.mean) if force_priors is None else tuple(force_priors)
         self.noise_std = noise_std
         self.learn_noise = learn_noise
         self.analytical_parameters = analytical_parameters
@@ -97,6 +83,7 @@ class StructuredGP(Model):
         *,
         options: LearningOptions | None = None,
         learn: Iterable[str] | None = None,
+        begin: Mapping[str, Tensor] | None = None,
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
     ) -> FitResult:
@@ -108,6 +95,8 @@ class StructuredGP(Model):
             learn: names of the priors whose hyperparameters are learned; the others keep the values and
                 input scales of an earlier fit (two-stage training). Default all; with none, and no noise
                 or analytical parameter to learn, the model is only conditioned.
+            begin: `hyperparameters` of a model of the same kind, such as one fitted to less data, that
+                learning starts from; by default it starts from fewer samples (`options.warm_start`).
             progress: called after each evaluation.
             checkpoint: file that keeps the best values of a long fit; a fit that finds it goes on from
                 there, and removes it at its end.
@@ -137,7 +126,8 @@ class StructuredGP(Model):
                 progress(evaluations, options.max_evaluations, value)
 
         saved = None if checkpoint is None else self._checkpoint(Path(checkpoint), problem, options, start)
-        learned = problem.solve(start, held, options, report, saved)
+        first = None if begin is None else _beginning(begin, start)
+        learned = problem.solve(start, held, options, report, saved, first)
         self._adopt(problem, {**held, **learned.tensors})
         if saved is not None:
             saved.remove()
@@ -334,6 +324,24 @@ class StructuredGP(Model):
     def save(self, path: str | Path) -> None:
         """Write the model as a folder; `forcegp.load_model` reads it back exactly."""
         save_structured(self, path)
+
+
+def _beginning(begin: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Where learning begins: at given values of what is learned.
+
+    Raises:
+        ModelError: a value is missing, or of another shape.
+    """
+    for key, value in start.items():
+        got = begin[key].shape if key in begin else None
+        if got != value.shape:
+            raise ModelError(
+                f"the hyperparameters to begin with do not fit: {key}",
+                expected=tuple(value.shape),
+                got="none" if got is None else tuple(got),
+                hint="take those of a model with the same priors",
+            )
+    return {key: begin[key].detach().to(value) for key, value in start.items()}
 
 
 def _parts(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> dict[str, slice]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data import farthest_points, standardized
 from forcegp.gp.checkpoint import Checkpoint
 from forcegp.gp.exact import negative_log_likelihood
 from forcegp.gp.hyperprior import bounds_of, initial_hyperparameters, negative_log_prior
@@ -44,15 +46,16 @@ class Training:
         return sum(len(m.q) for m in self.measurements)
 
     def thinned(self, samples: int) -> Training:
-        """About so many samples, evenly spaced over the rows of each measurement."""
-        step = max(1, round(self.samples / samples))
-        thin = tuple(
-            Measurement(
-                m.quantity, *(getattr(m, name)[::step] for name in ("q", "qd", "tau", "active", "values"))
-            )
-            for m in self.measurements
-        )
+        """About so many samples: the farthest points among the states of each measurement."""
+        share = samples / self.samples
+        thin = tuple(m[_spread(m, math.ceil(share * len(m.q)))] for m in self.measurements)
         return dataclasses.replace(self, measurements=thin)
+
+
+def _spread(m: Measurement, count: int) -> Tensor:
+    """Rows of distinct states that are far from each other, at most `count`."""
+    x = standardized(torch.cat([m.q, m.qd, m.tau], dim=-1))
+    return farthest_points(x, min(count, len(x.unique(dim=0))))
 
 
 def kernel_parameters(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -133,6 +136,7 @@ class Problem:
         options: LearningOptions,
         progress: Progress | None = None,
         checkpoint: Checkpoint | None = None,
+        begin: dict[str, Tensor] | None = None,
     ) -> Learned:
         """Learn: on a part of the data first where there is much, from several starts where asked for.
 
@@ -142,6 +146,7 @@ class Problem:
             options: how to learn.
             progress: called after each evaluation on all data.
             checkpoint: where the best values are kept, and taken from if they are there.
+            begin: where to begin on all data; `start` stays the centre of the weak priors.
         """
         analytical = frozenset(key for key in start if key.startswith(ANALYTICAL))
         bounds = bounds_of({key: value for key, value in start.items() if key not in analytical})
@@ -159,13 +164,14 @@ class Problem:
 
         saved = checkpoint.read(start) if checkpoint is not None else None
         note = checkpoint.noting(progress) if checkpoint is not None else progress
-        begins = [saved] if saved is not None else self._begins(start, options)
+        begin = saved if saved is not None else begin
+        begins = self._begins(start, options) if begin is None else [begin]
         best: Learned | None = None
-        for begin in begins:
-            for samples in [] if saved is not None else self._fewer(options.warm_start):
+        for first in begins:
+            for samples in self._fewer(options.warm_start) if begin is None else []:
                 small = dataclasses.replace(self, training=self.training.thinned(samples))
-                begin = run(small, begin, None).tensors
-            learned = run(self, begin, note)
+                first = run(small, first, None).tensors
+            learned = run(self, first, note)
             best = learned if best is None or learned.value < best.value else best
         assert best is not None
         return best

@@ -16,24 +16,34 @@ from forcegp.models.folder import Settings, write_model
 if TYPE_CHECKING:
     from forcegp.models.structured_gp import StructuredGP
 
-LEAVES = {
+STATIONARY = {
     "squared_exponential": kernels.SquaredExponential,
     "matern32": kernels.Matern32,
     "matern52": kernels.Matern52,
-    "linear": kernels.Linear,
 }
 PAIRS = {"sum": kernels.Sum, "product": kernels.Product}
 COLUMNS = ("q", "qd", "tau", "active", "values")
 
 
-class LeafKernel(Settings):
-    """A kernel that reads inputs."""
+class StationaryKernel(Settings):
+    """A kernel of the scaled distance."""
 
-    type: Literal["squared_exponential", "matern32", "matern52", "linear"]
+    type: Literal["squared_exponential", "matern32", "matern52"]
     inputs: tuple[str, ...] | None
 
     def build(self) -> kernels.Kernel:
-        return LEAVES[self.type](self.inputs)
+        return STATIONARY[self.type](self.inputs)
+
+
+class LinearKernel(Settings):
+    """A linear kernel."""
+
+    type: Literal["linear"] = "linear"
+    inputs: tuple[str, ...] | None
+    ard: bool = True
+
+    def build(self) -> kernels.Kernel:
+        return kernels.Linear(self.inputs, self.ard)
 
 
 class PairKernel(Settings):
@@ -47,7 +57,7 @@ class PairKernel(Settings):
         return PAIRS[self.type](self.left.build(), self.right.build())
 
 
-KernelSettings = Annotated[LeafKernel | PairKernel, Field(discriminator="type")]
+KernelSettings = Annotated[StationaryKernel | LinearKernel | PairKernel, Field(discriminator="type")]
 PairKernel.model_rebuild()
 
 
@@ -99,18 +109,21 @@ class StructuredSettings(Settings):
     constant: tuple[tuple[str, ...], ...]
 
 
-def _kernel_settings(kernel: kernels.Kernel) -> LeafKernel | PairKernel:
+def _kernel_settings(kernel: kernels.Kernel) -> StationaryKernel | LinearKernel | PairKernel:
     if isinstance(kernel, kernels.Sum):
         left, right = _kernel_settings(kernel.left), _kernel_settings(kernel.right)
         return PairKernel(
             type="product" if isinstance(kernel, kernels.Product) else "sum", left=left, right=right
         )
-    for name, kind in LEAVES.items():
+    if type(kernel) is kernels.Linear:
+        return LinearKernel(inputs=kernel.inputs, ard=kernel.ard)
+    for name, kind in STATIONARY.items():
         if type(kernel) is kind:
-            inputs = getattr(kernel, "inputs")  # noqa: B009  (every leaf has it)
-            return LeafKernel(type=name, inputs=inputs)  # pyright: ignore[reportArgumentType]
+            inputs = getattr(kernel, "inputs")  # noqa: B009  (every stationary kernel has it)
+            return StationaryKernel(type=name, inputs=inputs)  # pyright: ignore[reportArgumentType]
     raise ModelError(
-        f"a kernel of type {type(kernel).__name__} cannot be saved", expected=", ".join([*LEAVES, *PAIRS])
+        f"a kernel of type {type(kernel).__name__} cannot be saved",
+        expected=", ".join([*STATIONARY, "linear", *PAIRS]),
     )
 
 
