@@ -107,6 +107,8 @@ def write_json(path: str | Path, value: object) -> None:
 class Header(BaseModel):
     """A frozen, versioned JSON header; a subclass names its `FORMAT` and `VERSION` and adds fields.
 
+    Larger text than `MAX_BYTES` is not read; a subclass that holds series of numbers may raise it.
+
     A field that the class does not know is an error: a file that says more than we understand is
     not read as if it said less.
     """
@@ -115,6 +117,7 @@ class Header(BaseModel):
 
     FORMAT: ClassVar[str]
     VERSION: ClassVar[int]
+    MAX_BYTES: ClassVar[int] = MAX_HEADER_BYTES
 
     def to_json(self) -> str:
         """The header as JSON text, format and version first."""
@@ -133,7 +136,7 @@ class Header(BaseModel):
         Raises:
             ForceGPError: of class `error`; the message names the file and the field.
         """
-        fields = _json_object(text, source, error)
+        fields = _json_object(text, source, error, cls.MAX_BYTES)
         name, version = fields.pop("format", None), fields.pop("version", None)
         if name != cls.FORMAT:
             raise error(f"{source} is of another format", expected=cls.FORMAT, got=repr(name))
@@ -154,11 +157,9 @@ class Header(BaseModel):
             ) from cause
 
 
-def _json_object(text: str | bytes, source: str, error: type[ForceGPError]) -> dict[str, Any]:
-    if len(text) > MAX_HEADER_BYTES:
-        raise error(
-            f"{source}: the header is too large", expected=f"at most {MAX_HEADER_BYTES} bytes", got=len(text)
-        )
+def _json_object(text: str | bytes, source: str, error: type[ForceGPError], most: int) -> dict[str, Any]:
+    if len(text) > most:
+        raise error(f"{source}: the header is too large", expected=f"at most {most} bytes", got=len(text))
     try:
         value = json.loads(text)
     except (ValueError, RecursionError) as cause:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior
+from forcegp.models.default_priors import CONTACT_FRICTION, REMAINING
 
 CONTACTS = ("table", "ball")
 NOISE = 0.1
@@ -69,7 +70,11 @@ def logged(
 
 
 def all_priors() -> list[ForcePrior]:
-    return [JointForcePrior(), ContactForcePrior("table"), ContactForcePrior("ball")]
+    return [
+        JointForcePrior(REMAINING),
+        ContactForcePrior("table", CONTACT_FRICTION),
+        ContactForcePrior("ball"),
+    ]
 
 
 def conditioned(

@@ -13,9 +13,23 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.gp.affine import affine_map
-from forcegp.gp.kernels import sub
+from forcegp.gp.kernels import Kernel, Linear, Product, SquaredExponential, Sum, sub
 from forcegp.gp.priors import states
 from forcegp.models.structured_gp import StructuredGP
+
+
+def covariance(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict) -> Tensor:
+    """`(k, n, n')` of squared exponentials and linear kernels, their sums and products (remark 3.2)."""
+    if isinstance(kernel, Sum):
+        left = covariance(kernel.left, sub(params, "left"), x1, x2)
+        right = covariance(kernel.right, sub(params, "right"), x1, x2)
+        return left * right if isinstance(kernel, Product) else left + right
+    a, b = (torch.cat([x[name] for name in kernel.inputs or tuple(x)], dim=-1) for x in (x1, x2))
+    if isinstance(kernel, Linear):
+        slopes, bias = params["log_slope_std"].exp() ** 2, params["log_bias_std"].exp() ** 2
+        return torch.einsum("kd,nd,md->knm", slopes.expand(-1, a.shape[-1]), a, b) + bias[:, None, None]
+    assert isinstance(kernel, SquaredExponential)
+    return squared_exponential(params, a, b)
 
 
 def squared_exponential(params: dict[str, Tensor], x1: Tensor, x2: Tensor) -> Tensor:
@@ -38,10 +52,9 @@ class Textbook:
         self.model, self.params = model, params or model.hyperparameters
         self.system = system or model.system
 
-    def _inputs(self, at: object, p: int) -> Tensor:
+    def _inputs(self, at: object, p: int) -> dict[str, Tensor]:
         prior, scale = self.model.force_priors[p], self.model.training.scales[p]
-        features = scale.apply(prior.features(self.system, at))
-        return torch.cat(list(features.values()), dim=-1)
+        return scale.apply(prior.features(self.system, at))
 
     def _maps(self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor, quantity: str) -> tuple:
         system = self.system
@@ -58,7 +71,7 @@ class Textbook:
     def _covariance(self, one: tuple, two: tuple) -> Tensor:
         total = 0.0
         for p, prior in enumerate(self.model.force_priors):
-            k = squared_exponential(sub(self.params, prior.prefix), one[2][p], two[2][p])
+            k = covariance(prior.kernel, sub(self.params, prior.prefix), one[2][p], two[2][p])
             kQ = torch.diag_embed(k.permute(1, 2, 0))
             total = total + torch.einsum("iab,ijbc,jdc->iajd", one[1][p], kQ, two[1][p])
         n, a, m, d = total.shape

@@ -20,6 +20,8 @@ def test_every_name_makes_its_model() -> None:
         "gp": forcegp.IndependentGP,
         "sgp-zero": forcegp.StructuredGP,
         "sgp-mean": forcegp.StructuredGP,
+        "sgp-zero-se": forcegp.StructuredGP,
+        "sgp-mean-se": forcegp.StructuredGP,
         "sgp-contact": forcegp.StructuredGP,
     }
     for entry in MODELS.values():

@@ -497,6 +497,33 @@ def test_warm_start_ends_as_well_and_restarts_no_worse() -> None:
     assert many.objective <= cold.objective
 
 
+def test_a_fit_begins_at_the_hyperparameters_of_another() -> None:
+    data = logged(two_contacts(), 24)
+    small, large, again = (forcegp.StructuredGP(two_contacts(), "analytical") for _ in range(3))
+    small.fit(data[:12])
+    seen: list[float] = []
+    large.fit(data, begin=small.hyperparameters, progress=lambda e, m, value: seen.append(value))
+    again.fit(data, learn=[])
+    again.hyperparameters = small.hyperparameters
+    again.condition(data)
+    # What is minimised is the likelihood with the weak prior, which is not negative.
+    assert seen[0] > -again.log_marginal_likelihood() and min(seen) < seen[0]
+    missing = {key: value for key, value in small.hyperparameters.items() if "bias" not in key}
+    with pytest.raises(ModelError, match="do not fit: joint.left.left.log_bias_std"):
+        large.fit(data, begin=missing)
+
+
+def test_a_part_of_the_data_has_distinct_states() -> None:
+    data = logged(two_contacts(), 10)
+    model = forcegp.StructuredGP(two_contacts())
+    model.fit(data[torch.arange(10).repeat(3)], learn=[])
+    assert model.training is not None
+    (few,) = model.training.thinned(6).measurements
+    assert len(few.q) == 6 and len(few.q.unique(dim=0)) == 6
+    (all_,) = model.training.thinned(30).measurements
+    assert len(all_.q) == 10
+
+
 def test_the_normal_force_prior_changes_multipliers_alone() -> None:
     data = logged(two_contacts(), 10)
     joint = forcegp.JointForcePrior()

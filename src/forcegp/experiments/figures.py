@@ -14,7 +14,8 @@ from forcegp.experiments.covariance import covariance_blocks
 from forcegp.experiments.fits import Fit, noise_std_of
 from forcegp.experiments.identification import identify_alone, identify_structured
 from forcegp.experiments.multiplier import predicted_multiplier
-from forcegp.experiments.profiles import STRUCTURED, Profile
+from forcegp.experiments.profiles import PAPER_KERNELS, STRUCTURED, Profile
+from forcegp.experiments.rollouts import rollouts
 from forcegp.experiments.stages import Advance, Stages
 from forcegp.experiments.task import Task
 from forcegp.experiments.task_space import task_space_motion
@@ -47,6 +48,7 @@ def all_figures(stages: Stages, sizes: Profile, tasks: Sequence[Task], fits: Seq
         task_space=_task_space(stages, sizes, task),
         windows=[_window(stages, task, fit) for fit in shown],
         identification=_identification(stages, sizes, tasks),
+        rollouts=rollouts(stages, sizes, task, [f for f in shown if f.name not in PAPER_KERNELS]),
     )
 
 

@@ -31,6 +31,9 @@ class Profile:
         multiplier_seconds: length of the multiplier figure [s].
         identification_points: training points of the identification.
         identification_evaluations: iterations of the identification.
+        rollout_seconds: length of the trajectories that are predicted in open loop [s].
+        rollout_starts: states of a further simulated run that they start from.
+        rollout_samples: function samples of their bands.
     """
 
     name: str
@@ -47,10 +50,26 @@ class Profile:
     multiplier_seconds: float = 10.0
     identification_points: int = 200
     identification_evaluations: int = 150
+    rollout_seconds: float = 10.0
+    rollout_starts: int = 16
+    rollout_samples: int = 100
 
 
 PROFILES = {
-    "quick": Profile("quick", 60.0, 1, (50, 100, 200), 200, 200, 5000, ("nn",), identification_points=100),
+    "quick": Profile(
+        "quick",
+        60.0,
+        1,
+        (50, 100, 200),
+        200,
+        200,
+        5000,
+        ("nn",),
+        identification_points=100,
+        rollout_seconds=2.0,
+        rollout_starts=8,
+        rollout_samples=20,
+    ),
     "paper": Profile(
         "paper",
         600.0,

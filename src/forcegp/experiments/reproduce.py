@@ -91,7 +91,8 @@ def run(
     figures = all_figures(stages, sizes, tasks, fits)
     results = _results(sizes, tasks, scores, stages)
     write_text(root / RESULTS, results.to_json())
-    write_text(root / MARKDOWN, results_markdown(results, figures.multiplier, figures.identification))
+    readings = figures.multiplier, figures.identification, figures.rollouts
+    write_text(root / MARKDOWN, results_markdown(results, *readings))
     write_page(root / PAGE, results, figures)
     done = stages.done.values()
     return Reproduction(root / PAGE, results, sum(stage.reused for stage in done), len(done))

@@ -18,7 +18,7 @@ from forcegp.data import Dataset, Split, split_by_selection, split_by_stretches
 from forcegp.experiments.profiles import Profile
 from forcegp.experiments.stages import Advance, Stage, Stages
 from forcegp.files import Header, write_json, write_text
-from forcegp.scene import load_scene
+from forcegp.scene import Scene, load_scene
 from forcegp.simulate import SimulationConfig, check_engine, make_engine, simulate
 
 SCENE = "kuka_plane"
@@ -84,11 +84,10 @@ def make_task(stages: Stages, profile: Profile, seed: int) -> Task:
     scene = load_scene(SCENE)
     system = scene.system()
     config = dataclasses.replace(scene.simulation, duration=profile.duration, seed=seed)
-    scene_text = json.loads(json.dumps(scene.sections.model_dump(mode="json")))
     simulated = stages.run(
         f"simulate/seed-{seed}",
         lambda folder, advance: _simulate(system, config, folder, advance),
-        settings={"scene": scene_text, "simulation": dataclasses.asdict(config)},
+        settings=simulation_settings(scene, config),
         total=config.steps,
     )
     data = Dataset.read(simulated / LOG)
@@ -110,6 +109,12 @@ def make_task(stages: Stages, profile: Profile, seed: int) -> Task:
         simulated=simulated,
         selected=selected,
     )
+
+
+def simulation_settings(scene: Scene, config: SimulationConfig) -> dict[str, object]:
+    """Everything that decides a simulated run, as JSON."""
+    sections = json.loads(json.dumps(scene.sections.model_dump(mode="json")))
+    return {"scene": sections, "simulation": dataclasses.asdict(config)}
 
 
 def _simulate(system: ConstrainedSystem, config: SimulationConfig, folder: Path, advance: Advance) -> None:

@@ -46,7 +46,7 @@ class Training:
         return sum(len(m.q) for m in self.measurements)
 
     def thinned(self, samples: int) -> Training:
-        """About so many samples: the farthest points among the states of each measurement."""
+        """About so many samples: the farthest points among the distinct states of each measurement."""
         share = samples / self.samples
         thin = tuple(m[_spread(m, math.ceil(share * len(m.q)))] for m in self.measurements)
         return dataclasses.replace(self, measurements=thin)

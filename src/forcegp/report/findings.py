@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 from forcegp.report.curves import FLOOR, GP_MODELS
@@ -14,6 +13,9 @@ from forcegp.report.data import (
     Results,
     Score,
 )
+from forcegp.report.finding import Finding
+from forcegp.report.rollout_data import RolloutData
+from forcegp.report.rollout_findings import bands, tip_error
 from forcegp.report.style import label
 from forcegp.report.tables import largest, models_of, pick
 
@@ -27,26 +29,12 @@ CLOSE = 0.15
 """Relative difference up to which two errors count as about the same."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A reading of the numbers.
-
-    Attributes:
-        topic: in a few words.
-        agrees: whether the paper's claim, or ours, is borne out; `None` where none is made.
-        text: the reading, with its numbers.
-    """
-
-    topic: str
-    agrees: bool | None
-    text: str
-
-
 def findings(
     results: Results,
     paper: PaperNumbers,
     multiplier: MultiplierData | None,
     identification: IdentificationData | None,
+    rollouts: RolloutData | None,
 ) -> list[Finding]:
     """All readings that the results allow."""
     found = [
@@ -56,6 +44,7 @@ def findings(
     found += [_residual(results)]
     found += [_multiplier(multiplier)] if multiplier and multiplier.bands else []
     found += [_identification(identification)] if identification and identification.runs else []
+    found += [tip_error(rollouts), bands(rollouts)] if rollouts else []
     return [finding for finding in found if finding is not None]
 
 

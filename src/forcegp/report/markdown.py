@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from forcegp.report.data import IdentificationData, MultiplierData, Results, paper_numbers
 from forcegp.report.findings import findings
+from forcegp.report.rollout_data import RolloutData
+from forcegp.report.rollouts import rollout_table
 from forcegp.report.tables import (
     Table,
     curve_table,
@@ -18,13 +20,17 @@ VERDICT = {True: " (borne out)", False: " (differs)", None: ""}
 
 
 def results_markdown(
-    results: Results, multiplier: MultiplierData | None, identification: IdentificationData | None
+    results: Results,
+    multiplier: MultiplierData | None,
+    identification: IdentificationData | None,
+    rollouts: RolloutData | None,
 ) -> str:
     """The numbers of a reproduction beside the paper's, as Markdown.
 
     Args:
         results: the scores.
         multiplier, identification: of the figures, for the readings.
+        rollouts: predicted trajectories, for the readings and a table.
     """
     paper = paper_numbers()
     parts = [
@@ -33,7 +39,7 @@ def results_markdown(
         "## What the numbers say",
         "\n".join(
             f"- **{f.topic}**{VERDICT[f.agrees]}. {f.text}"
-            for f in findings(results, paper, multiplier, identification)
+            for f in findings(results, paper, multiplier, identification, rollouts)
         ),
         "## Errors",
         markdown_table(error_table(results, paper)),
@@ -42,6 +48,7 @@ def results_markdown(
         "## Uncertainty, constraint, cost",
         markdown_table(quality_table(results)),
         markdown_table(residual_table(results, paper)),
+        *(["## Trajectories", markdown_table(rollout_table(rollouts))] if rollouts else []),
         "## The runs",
         markdown_table(simulation_table(results)),
         markdown_table(settings_table(results)),

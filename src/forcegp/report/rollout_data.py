@@ -81,6 +81,8 @@ class RolloutData(Header):
         tip: logged x, y and z of the tip [m].
         multiplier: logged λ of the first contact [N]; empty where it is not logged.
         starts: number of starts that medians are over.
+        band_starts: number of starts that coverages are over.
+        band_seconds: time that they, and the bands, are over [s].
         level: part of the samples that bands hold.
         horizons: times of `ModelPath.errors` [s].
         models: one a model.
@@ -90,12 +92,15 @@ class RolloutData(Header):
     """
 
     FORMAT: ClassVar[str] = "forcegp-rollout"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
+    MAX_BYTES: ClassVar[int] = 1 << 24
 
     t: Series
     tip: list[Series]
     multiplier: Series
     starts: int
+    band_starts: int
+    band_seconds: float
     level: float
     horizons: Series
     models: list[ModelPath]
@@ -120,6 +125,8 @@ def rollout_data(found: Comparison) -> RolloutData:
         tip=[series(x) for x in found.tip[0].T],
         multiplier=[] if logged is None else series(logged[0, :, 0]),
         starts=len(found.q),
+        band_starts=len(found.q),
+        band_seconds=float(found.t[-1]),
         level=LEVEL,
         horizons=horizons,
         models=[_model_path(found, name, horizons) for name in found.predicted],
@@ -127,6 +134,28 @@ def rollout_data(found: Comparison) -> RolloutData:
         bodies=joints[0].shape[1],
         films=films,
     )
+
+
+def with_bands(paths: RolloutData, bands: RolloutData) -> RolloutData:
+    """Trajectories of mean functions, with what function samples say of the same models and first start.
+
+    Bands cost as many trajectories as there are samples, so that they may be of fewer starts and less time.
+
+    Args:
+        paths: tip errors, drift and multiplier over the whole time.
+        bands: of the same models, in the same order.
+    """
+    models = [_with_bands(*pair) for pair in zip(paths.models, bands.models, strict=True)]
+    seconds = {"band_starts": bands.starts, "band_seconds": bands.band_seconds}
+    return paths.model_copy(update={"models": models, **seconds})
+
+
+def _with_bands(path: ModelPath, band: ModelPath) -> ModelPath:
+    drifts = [x.worst_drift for x in (path, band) if x.worst_drift is not None]
+    times = [x.diverged_at for x in (path, band) if x.diverged_at is not None]
+    names = ("tip_bands", "multiplier_band", "lost", "coverage")
+    worst = {"worst_drift": max(drifts, default=None), "diverged_at": min(times, default=None)}
+    return path.model_copy(update={name: getattr(band, name) for name in names} | worst)
 
 
 def _model_path(found: Comparison, name: str, horizons: list[float]) -> ModelPath:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
-from importlib.resources import files
+import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from markupsafe import Markup
@@ -13,9 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.files import write_text
+from forcegp.report.animation import animation, animation_source
+from forcegp.report.data import Series
 from forcegp.report.html import FigureBlock, render
-from forcegp.report.rollout_data import ModelPath, RolloutData
-from forcegp.report.style import INK, Picture, colour, draw, label
+from forcegp.report.rollout_data import Band, ModelPath, RolloutData
+from forcegp.report.style import INK, Picture, colour, draw, label, line
 from forcegp.report.tables import Table
 
 WIDTH = 4.6
@@ -28,18 +28,7 @@ def draw_tip(data: RolloutData) -> Picture:
     def paint(figure: Figure) -> None:
         for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
             for path in data.models:
-                t, shown = data.t[: len(path.tip[axis])], colour(path.model)
-                if path.tip_bands:
-                    band = path.tip_bands[axis]
-                    axes.fill_between(
-                        data.t[: len(band.lower)],
-                        band.lower,
-                        band.upper,
-                        color=shown,
-                        alpha=0.25,
-                        linewidth=0,
-                    )
-                axes.plot(t, path.tip[axis], color=shown, label=label(path.model))
+                _curve(axes, data, path, path.tip[axis], path.tip_bands[axis] if path.tip_bands else None)
             axes.plot(data.t, data.tip[axis], color=INK, linestyle=(0, (4, 1.5)), label="simulated")
             span = max(data.tip[axis]) - min(data.tip[axis])
             middle = 0.5 * (max(data.tip[axis]) + min(data.tip[axis]))
@@ -59,8 +48,8 @@ def draw_tip_error(data: RolloutData) -> Picture:
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         for path in data.models:
-            error = [max(e, 1e-9) for e in path.tip_error]
-            axes.plot(data.t[1 : len(error)], error[1:], color=colour(path.model), label=label(path.model))
+            # All start at no error, which has no place on a logarithmic scale.
+            _curve(axes, data, path, [max(e, 1e-9) if i else math.nan for i, e in enumerate(path.tip_error)])
         axes.set_yscale("log")
         axes.set_xlabel("time [s]")
         axes.set_ylabel("tip error [m]")
@@ -78,8 +67,7 @@ def draw_drift(data: RolloutData) -> Picture:
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         for path in shown:
-            error = [max(abs(c), 1e-16) for c in path.drift]
-            axes.plot(data.t[: len(error)], error, color=colour(path.model), label=label(path.model))
+            _curve(axes, data, path, [max(abs(c), 1e-16) for c in path.drift])
         axes.set_yscale("log")
         axes.set_xlabel("time [s]")
         axes.set_ylabel("|c(q)| [m]")
@@ -95,19 +83,19 @@ def draw_drift(data: RolloutData) -> Picture:
 def draw_contact_force(data: RolloutData) -> Picture:
     """The multiplier along predicted trajectories with its band, and the probability of lost contact."""
     shown = [path for path in data.models if path.multiplier]
-    losing = [path for path in shown if path.lost]
+    losing = [path for path in shown if any(path.lost)]
 
     def paint(figure: Figure) -> None:
         panels = figure.subplots(2 if losing else 1, 1, sharex=True, squeeze=False)[:, 0]
         for path in shown:
-            _paint_multiplier(panels[0], data, path)
+            _curve(panels[0], data, path, path.multiplier, path.multiplier_band)
         if data.multiplier:
             panels[0].plot(data.t, data.multiplier, color=INK, linestyle=(0, (4, 1.5)), label="simulated")
             top = max(data.multiplier)
             panels[0].set_ylim(min(0.0, min(data.multiplier)) - 0.2 * top, 1.6 * top)
         panels[0].set_ylabel("multiplier λ [N]")
         for path in losing:
-            panels[1].plot(data.t[: len(path.lost)], path.lost, color=colour(path.model))
+            _curve(panels[1], data, path, path.lost)
             panels[1].set_ylabel("P(contact lost)")
             panels[1].set_ylim(-0.03, 1.03)
         panels[-1].set_xlabel("time [s]")
@@ -118,12 +106,13 @@ def draw_contact_force(data: RolloutData) -> Picture:
     return draw(paint, (WIDTH, 3.8 if losing else 2.8), alt, "Contact force along the way")
 
 
-def _paint_multiplier(axes: Axes, data: RolloutData, path: ModelPath) -> None:
-    band, shown = path.multiplier_band, colour(path.model)
+def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band: Band | None = None) -> None:
+    """Values of a model over time in its style, with their band as far as it goes."""
+    style = {"color": colour(path.model), "linestyle": line(path.model)}
     if band is not None:
         t = data.t[: len(band.lower)]
-        axes.fill_between(t, band.lower, band.upper, color=shown, alpha=0.25, linewidth=0)
-    axes.plot(data.t[: len(path.multiplier)], path.multiplier, color=shown, label=label(path.model))
+        axes.fill_between(t, band.lower, band.upper, color=style["color"], alpha=0.25, linewidth=0)
+    axes.plot(data.t[: len(values)], values, label=label(path.model), **style)
 
 
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
@@ -138,60 +127,53 @@ def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
 
 def rollout_table(data: RolloutData) -> Table:
     """Tip errors at the horizons, coverage of the bands and largest drift."""
-    heads = ("model", *(f"after {h:g} s [mm]" for h in data.horizons), "in band", "largest drift [m]")
+    heads = ("model", *(f"after {h:g} s [mm]" for h in data.horizons), "in band", "largest |c(q)| [m]")
     rows = []
     for path in data.models:
         errors = ["diverged" if e is None else f"{1e3 * e:.3g}" for e in path.errors]
         coverage = "–" if path.coverage is None else f"{path.coverage:.3f}"
         drift = "–" if path.worst_drift is None else f"{path.worst_drift:.1e}"
         rows.append((label(path.model), *errors, coverage, drift))
-    caption = f"Tip error in open loop (median over {data.starts} starts), and {data.level:.0%} bands"
+    caption = f"Tip error in open loop (median over {data.starts} starts)"
+    if any(path.coverage is not None for path in data.models):
+        caption += (
+            f"; share of simulated tip positions in the {data.level:.0%} bands over function samples "
+            f"({data.band_starts} starts, {data.band_seconds:.3g} s)"
+        )
     return Table(caption, heads, tuple(rows))
 
 
-def animation(data: RolloutData) -> Markup:
-    """The arm in motion: a canvas with a slider and a play button, drawn by a script of its own."""
-    films = [
-        {
-            "label": "simulated" if film.label == "logged" else label(film.label),
-            "colour": INK if film.label == "logged" else colour(film.label),
-            "points": film.points,
-        }
-        for film in data.films
-    ]
-    content = {"times": data.frame_times, "bodies": data.bodies, "films": films}
-    # "</" would end the script element, whatever it stands in.
-    text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
-    return Markup(
-        '<figure class="animation"><canvas width="920" height="560" role="img" '
-        'aria-label="The arm moving: simulated in black, predicted in colour"></canvas>'
-        '<p><button type="button">Play</button> <input type="range" min="0" value="0" step="1" '
-        'aria-label="time"> <output></output></p>'
-        f'<script type="application/json">{text}</script><script>{_script()}</script></figure>'
-    )
+@dataclass(frozen=True)
+class RolloutSection:
+    """The section on trajectories, of any page.
+
+    Attributes:
+        block: the figures under their caption.
+        table: tip errors, coverage and drift.
+        animation: the arm in motion.
+        script: the animation's script, as the page's content security policy is to name it.
+    """
+
+    block: FigureBlock
+    table: Table
+    animation: Markup
+    script: str
 
 
-def animation_source() -> str:
-    """The animation's script as a page's content security policy names it: by its hash."""
-    digest = hashlib.sha256(_script().encode()).digest()
-    return "sha256-" + base64.b64encode(digest).decode()
-
-
-def _script() -> str:
-    return (files("forcegp.report") / "templates" / "animation.js").read_text(encoding="utf-8")
-
-
-def rollout_block(data: RolloutData) -> FigureBlock:
-    """The figures of the section under their caption."""
-    band = f" with the band that holds {data.level:.0%} of the function samples" if _sampled(data) else ""
-    return FigureBlock(
-        "Trajectories predicted in open loop",
+def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
+    """The section on trajectories; `source` is the file with the data, beside the page."""
+    band = ""
+    if any(path.tip_bands for path in data.models):
+        band = (
+            f" with the band that holds {data.level:.0%} of the function samples ({data.band_seconds:.3g} s)"
+        )
+    caption = (
         f"From a logged state and the logged torques, {data.t[-1]:.3g} s ahead: simulated in black, "
         f"predicted in colour{band}. Errors are medians over {data.starts} starts. A curve ends where its "
-        "prediction diverged.",
-        rollout_pictures(data),
-        DATA,
+        "prediction diverged."
     )
+    block = FigureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
+    return RolloutSection(block, rollout_table(data), animation(data), animation_source())
 
 
 def write_rollouts(folder: Path, title: str, data: RolloutData) -> Path:
@@ -205,21 +187,9 @@ def write_rollouts(folder: Path, title: str, data: RolloutData) -> Path:
     Returns:
         The path of the page.
     """
-    block = rollout_block(data)
-    for i, picture in enumerate(block.pictures):
+    section = rollout_section(data)
+    for i, picture in enumerate(section.block.pictures):
         write_text(folder / f"rollout-{i + 1}.svg", picture.svg)
     write_text(folder / DATA, data.to_json())
-    text = render(
-        "rollout.html.j2",
-        title=title,
-        table=rollout_table(data),
-        blocks=(block,),
-        animation=animation(data),
-        script=animation_source(),
-    )
-    write_text(folder / PAGE, text)
+    write_text(folder / PAGE, render("rollout.html.j2", title=title, section=section))
     return folder / PAGE
-
-
-def _sampled(data: RolloutData) -> bool:
-    return any(path.tip_bands for path in data.models)

@@ -22,6 +22,8 @@ COLOURS = {
 }
 """One colour a model, told apart by colour-blind readers and on paper."""
 MARKERS = {"analytical": "x", "nn": "v", "gp": "s", "sgp-zero": "o", "sgp-mean": "D", "sgp-contact": "^"}
+DASHES = {"nn-30-20": (1.0, 1.2), "nn-200x4": (5.0, 1.5, 1.0, 1.5)}
+"""Lengths of dashes and gaps of the networks that share a colour with the first, in line widths."""
 OTHER = "#555555"
 INK = "#222222"
 FAINT = "#b8b8b8"
@@ -97,6 +99,11 @@ def label(model: str) -> str:
 def colour(model: str) -> str:
     """The colour of a model."""
     return COLOURS.get(model, COLOURS["nn"] if model.startswith("nn") else OTHER)
+
+
+def line(model: str) -> str | tuple[float, tuple[float, ...]]:
+    """The line style of a model, for curves of several models in one panel."""
+    return (0.0, DASHES[model]) if model in DASHES else "-"
 
 
 def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, title: str = "") -> Picture:

@@ -9,6 +9,18 @@
   let turn = -2.2, lift = 0.45, frame = 0, playing = false, started = 0, dragged = null;
   slider.max = frames - 1;
 
+  // The legend: a box for each arm that shows or hides it, and a note where its prediction has ended.
+  const boxes = [], notes = [];
+  data.films.forEach((film) => {
+    const name = document.createElement("label"), box = document.createElement("input");
+    const note = document.createElement("span");
+    box.type = "checkbox"; box.checked = true; box.onchange = () => draw();
+    name.style.color = film.colour;
+    name.append(box, " " + film.label, note);
+    figure.querySelector(".films").append(name, " ");
+    boxes.push(box); notes.push(note);
+  });
+
   // Orthographic view from a direction (turn, lift), in metres about the middle of the arm.
   const first = data.films[0].points;
   let reach = 0.3;
@@ -39,18 +51,20 @@
     }
     data.films.forEach((film, index) => {
       const shown = Math.min(frame, film.points.length / size - 1);
+      notes[index].textContent = shown < frame ? " (diverged)" : "";
+      if (!boxes[index].checked) return;
       const at = (f, b) => view(...film.points.slice(f * size + 3 * b, f * size + 3 * b + 3));
       const trail = [];
       for (let f = Math.max(0, shown - 60); f <= shown; f++) trail.push(at(f, data.bodies - 1));
       const arm = Array.from({ length: data.bodies }, (_, b) => at(shown, b));
       pen.globalAlpha = shown < frame ? 0.25 : 1;
       line(trail, film.colour, 1.5);
+      pen.setLineDash(film.dash);
       line(arm, film.colour, index ? 3 : 7);
+      pen.setLineDash([]);
       pen.fillStyle = film.colour;
       arm.forEach(([x, y]) => { pen.beginPath(); pen.arc(x, y, index ? 3 : 5, 0, 7); pen.fill(); });
       pen.globalAlpha = 1;
-      pen.font = "16px sans-serif";
-      pen.fillText(film.label + (shown < frame ? " (diverged)" : ""), 16, 26 + 22 * index);
     });
     slider.value = frame;
     clock.textContent = data.times[frame].toFixed(2) + " s";
