@@ -11,26 +11,35 @@ from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, pro
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset
-    from forcegp.rollout import Rollout
+    from forcegp.models.base import Model
+    from forcegp.rollout import Rollout, RolloutOptions
+
+
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the page.")]
+Start = Annotated[int, typer.Option(min=0, help="Row of the data to start from.")]
+Duration = Annotated[
+    float | None, typer.Option(help="Time to roll out in seconds; default: to the end of the trajectory.")
+]
+Samples = Annotated[int, typer.Option(min=0, help="Functions to draw from the model's posterior.")]
+Stabilization = Annotated[str, typer.Option(help="none, baumgarte or projection.")]
+Method = Annotated[str, typer.Option(help="semi_implicit_euler, rk4, rk45 or dop853.")]
+Unilateral = Annotated[
+    bool, typer.Option("--unilateral", help="Let contacts open where they would pull, and close again.")
+]
+Seed = Annotated[int, typer.Option(help="Seed of the samples.")]
 
 
 def rollout(
     model: ModelFolder,
     data: DataFile,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the page.")],
-    start: Annotated[int, typer.Option(min=0, help="Row of the data to start from.")] = 0,
-    duration: Annotated[
-        float | None, typer.Option(help="Time to roll out in seconds; default: to the end of the trajectory.")
-    ] = None,
-    samples: Annotated[int, typer.Option(min=0, help="Functions to draw from the model's posterior.")] = 0,
-    stabilization: Annotated[str, typer.Option(help="none, baumgarte or projection.")] = "baumgarte",
-    method: Annotated[
-        str, typer.Option(help="semi_implicit_euler, rk4, rk45 or dop853.")
-    ] = "semi_implicit_euler",
-    unilateral: Annotated[
-        bool, typer.Option("--unilateral", help="Let contacts open where they would pull, and close again.")
-    ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the samples.")] = 0,
+    out: Out,
+    start: Start = 0,
+    duration: Duration = None,
+    samples: Samples = 0,
+    stabilization: Stabilization = "baumgarte",
+    method: Method = "semi_implicit_euler",
+    unilateral: Unilateral = False,
+    seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
     """Simulate forward with a model, from a logged state and under the logged torques.
@@ -46,44 +55,61 @@ def rollout(
     forcegp rollout -m model/ -d run.parquet --start 2400 --samples 50 -o rollout/
     """
     from forcegp.models.files import load_model
-    from forcegp.report.rollout_data import rollout_data
-    from forcegp.report.rollouts import write_rollouts
-    from forcegp.rollout import RolloutOptions, beside_log
+    from forcegp.rollout import RolloutOptions
 
     regression = load_model(model)
     log = _stretch(data_of_robot(read_data(data), regression.system.robot), start, duration)
-    dt = float((log.t[-1] - log.t[0]) / (len(log) - 1))
-    with progress_bar("rolling out", len(log) - 1) as progress:
-        path = regression.rollout(
+    options = RolloutOptions(_period(log), method, stabilization, unilateral, on_divergence="keep")
+    path = _roll(regression, log, options, samples, seed)
+    rolled, file = _as_data(path, log, options.dt), out / "rollout.parquet"
+    rolled.with_step(f"rolled out by the model in {model} from row {start}").write(file)
+    page = _write_page(out, f"Model {model} rolled out on {data}", regression.kind, path, log, options.dt)
+    show({**_figures(path, rolled, options.dt), "page": str(page), "file": str(file)}, as_json)
+
+
+def _period(log: Dataset) -> float:
+    return float((log.t[-1] - log.t[0]) / (len(log) - 1))
+
+
+def _roll(regression: Model, log: Dataset, options: RolloutOptions, samples: int, seed: int) -> Rollout:
+    """From the first state of the log under its torques, to its end."""
+    steps = len(log) - 1
+    with progress_bar("rolling out", steps) as progress:
+        return regression.rollout(
             log.q[0],
             log.qd[0],
             log.tau,
-            duration=dt * (len(log) - 1),
+            duration=options.dt * steps,
             samples=samples,
             seed=seed,
             active=log.active(regression.system.contact_names)[0],
-            options=RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep"),
+            options=options,
             progress=progress,
         )
-    length = len(path.t) if not path.diverged else round(path.diverged[0].t / dt) + 1
-    file = out / "rollout.parquet"
-    _as_data(path, log, length).with_step(f"rolled out by the model in {model} from row {start}").write(file)
-    error = (path.q[:length] - log.q[:length]).abs()
+
+
+def _write_page(out: Path, title: str, name: str, path: Rollout, log: Dataset, dt: float) -> Path:
+    from forcegp.report.rollout_data import rollout_data
+    from forcegp.report.rollouts import write_rollouts
+    from forcegp.rollout import beside_log
+
+    return write_rollouts(out, title, rollout_data(beside_log(name, path, log, dt)))
+
+
+def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:
+    """What the command reports, up to where the prediction diverged."""
+    error = (rolled.q - rolled.q_logged).abs()
     figures: dict[str, object] = {
-        "duration_s": dt * (length - 1),
+        "duration_s": dt * (len(rolled) - 1),
         "largest_joint_error": float(error.max()),
         "joint_error_at_the_end": float(error[-1].max()),
         "diverged": path.diverged[0].reason if path.diverged else "no",
     }
     if path.c.shape[-1]:
-        figures["largest_constraint_error_m"] = float(path.drift[:length].abs().max())
+        figures["largest_constraint_error_m"] = float(path.drift[: len(rolled)].abs().max())
     for event in path.events:
         figures[f"{event.contact}_{'closes' if event.closed else 'opens'}_s"] = event.t
-    title = f"Model {model} rolled out on {data}"
-    figures["page"] = str(
-        write_rollouts(out, title, rollout_data(beside_log(regression.kind, path, log, dt)))
-    )
-    show({**figures, "file": str(file)}, as_json)
+    return figures
 
 
 def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
@@ -108,8 +134,9 @@ def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
     return own
 
 
-def _as_data(path: Rollout, log: Dataset, length: int) -> Dataset:
-    """The rolled-out motion as a data set beside the log that it started from."""
+def _as_data(path: Rollout, log: Dataset, dt: float) -> Dataset:
+    """The rolled-out motion as a data set beside the log that it started from, up to where it diverged."""
+    length = len(path.t) if not path.diverged else round(path.diverged[0].t / dt) + 1
     extras = {"q_logged": log.q[:length], "qd_logged": log.qd[:length]}
     if path.samples is not None:
         extras["q_std"] = path.samples.q[:, :length].std(dim=0)

@@ -77,6 +77,17 @@ class SumDraw(FunctionDraw):
 
 
 @dataclass(frozen=True)
+class OuterDraw(FunctionDraw):
+    """All pairs of the features of two factors."""
+
+    left: FunctionDraw
+    right: FunctionDraw
+
+    def basis(self, x: Features) -> Tensor:
+        return (self.left.basis(x)[..., :, None] * self.right.basis(x)[..., None, :]).flatten(-2)
+
+
+@dataclass(frozen=True)
 class ProductDraw(FunctionDraw):
     """Features of two factors, paired at random so that their number does not multiply."""
 

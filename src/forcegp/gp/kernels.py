@@ -16,13 +16,25 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.draws import Features, FourierDraw, FunctionDraw, LinearDraw, ProductDraw, SumDraw, stacked
+from forcegp.gp.draws import (
+    Features,
+    FourierDraw,
+    FunctionDraw,
+    LinearDraw,
+    OuterDraw,
+    ProductDraw,
+    SumDraw,
+    stacked,
+)
 
 Parameters = Mapping[str, Tensor]
 Initial = dict[str, Tensor]
 
 LARGEST_EXPONENT = 300.0
 """exp(−300) is far below rounding and far above the denormal numbers that slow processors down."""
+
+LINEAR_PAIRS = 8
+"""How many times fewer random features a factor of a product has where the other one is linear."""
 
 
 def sub(params: Parameters, prefix: str) -> dict[str, Tensor]:
@@ -277,6 +289,13 @@ class Product(Sum):
                     product = Product(getattr(inner, part), getattr(self, other))
                     terms.append(product.draw(own | rest, features, generator))
                 return SumDraw(terms[0], terms[1])
+        if isinstance(self.left, Linear) or isinstance(self.right, Linear):
+            # A linear factor has few features and all of them matter, so the other one is given fewer.
+            few = max(1, features // LINEAR_PAIRS)
+            return OuterDraw(
+                self.left.draw(sub(params, "left"), few, generator),
+                self.right.draw(sub(params, "right"), few, generator),
+            )
         # Features of the two factors are paired at random, so that their number does not multiply.
         left = self.left.draw(sub(params, "left"), features, generator)
         right = self.right.draw(sub(params, "right"), features, generator)

@@ -23,6 +23,9 @@ from forcegp.gp.priors import States
 FEATURES = 1024
 """Random features an output; the covariance of the prior draws errs by about 1/√FEATURES of its scale."""
 
+UNMEASURED = 4
+"""How many times fewer of them a prior has whose force no row shows."""
+
 
 @dataclass(frozen=True, eq=False)
 class PosteriorSamples:
@@ -137,7 +140,9 @@ def draw_samples(
         torch.zeros(len(like), count, dtype=like.dtype, device=like.device),
     )
     for p, prior in enumerate(posterior.priors):
-        draw = prior.kernel.draw(sub(posterior.params, prior.prefix), features, generator)
+        # The data do not correct what no row shows: its prior need be no better than its hyperparameters.
+        own = features if posterior.measured[p] else max(1, features // UNMEASURED)
+        draw = prior.kernel.draw(sub(posterior.params, prior.prefix), own, generator)
         size = draw.basis(posterior.blocks[0].features[p]).shape
         w = torch.randn(size[0], size[2], count, dtype=torch.float64, generator=generator).to(like)
         rows = [

@@ -35,7 +35,6 @@ from forcegp.report.tables import (
     simulation_table,
 )
 
-
 ROLLOUTS = "stages/figures/rollouts/data.json"
 """Where a reproduction keeps the data of its trajectories."""
 
@@ -145,7 +144,7 @@ def _task_space(data: TaskSpaceData) -> FigureBlock:
     )
 
 
-def _predictions(windows: Sequence[WindowData]) -> FigureBlock:
+def _predictions(windows: list[WindowData]) -> FigureBlock:
     seconds = f"{windows[0].t[-1] - windows[0].t[0]:.1f} s" if windows else ""
     return FigureBlock(
         "Figure 4: predictions",
@@ -157,7 +156,7 @@ def _predictions(windows: Sequence[WindowData]) -> FigureBlock:
     )
 
 
-def _errors(windows: Sequence[WindowData]) -> FigureBlock:
+def _errors(windows: list[WindowData]) -> FigureBlock:
     limit = common_limit(windows)
     return FigureBlock(
         "Figure 5: errors of the predictions",
