@@ -16,6 +16,7 @@ from forcegp.report.data import (
     WindowData,
 )
 from forcegp.report.page import FigureData
+from forcegp.report.rollout_data import Band, Film, ModelPath, RolloutData
 
 T = [i / 240 for i in range(72)]
 JOINTS = [f"joint_{i}" for i in range(1, 8)]
@@ -116,6 +117,56 @@ def identification(mass: float = 2.001, offset: float = 2e-4) -> IdentificationD
     return IdentificationData(true_mass=2.0, points=100, runs=runs)
 
 
+def model_path(model: str, error: float | None, coverage: float | None = None) -> ModelPath:
+    """A trajectory whose tip error after 0.5 and 1 s is given [m]; one without an error has diverged."""
+    near = [Band(lower=[-0.1] * len(T), upper=[0.1] * len(T))]
+    forces = coverage is not None
+    return ModelPath(
+        model=model,
+        tip=waves(3, 0.1),
+        tip_bands=near * 3 if forces else [],
+        tip_error=[1e-3 * t for t in T],
+        drift=[1e-5 * t for t in T],
+        multiplier=[45.0] * len(T) if forces else [],
+        multiplier_band=Band(lower=[44.0] * len(T), upper=[46.0] * len(T)) if forces else None,
+        lost=[0.0] * len(T) if forces else [],
+        errors=[0.001, error],
+        coverage=coverage,
+        worst_drift=1e-4,
+        diverged_at=0.9 if error is None else None,
+    )
+
+
+def rollouts(*models: ModelPath) -> RolloutData:
+    """Trajectories that bear the aims out unless models are given."""
+    good = (
+        model_path("analytical", 0.5),
+        model_path("nn", None),
+        model_path("gp", 0.3),
+        model_path("sgp-zero", 0.2, 0.85),
+        model_path("sgp-mean", 0.03, 0.9),
+        model_path("sgp-contact", 0.004, 0.96),
+    )
+    shown = models or good
+    return RolloutData(
+        t=T,
+        tip=waves(3, 0.1),
+        multiplier=[45.0] * len(T),
+        starts=4,
+        band_starts=2,
+        band_seconds=0.5,
+        level=0.9,
+        horizons=[0.5, 1.0],
+        models=list(shown),
+        frame_times=[0.0, 0.1],
+        bodies=2,
+        films=[
+            Film(label=name, points=[0.0, 0.0, 0.0, 0.4, 0.1 * i, 0.5] * 2)
+            for i, name in enumerate(("logged", *(path.model for path in shown)))
+        ],
+    )
+
+
 def figures() -> FigureData:
     """The data of all figures."""
     eye = [[float(i == j) for j in range(14)] for i in range(14)]
@@ -132,4 +183,5 @@ def figures() -> FigureData:
         ),
         windows=[window("nn", std=False), window("sgp-mean")],
         identification=identification(),
+        rollouts=rollouts(),
     )  # fmt: skip

@@ -7,18 +7,23 @@ from pathlib import Path
 import pytest
 import torch
 
+from forcegp.data import Dataset
 from forcegp.errors import DataError, UnknownNameError
 from forcegp.experiments.figures import DATA
 from forcegp.experiments.profiles import Profile, profile_of
 from forcegp.experiments.reproduce import Reproduction, run
+from forcegp.experiments.task import LOG
+from forcegp.report.animation import animation_source
 from forcegp.report.data import CovarianceData, MultiplierData, Results, WindowData
 from forcegp.report.findings import RESIDUAL
+from forcegp.report.rollout_data import RolloutData
 
 TEN_SECONDS = Profile(
     "test",
     duration=10.0,
     seeds=1,
     sizes=(40,),
+    paper_kernels_up_to=0,
     main=40,
     baseline_points=200,
     networks=("nn",),
@@ -27,6 +32,9 @@ TEN_SECONDS = Profile(
     multiplier_seconds=3.0,
     identification_points=30,
     identification_evaluations=30,
+    rollout_seconds=1.0,
+    rollout_starts=2,
+    rollout_samples=3,
 )
 
 pytestmark = pytest.mark.slow
@@ -105,6 +113,32 @@ def test_windows_of_all_models_are_the_same_samples(made: Reproduction) -> None:
     assert len(windows) == 6
     assert all(w.t == windows[0].t and w.measured == windows[0].measured for w in windows)
     assert windows[0].t[-1] - windows[0].t[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_trajectories_of_all_models_start_where_an_unseen_motion_is(made: Reproduction) -> None:
+    path = folder(made) / "rollouts" / DATA
+    data = RolloutData.from_json(path.read_bytes(), str(path), DataError)
+    assert [p.model for p in data.models] == ["analytical", "nn", "gp", "sgp-zero", "sgp-mean", "sgp-contact"]
+    assert data.horizons == [0.5, 1.0] and (data.starts, data.band_starts) == (2, 2)
+    assert len(data.tip[0]) == len(data.t) == 241
+    seen = Dataset.read(made.page.parent / "stages" / "simulate" / "seed-3" / LOG)
+    unseen = Dataset.read(made.page.parent / "stages" / "simulate" / "rollout" / LOG)
+    assert not torch.equal(seen.q[:240], unseen.q[:240])
+    for model in data.models:
+        # The tip is a robot's own, and the analytical model has learned the figures of its robot.
+        assert model.tip_error[0] < 1e-3
+        structured = model.model.startswith("sgp")
+        assert (model.coverage is not None) == structured == bool(model.tip_bands)
+        if structured:
+            assert model.worst_drift is not None and model.worst_drift < 5e-3
+            assert len(model.tip_bands[0].lower) == len(data.t)
+
+
+def test_results_and_page_have_the_trajectories(made: Reproduction) -> None:
+    assert "| after 1 s [mm] |" in (made.page.parent / "results.md").read_text(encoding="utf-8")
+    text = made.page.read_text(encoding="utf-8")
+    assert "Trajectories predicted in open loop" in text and "Tip error of trajectories" in text
+    assert "<canvas" in text and f"script-src '{animation_source()}'" in text
 
 
 def test_profiles_are_found_by_name() -> None:

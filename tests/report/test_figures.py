@@ -13,8 +13,9 @@ from forcegp.report.curves import draw_identification, draw_learning_curve, draw
 from forcegp.report.data import SPLITS, paper_numbers
 from forcegp.report.motion import draw_constraint, draw_multiplier, draw_path, draw_task_space
 from forcegp.report.predictions import common_limit, draw_errors, draw_predictions
+from forcegp.report.rollouts import rollout_pictures
 from forcegp.report.style import COLOURS, LABELS, Picture, colour
-from report_samples import MODELS, figures, identification, multiplier, results, window
+from report_samples import MODELS, figures, identification, multiplier, results, rollouts, window
 
 KINDS = ("noisy", "clean")
 
@@ -36,6 +37,7 @@ def all_pictures() -> list[Picture]:
         *(draw_learning_curve(results(), paper, split, kind) for split in SPLITS for kind in KINDS),
         draw_residual(results(), paper, "stretches"),
         *draw_identification(identification()),
+        *rollout_pictures(rollouts()),
     ]  # fmt: skip
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
 import re
 import shutil
 import subprocess
@@ -53,7 +56,7 @@ def test_the_page_refers_to_nothing_outside_itself(page: Path) -> None:
     found.feed(text)
     assert found.addresses and all(a.startswith(("data:", "#")) for a in found.addresses)
     assert found.undescribed == 0
-    assert not {"script", "iframe", "object", "base"} & set(found.tags)
+    assert not {"iframe", "object", "base"} & set(found.tags)
     style = re.search(r"<style>(.*?)</style>", text, re.S)
     assert style and "url(" not in style.group(1) and "@import" not in style.group(1)
 
@@ -68,10 +71,20 @@ def test_the_page_has_every_figure_of_the_paper_and_every_model(page: Path) -> N
         "Figure 5",
         "Learning curves",
         "Identification",
+        "Trajectories predicted in open loop",
+        "The arm in motion",
     ):
         assert heading in text
     for model in ("Analytical model", "Neural network", "S-GP, zero mean", "S-GP, mean and contact prior"):
         assert model in text
+
+
+def test_the_policy_lets_the_script_of_the_animation_run_and_no_other(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    scripts = re.findall(r"<script>(.*?)</script>", text, re.S)
+    assert len(scripts) == 1
+    digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
+    assert f"{POLICY}; script-src 'sha256-{digest}'\"" in text
 
 
 def test_text_from_outside_is_escaped(tmp_path: Path) -> None:
@@ -85,17 +98,22 @@ def test_text_from_outside_is_escaped(tmp_path: Path) -> None:
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.slow
 def test_a_browser_shows_the_page_without_complaint(page: Path, tmp_path: Path) -> None:
-    # The frame gives the page a narrow screen, and writes what it measured into its own title.
+    # The frame gives the page a narrow screen, plays its animation, and writes down what it measured.
     frame = tmp_path / "frame.html"
+    # "</" would end the frame's own script.
+    held = json.dumps(page.read_text(encoding="utf-8")).replace("</", "<\\/")
     frame.write_text(
         f'<iframe id="f" style="width:{NARROW}px;height:800px" srcdoc=""></iframe>'
         '<p id="out">waiting</p><script>'
         'const f = document.getElementById("f");'
         "f.onload = () => { const d = f.contentDocument, r = d.documentElement;"
         "const broken = [...d.images].filter(i => !i.complete || i.naturalWidth === 0).length;"
+        'const films = d.querySelectorAll(".films input"), play = d.querySelector("button");'
+        "films[1].click(); play.click();"
         'document.getElementById("out").textContent ='
-        "`measured width=${r.scrollWidth} images=${d.images.length} broken=${broken}`; };"
-        f"f.srcdoc = {page.read_text(encoding='utf-8')!r};</script>".replace("</style>", "<\\/style>"),
+        "`measured width=${r.scrollWidth} images=${d.images.length} broken=${broken}`"
+        " + ` films=${films.length} shown=${films[1].checked} button=${play.textContent}`; };"
+        f"f.srcdoc = {held};</script>",
         encoding="utf-8",
     )
     done = subprocess.run(
@@ -103,10 +121,11 @@ def test_a_browser_shows_the_page_without_complaint(page: Path, tmp_path: Path) 
          "--virtual-time-budget=5000", "--dump-dom", frame.as_uri()],
         capture_output=True, text=True, timeout=120, check=True,
     )  # fmt: skip
-    measured = re.search(r"measured width=(\d+) images=(\d+) broken=(\d+)", done.stdout)
+    measured = re.search(r"measured width=(\d+) images=(\d+) broken=(\d+) (.*?)</p>", done.stdout)
     assert measured, done.stdout[-300:]
-    width, images, broken = (int(value) for value in measured.groups())
+    width, images, broken = (int(value) for value in measured.groups()[:3])
     assert width <= NARROW and images >= 15 and broken == 0
+    assert measured.group(4) == "films=7 shown=false button=Pause"
     # The page's own policy forbids requests, so that an attempt to fetch anything is a console message.
     assert "CONSOLE" not in done.stderr
     assert POLICY in page.read_text(encoding="utf-8")

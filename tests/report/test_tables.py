@@ -6,10 +6,14 @@ import pytest
 
 from forcegp.report.curves import FLOOR
 from forcegp.report.data import paper_numbers
-from forcegp.report.findings import Finding, findings
+from forcegp.report.finding import Finding
+from forcegp.report.findings import findings
 from forcegp.report.markdown import results_markdown
+from forcegp.report.rollout_data import with_bands
+from forcegp.report.rollout_findings import bands, tip_error
+from forcegp.report.rollouts import rollout_table
 from forcegp.report.tables import curve_table, error_table, number
-from report_samples import band, identification, multiplier, results, score
+from report_samples import band, identification, model_path, multiplier, results, rollouts, score
 
 PAPER = paper_numbers()
 
@@ -17,7 +21,7 @@ PAPER = paper_numbers()
 def reading(topic: str, *args: object) -> Finding:
     """The finding on a topic."""
     made = args or (results(), multiplier(), identification())
-    found = findings(made[0], PAPER, made[1], made[2])  # type: ignore[arg-type]
+    found = findings(made[0], PAPER, made[1], made[2], rollouts())  # type: ignore[arg-type]
     return next(f for f in found if f.topic.startswith(topic))
 
 
@@ -91,8 +95,8 @@ def test_a_zero_mean_is_not_held_to_the_multiplier() -> None:
 
 
 def test_markdown_has_every_reading_and_whole_tables() -> None:
-    text = results_markdown(results(), multiplier(), identification())
-    for finding in findings(results(), PAPER, multiplier(), identification()):
+    text = results_markdown(results(), multiplier(), identification(), rollouts())
+    for finding in findings(results(), PAPER, multiplier(), identification(), rollouts()):
         assert finding.text in text
     widths = {}
     for line in text.splitlines():
@@ -106,6 +110,49 @@ def test_markdown_has_every_reading_and_whole_tables() -> None:
 @pytest.mark.parametrize("missing", ["gp", "sgp-zero"])
 def test_a_missing_model_leaves_out_its_readings_only(missing: str) -> None:
     kept = [s for s in results().scores if s.model != missing]
-    found = findings(results(kept), PAPER, multiplier(), identification())
+    found = findings(results(kept), PAPER, multiplier(), identification(), None)
     assert not any(f.topic.startswith("GP against") for f in found) or missing != "gp"
     assert any(f.topic == "Constraint" for f in found)
+
+
+def test_tip_errors_are_held_against_every_model_that_learns_no_forces() -> None:
+    good = tip_error(rollouts())
+    assert good is not None and good.agrees
+    assert "GP 300 mm, ratio 0.1;" in good.text and "Neural network, 80 diverged, ratio 0" in good.text
+    others = model_path("analytical", 0.5), model_path("gp", 0.3)
+    worse = tip_error(rollouts(*others, model_path("sgp-mean", 0.07, 0.9)))
+    assert worse is not None and worse.agrees is False and "ratio 0.23" in worse.text
+    gone = tip_error(rollouts(*others, model_path("sgp-mean", None, 0.9)))
+    assert gone is not None and gone.agrees is False and "S-GP, analytical mean diverged" in gone.text
+    assert tip_error(rollouts().model_copy(update={"horizons": [0.5]})) is None
+
+
+def test_bands_that_hold_too_little_or_too_much_are_named() -> None:
+    good = bands(rollouts())
+    assert good is not None and good.agrees and "0.850" in good.text
+    both = bands(rollouts(model_path("sgp-mean", 0.1, 0.7), model_path("sgp-contact", 0.1, 0.99)))
+    assert both is not None and both.agrees is False
+    assert "outside: S-GP, analytical mean, S-GP, mean and contact prior." in both.text
+    assert bands(rollouts(model_path("analytical", 0.1))) is None
+
+
+def test_the_rollout_table_has_errors_coverage_and_drift() -> None:
+    table = rollout_table(rollouts())
+    assert "2 starts, 0.5 s" in table.caption
+    rows = {row[0]: row[1:] for row in table.rows}
+    assert rows["Neural network, 80"] == ("1", "diverged", "–", "1.0e-04")
+    assert rows["S-GP, analytical mean"] == ("1", "30", "0.900", "1.0e-04")
+    plain = rollout_table(rollouts(model_path("analytical", 0.1)))
+    assert "bands" not in plain.caption
+
+
+def test_bands_of_fewer_starts_join_the_errors_of_more() -> None:
+    bare = model_path("sgp-mean", 0.05).model_copy(update={"worst_drift": 3e-4})
+    sampled = model_path("sgp-mean", None, 0.9)
+    paths = rollouts(bare).model_copy(update={"starts": 16})
+    joined = with_bands(paths, rollouts(sampled).model_copy(update={"starts": 5, "band_seconds": 0.25}))
+    assert (joined.starts, joined.band_starts, joined.band_seconds) == (16, 5, 0.25)
+    model = joined.models[0]
+    assert model.errors == bare.errors and model.tip == bare.tip
+    assert model.tip_bands == sampled.tip_bands and model.coverage == 0.9
+    assert model.worst_drift == 3e-4 and model.diverged_at == 0.9
