@@ -130,8 +130,9 @@ def test_trajectories_of_all_models_start_where_an_unseen_motion_is(made: Reprod
         structured = model.model.startswith("sgp")
         assert (model.coverage is not None) == structured == bool(model.tip_bands)
         if structured:
-            assert model.worst_drift is not None and model.worst_drift < 5e-3
             assert len(model.tip_bands[0].lower) == len(data.t)
+        # Nothing holds models of accelerations on the surface.
+        assert (max(abs(c) for c in model.drift) < 1e-3) == (model.model not in ("nn", "gp"))
 
 
 def test_results_and_page_have_the_trajectories(made: Reproduction) -> None:

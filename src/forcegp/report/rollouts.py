@@ -23,7 +23,7 @@ PAGE, DATA = "rollout.html", "rollout.json"
 
 
 def draw_tip(data: RolloutData) -> Picture:
-    """Position of the tip over time by axis, logged and predicted, with bands over samples."""
+    """Position of the tip by axis, logged and predicted, for as long as there are bands over samples."""
 
     def paint(figure: Figure) -> None:
         for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
@@ -34,11 +34,11 @@ def draw_tip(data: RolloutData) -> Picture:
             middle = 0.5 * (max(data.tip[axis]) + min(data.tip[axis]))
             axes.set_ylim(middle - max(span, 0.02), middle + max(span, 0.02))
             axes.set_ylabel(f"{'xyz'[axis]} [m]")
-            axes.margins(x=0.0)
+            axes.set_xlim(0.0, data.band_seconds)
         figure.axes[-1].set_xlabel("time [s]")
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
-    alt = f"Tip position over {data.t[-1]:.3g} s by axis, simulated and predicted in open loop by each model."
+    alt = f"Tip position over {data.band_seconds:.3g} s by axis, simulated and predicted in open loop by each model."
     return draw(paint, (WIDTH, 5.0), alt, "Position of the tip")
 
 
@@ -48,8 +48,7 @@ def draw_tip_error(data: RolloutData) -> Picture:
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         for path in data.models:
-            # All start at no error, which has no place on a logarithmic scale.
-            _curve(axes, data, path, [max(e, 1e-9) if i else math.nan for i, e in enumerate(path.tip_error)])
+            _curve(axes, data, path, _logarithmic(path.tip_error, 1e-9))
         axes.set_yscale("log")
         axes.set_xlabel("time [s]")
         axes.set_ylabel("tip error [m]")
@@ -67,7 +66,7 @@ def draw_drift(data: RolloutData) -> Picture:
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         for path in shown:
-            _curve(axes, data, path, [max(abs(c), 1e-16) for c in path.drift])
+            _curve(axes, data, path, _logarithmic(path.drift, 1e-16))
         axes.set_yscale("log")
         axes.set_xlabel("time [s]")
         axes.set_ylabel("|c(q)| [m]")
@@ -99,7 +98,7 @@ def draw_contact_force(data: RolloutData) -> Picture:
             panels[1].set_ylabel("P(contact lost)")
             panels[1].set_ylim(-0.03, 1.03)
         panels[-1].set_xlabel("time [s]")
-        panels[-1].margins(x=0.0)
+        panels[-1].set_xlim(0.0, data.band_seconds)
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
     alt = "Multiplier along the predicted trajectories, with bands over samples, beside the simulated one."
@@ -113,6 +112,11 @@ def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band:
         t = data.t[: len(band.lower)]
         axes.fill_between(t, band.lower, band.upper, color=style["color"], alpha=0.25, linewidth=0)
     axes.plot(data.t[: len(values)], values, label=label(path.model), **style)
+
+
+def _logarithmic(values: Series, least: float) -> Series:
+    """Sizes for a logarithmic scale; the first is of the logged state that the prediction starts from."""
+    return [math.nan, *(max(abs(value), least) for value in values[1:])]
 
 
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
@@ -162,14 +166,12 @@ class RolloutSection:
 
 def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
     """The section on trajectories; `source` is the file with the data, beside the page."""
-    band = ""
-    if any(path.tip_bands for path in data.models):
-        band = (
-            f" with the band that holds {data.level:.0%} of the function samples ({data.band_seconds:.3g} s)"
-        )
+    band = f" with the band that holds {data.level:.0%} of the function samples"
+    sampled = any(path.tip_bands for path in data.models)
     caption = (
-        f"From a logged state and the logged torques, {data.t[-1]:.3g} s ahead: simulated in black, "
-        f"predicted in colour{band}. Errors are medians over {data.starts} starts. A curve ends where its "
+        f"From a logged state and the logged torques, {data.t[-1]:.3g} s ahead: simulated in black, predicted "
+        f"in colour{band if sampled else ''}. Position and contact force are shown for the first "
+        f"{data.band_seconds:.3g} s. Errors are medians over {data.starts} starts. A curve ends where its "
         "prediction diverged."
     )
     block = FigureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)

@@ -45,7 +45,7 @@ class SimulationConfig:
     max_acceleration: float = 4.0
     lift_probability: float = 0.0
     lift_height: tuple[float, float] = (0.02, 0.1)
-    pressing_force: tuple[float, float] = (40.0, 50.0)
+    pressing_force: tuple[float, float] = (10.0, 15.0)
     elbow_swing: float = 0.15
     viscous_friction: float = 1.0
     noise_std: float = 0.1
