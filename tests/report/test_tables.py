@@ -147,12 +147,14 @@ def test_the_rollout_table_has_errors_coverage_and_drift() -> None:
 
 
 def test_bands_of_fewer_starts_join_the_errors_of_more() -> None:
-    bare = model_path("sgp-mean", 0.05).model_copy(update={"worst_drift": 3e-4})
+    network, bare = model_path("nn", 0.5), model_path("sgp-mean", 0.05)
+    bare = bare.model_copy(update={"worst_drift": 3e-4})
     sampled = model_path("sgp-mean", None, 0.9)
-    paths = rollouts(bare).model_copy(update={"starts": 16})
+    paths = rollouts(network, bare).model_copy(update={"starts": 16})
     joined = with_bands(paths, rollouts(sampled).model_copy(update={"starts": 5, "band_seconds": 0.25}))
     assert (joined.starts, joined.band_starts, joined.band_seconds) == (16, 5, 0.25)
-    model = joined.models[0]
+    assert joined.models[0] == network
+    model = joined.models[1]
     assert model.errors == bare.errors and model.tip == bare.tip
     assert model.tip_bands == sampled.tip_bands and model.coverage == 0.9
     assert model.worst_drift == 3e-4 and model.diverged_at == 0.9

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from forcegp.data import Dataset
@@ -14,7 +14,7 @@ from forcegp.experiments.stages import Advance, Stage, Stages
 from forcegp.experiments.task import LOG, SCENE, Task, simulation_settings
 from forcegp.files import write_text
 from forcegp.report.rollout_data import RolloutData, rollout_data, with_bands
-from forcegp.rollout import Comparison, compare
+from forcegp.rollout import compare
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 
@@ -73,15 +73,16 @@ def _roll(
 ) -> None:
     """Mean trajectories from all starts over the whole time, and bands over a part of it."""
     models = {fit.name: fit.load() for fit in fits}
-    data = Dataset.read(simulated / LOG)
+    sampled = {name: model for name, model in models.items() if model.has_function_samples}
+    data, system = Dataset.read(simulated / LOG), task.system
+    seconds, starts = sizes.rollout_seconds, sizes.rollout_starts
 
-    def found(what: str, seconds: float, starts: int, samples: int) -> Comparison:
-        def progress(done: int, total: int) -> None:
-            advance(done, total, what)
+    def reported(what: str) -> Callable[[int, int], None]:
+        return lambda done, total: advance(done, total, what)
 
-        return compare(models, data, seconds, starts, samples, system=task.system, progress=progress)
-
-    paths = rollout_data(found("means", sizes.rollout_seconds, sizes.rollout_starts, 0))
-    seconds, starts = min(BAND_SECONDS, sizes.rollout_seconds), min(BAND_STARTS, sizes.rollout_starts)
-    bands = rollout_data(found("function samples", seconds, starts, sizes.rollout_samples))
-    write_text(folder / ROLLOUTS, with_bands(paths, bands).to_json())
+    paths = compare(models, data, seconds, starts, system=system, progress=reported("means"))
+    seconds, starts, samples = min(BAND_SECONDS, seconds), min(BAND_STARTS, starts), sizes.rollout_samples
+    bands = compare(
+        sampled, data, seconds, starts, samples, system=system, progress=reported("function samples")
+    )
+    write_text(folder / ROLLOUTS, with_bands(rollout_data(paths), rollout_data(bands)).to_json())

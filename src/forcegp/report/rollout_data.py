@@ -143,9 +143,10 @@ def with_bands(paths: RolloutData, bands: RolloutData) -> RolloutData:
 
     Args:
         paths: tip errors, drift and multiplier over the whole time.
-        bands: of the same models, in the same order.
+        bands: of those of the models that have function samples.
     """
-    models = [_with_bands(*pair) for pair in zip(paths.models, bands.models, strict=True)]
+    sampled = {band.model: band for band in bands.models}
+    models = [_with_bands(p, sampled[p.model]) if p.model in sampled else p for p in paths.models]
     seconds = {"band_starts": bands.starts, "band_seconds": bands.band_seconds}
     return paths.model_copy(update={"models": models, **seconds})
 

@@ -38,7 +38,7 @@ def draw_tip(data: RolloutData) -> Picture:
         figure.axes[-1].set_xlabel("time [s]")
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
-    alt = f"Tip position over {data.band_seconds:.3g} s by axis, simulated and predicted in open loop by each model."
+    alt = f"Tip position over {data.band_seconds:.3g} s by axis, simulated, and predicted by each model."
     return draw(paint, (WIDTH, 5.0), alt, "Position of the tip")
 
 
@@ -169,8 +169,8 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
     band = f" with the band that holds {data.level:.0%} of the function samples"
     sampled = any(path.tip_bands for path in data.models)
     caption = (
-        f"From a logged state and the logged torques, {data.t[-1]:.3g} s ahead: simulated in black, predicted "
-        f"in colour{band if sampled else ''}. Position and contact force are shown for the first "
+        f"From a logged state and the logged torques, {data.t[-1]:.3g} s ahead: simulated in black, "
+        f"predicted in colour{band if sampled else ''}. Position and contact force are shown for the first "
         f"{data.band_seconds:.3g} s. Errors are medians over {data.starts} starts. A curve ends where its "
         "prediction diverged."
     )
