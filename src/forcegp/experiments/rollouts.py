@@ -22,8 +22,8 @@ ROLLOUTS = "data.json"
 OTHER_MOTION = 1000
 """Added to the task's seed for the motion that no model saw."""
 BAND_SECONDS, BAND_STARTS = 2.0, 5
-"""At most so long, and from so many starts, are function samples rolled out: in open loop errors grow until
-they reach the size of the motion, and what a band holds from then on says little about the model."""
+"""At most so long [s], and from so many starts, are function samples rolled out: each costs a trajectory more
+from every start."""
 
 
 def rollouts(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]) -> RolloutData:

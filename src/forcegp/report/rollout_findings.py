@@ -34,8 +34,7 @@ def tip_error(data: RolloutData) -> Finding | None:
     reached = all(ratio <= FIFTH for ratio in ratios.values())
     text = (
         f"Open loop, median over {data.starts} starts, {HORIZON:g} s ahead: {label(OURS)} "
-        f"{_millimetres(ours)} (to be at most a fifth of the following); {listed}{beside}. Pressing on a "
-        "surface in open loop is unstable, so that small errors grow until they reach the size of the motion."
+        f"{_millimetres(ours)} (to be at most a fifth of the following); {listed}{beside}."
     )
     return Finding("Tip error of trajectories", reached, text)
 
