@@ -509,7 +509,7 @@ def test_a_fit_begins_at_the_hyperparameters_of_another() -> None:
     # What is minimised is the likelihood with the weak prior, which is not negative.
     assert seen[0] > -again.log_marginal_likelihood() and min(seen) < seen[0]
     missing = {key: value for key, value in small.hyperparameters.items() if "bias" not in key}
-    with pytest.raises(ModelError, match="do not fit: joint.left.left.log_bias_std"):
+    with pytest.raises(ModelError, match=r"do not fit: joint\.left\.left\.log_bias_std"):
         large.fit(data, begin=missing)
 
 

@@ -40,7 +40,10 @@ def all_figures(stages: Stages, sizes: Profile, tasks: Sequence[Task], fits: Seq
     shown = [
         f
         for f in fits
-        if f.task is task and f.split == "stretches" and f.points in (sizes.main, sizes.baseline_points)
+        if f.task is task
+        and f.split == "stretches"
+        and f.points in (sizes.main, sizes.baseline_points)
+        and f.name not in PAPER_KERNELS
     ]
     return FigureData(
         covariance=_covariance(stages, task, next(f for f in shown if f.name == "sgp-zero")),
@@ -48,7 +51,7 @@ def all_figures(stages: Stages, sizes: Profile, tasks: Sequence[Task], fits: Seq
         task_space=_task_space(stages, sizes, task),
         windows=[_window(stages, task, fit) for fit in shown],
         identification=_identification(stages, sizes, tasks),
-        rollouts=rollouts(stages, sizes, task, [f for f in shown if f.name not in PAPER_KERNELS]),
+        rollouts=rollouts(stages, sizes, task, shown),
     )
 
 

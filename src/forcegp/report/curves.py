@@ -14,6 +14,8 @@ from forcegp.report.style import AXES, INK, MARKERS, Picture, colour, draw, labe
 
 WIDTH = 4.6
 GP_MODELS = ("gp", "sgp-zero", "sgp-mean", "sgp-contact")
+PAPER_KERNELS = ("sgp-zero-se", "sgp-mean-se")
+"""The paper's structured models with its kernel alone: in tables, not in figures."""
 FLOOR = (2.0 / torch.pi) ** 0.5
 """Mean magnitude of standard normal noise: no model's error against noisy accelerations is smaller."""
 

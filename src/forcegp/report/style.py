@@ -39,6 +39,8 @@ LABELS = {
     "sgp-zero": "S-GP, zero mean",
     "sgp-mean": "S-GP, analytical mean",
     "sgp-contact": "S-GP, mean and contact prior",
+    "sgp-zero-se": "S-GP, zero mean, paper's kernel",
+    "sgp-mean-se": "S-GP, analytical mean, paper's kernel",
 }
 """What a model is called in figures and tables."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from forcegp.report.curves import GP_MODELS
+from forcegp.report.curves import GP_MODELS, PAPER_KERNELS
 from forcegp.report.data import SPLITS, PaperNumbers, Results, Score
 from forcegp.report.style import label
 
@@ -123,7 +123,7 @@ def curve_table(results: Results, paper: PaperNumbers, kind: str) -> Table:
     """Error over training points: ours on both splits, and the paper's for noisy accelerations."""
     measure = _noisy if kind == "noisy" else _clean
     sizes = sorted({s.points for s in results.scores if s.model in GP_MODELS})
-    models = [m for m in GP_MODELS if m in models_of(results)]
+    models = [m for m in (*GP_MODELS, *PAPER_KERNELS) if m in models_of(results)]
     rows = []
     for model in models:
         for split in SPLITS:
