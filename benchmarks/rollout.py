@@ -1,9 +1,11 @@
-"""Speed and memory of rollouts with a structured GP on the paper's task.
+"""Speed, memory and drift of rollouts with a structured GP on the paper's task.
 
-    python benchmarks/rollout.py --json result.json
+    python benchmarks/rollout.py --json result.json --docs
 
-Ten seconds at 240 Hz from a simulated state: the mean trajectory, and 100 function samples at once. The model
-is conditioned on `--points` simulated points with hyperparameters learned from 100 of them.
+Ten seconds at 240 Hz from a simulated state: the mean trajectory, and 100 function samples at once, with a
+model that is conditioned on `--points` simulated points; the same over half the time, which shows how memory
+grows with length. Then the largest constraint error over ten seconds under the simulator's controller (closed
+loop) and under the simulated torques (open loop), by method and stabilization, from a state on the surface.
 """
 
 from __future__ import annotations
@@ -17,31 +19,47 @@ import time
 from pathlib import Path
 
 import torch
+from results_page import table, write_section
 
-from forcegp.data.selection import select_points
-from forcegp.models.base import Model
+from forcegp.constraints.projection import project_state
+from forcegp.data import Dataset, select_points
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.rollout import RolloutOptions
+from forcegp.rollout import RolloutOptions, TaskSpaceControl
 from forcegp.scene import load_scene
 from forcegp.simulate import SimulationConfig, SimulationResult, simulate
+from forcegp.simulate.plan import make_plan
 
 TARGETS = {0: 5.0, 100: 60.0}
 """Seconds that a rollout of ten seconds may take, by number of samples."""
 MEBIBYTE = 2**20
+DRIFT_POINTS = 200
+"""Training points of the model whose drift is measured."""
+DRIFT = [
+    ("none", "semi_implicit_euler"),
+    ("none", "rk4"),
+    ("baumgarte", "semi_implicit_euler"),
+    ("baumgarte", "rk4"),
+    ("projection", "semi_implicit_euler"),
+]
+DOCS = Path(__file__).parent.parent / "docs" / "benchmarks.md"
 
 
-def model_and_run(points: int, seconds: float) -> tuple[Model, SimulationResult]:
-    """A model conditioned on simulated points, and another run to start from."""
+def model_and_run(points: int, seconds: float) -> tuple[StructuredGP, Dataset, SimulationResult]:
+    """A model conditioned on simulated points, those points, and another run to start from."""
     system = load_scene("kuka_plane").system()
-    train = simulate(system, SimulationConfig(duration=max(10.0, points / 100.0), seed=1)).data
+    train = simulate(system, SimulationConfig(duration=max(10.0, points / 20.0), seed=1)).data
     chosen = train[select_points(train, points)]
     model = StructuredGP(system, mean="analytical", noise_std=0.1)
-    model.fit(chosen[:100])
+    model.fit(chosen[:DRIFT_POINTS])
     model.condition(chosen)
-    return model, simulate(system, SimulationConfig(duration=seconds + 0.1, seed=2))
+    return model, chosen, simulate(system, _test_run(seconds))
 
 
-def measure(model: Model, run: SimulationResult, seconds: float, samples: int) -> dict[str, float]:
+def _test_run(seconds: float) -> SimulationConfig:
+    return SimulationConfig(duration=seconds + 0.1, seed=2)
+
+
+def measure(model: StructuredGP, run: SimulationResult, seconds: float, samples: int) -> dict[str, float]:
     """Wall and processor time of one rollout, the growth of memory, and what its result holds."""
     data = run.data
     options = RolloutOptions(on_divergence="keep")
@@ -68,23 +86,77 @@ def measure(model: Model, run: SimulationResult, seconds: float, samples: int) -
     }
 
 
+def drift(model: StructuredGP, run: SimulationResult, seconds: float) -> list[dict[str, float | str]]:
+    """Largest |c(q)| by loop, stabilization and method, with the speed that the joints come to [m, rad/s]."""
+    data, system, config = run.data, model.system, _test_run(seconds)
+    plan = make_plan(system, config, torch.Generator().manual_seed(config.seed))
+    control = TaskSpaceControl(system, plan, config.dt, config.gains)
+    q0, qd0 = project_state(system, data.q[0], data.qd[0])
+    rows = []
+    for loop, inputs in (("closed", control), ("open", data.tau)):
+        for stabilization, method in DRIFT:
+            options = RolloutOptions(method=method, stabilization=stabilization, on_divergence="keep")
+            path = model.rollout(q0, qd0, inputs, seconds, options=options)
+            figures = {"c_m": float(path.drift.abs().max()), "speed_rad_s": float(path.qd.abs().max())}
+            rows.append({"loop": loop, "stabilization": stabilization, "method": method, **figures})
+    return rows
+
+
+def docs_section(result: dict) -> str:
+    """The results as a section of the docs."""
+    heads = {
+        "samples": lambda r: str(r["samples"] or "mean"),
+        "simulated [s]": lambda r: f"{r['seconds_simulated']:g}",
+        "time [s]": lambda r: f"{r['wall_s']:.1f}",
+        "target [s]": lambda r: f"{r['target_s']:g}",
+        "result [MiB]": lambda r: f"{r['stored_MiB']:.1f}",
+        "peak growth [MiB]": lambda r: f"{r['peak_growth_MiB']:.0f}",
+        "largest drift [m]": lambda r: f"{r['drift_m']:.1e}",
+    }
+    speed = [[cell(r) for cell in heads.values()] for r in result["rollouts"]]
+    drifts = [[r["loop"], r["stabilization"], r["method"], f"{r['c_m']:.1e}"] for r in result["drift"]]
+    return "\n\n".join(
+        [
+            "## Rollouts",
+            f"`python benchmarks/rollout.py --docs` on {result['machine']}, {result['threads']} threads; "
+            f"analytical mean, {result['points']} points, 240 Hz.",
+            table(list(heads), speed),
+            f"Largest constraint error over {result['seconds']:g} s ({DRIFT_POINTS} points, from a state on "
+            "the surface):",
+            table(["loop", "stabilization", "method", "largest drift [m]"], drifts),
+        ]
+    )
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--points", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--docs", action="store_true", help="Write the section of docs/benchmarks.md.")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    model, run = model_and_run(args.points, args.seconds)
+    model, chosen, run = model_and_run(args.points, args.seconds)
+    spans = (0.5 * args.seconds, args.seconds)
     with torch.no_grad():
-        rows = [measure(model, run, args.seconds, samples) for samples in TARGETS]
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
-    result = {"machine": machine, "threads": args.threads, "points": args.points, "rollouts": rows}
-    for row in rows:
-        print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
+        rows = [measure(model, run, seconds, samples) for samples in TARGETS for seconds in spans]
+        model.condition(chosen[:DRIFT_POINTS])
+        drifts = drift(model, run, args.seconds)
+    result = {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}",
+        "threads": args.threads,
+        "points": args.points,
+        "seconds": args.seconds,
+        "rollouts": rows,
+        "drift": drifts,
+    }
+    for row in [*rows, *drifts]:
+        print(", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
     if args.json is not None:
         args.json.write_text(json.dumps(result, indent=2) + "\n")
+    if args.docs:
+        write_section(DOCS, "rollout", docs_section(result))
 
 
 if __name__ == "__main__":

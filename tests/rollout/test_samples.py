@@ -106,6 +106,16 @@ def test_probability_of_lost_contact_is_that_of_the_posterior_draws() -> None:
     assert torch.allclose(contact_loss_probability(model, q, qd, tau), share, atol=0.02)
 
 
+def test_a_learned_model_loses_no_contact_while_it_slides() -> None:
+    """Neither its mean nor any sample opens a contact that stays closed in simulation."""
+    data = log()
+    options = RolloutOptions(unilateral=True)
+    path = fitted().rollout(data.q[0], data.qd[0], data.tau, 0.5, samples=8, options=options)
+    for found in (path, path.need_samples()):
+        assert not found.events and bool(found.active.all())
+    assert float(contact_loss_probability(fitted(), data.q, data.qd, data.tau).max()) < 1e-3
+
+
 def test_models_without_a_posterior_say_so() -> None:
     data, plain = log(), AnalyticalModel(arm(Baumgarte()))
     with pytest.raises(ModelError, match="no uncertainty of the multiplier"):
