@@ -1,6 +1,6 @@
 """Speed, memory and drift of rollouts with a structured GP on the paper's task.
 
-    python benchmarks/rollout.py --json result.json --docs
+    python benchmarks/rollout.py --json result.json --docs docs/benchmarks.md
 
 Ten seconds at 240 Hz from a simulated state: the mean trajectory, and 100 function samples at once, with a
 model that is conditioned on `--points` simulated points; the same over half the time, which shows how memory
@@ -41,7 +41,6 @@ DRIFT = [
     ("baumgarte", "rk4"),
     ("projection", "semi_implicit_euler"),
 ]
-DOCS = Path(__file__).parent.parent / "docs" / "benchmarks.md"
 
 
 def model_and_run(points: int, seconds: float) -> tuple[StructuredGP, Dataset, SimulationResult]:
@@ -118,8 +117,8 @@ def docs_section(result: dict) -> str:
     return "\n\n".join(
         [
             "## Rollouts",
-            f"`python benchmarks/rollout.py --docs` on {result['machine']}, {result['threads']} threads; "
-            f"analytical mean, {result['points']} points, 240 Hz.",
+            f"`python benchmarks/rollout.py --docs docs/benchmarks.md` on {result['machine']}, "
+            f"{result['threads']} threads; analytical mean, {result['points']} points, 240 Hz.",
             table(list(heads), speed),
             f"Largest constraint error over {result['seconds']:g} s ({DRIFT_POINTS} points, from a state on "
             "the surface):",
@@ -134,7 +133,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--docs", action="store_true", help="Write the section of docs/benchmarks.md.")
+    parser.add_argument("--docs", type=Path, help="Markdown file whose section on rollouts is written.")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     model, chosen, run = model_and_run(args.points, args.seconds)
@@ -155,8 +154,8 @@ def main() -> None:
         print(", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
     if args.json is not None:
         args.json.write_text(json.dumps(result, indent=2) + "\n")
-    if args.docs:
-        write_section(DOCS, "rollout", docs_section(result))
+    if args.docs is not None:
+        write_section(args.docs, "rollout", docs_section(result))
 
 
 if __name__ == "__main__":
