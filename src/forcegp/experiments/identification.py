@@ -20,6 +20,9 @@ WRONG_MASS = 2.5
 WRONG_OFFSET = 0.05
 """By how much the position of the last joint is off at the start, each axis [m]."""
 
+TOLERANCE = 1e-9
+"""Of L-BFGS: with θ_A among the unknowns, it pauses on its way for a step or two."""
+
 
 class LastLink(nn.Module):
     """θ_A = (log mass of the last link, shift of the last joint), remembering where it was evaluated.
@@ -88,7 +91,7 @@ def identify_structured(
         noise_std=noise_std,
         analytical_parameters=theta,
     )
-    result = model.fit(data, options=LearningOptions(max_evaluations=evaluations), progress=progress)
+    result = model.fit(data, options=_options(evaluations), progress=progress)
     return _run(theta, result.history, system.robot, name, seed)
 
 
@@ -105,8 +108,12 @@ def identify_alone(
         return (eom.acceleration(eom.Q_K + data.tau) - data.qdd).square().mean()
 
     start = {name: value.detach().clone() for name, value in theta.named_parameters()}
-    learned = minimise(objective, start, LearningOptions(max_evaluations=evaluations))
+    learned = minimise(objective, start, _options(evaluations))
     return _run(theta, learned.history, system.robot, "analytical", seed)
+
+
+def _options(evaluations: int) -> LearningOptions:
+    return LearningOptions(max_evaluations=evaluations, tolerance=TOLERANCE)
 
 
 def _run(

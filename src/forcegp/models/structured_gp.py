@@ -31,6 +31,8 @@ from forcegp.models.observation import NoiseStd, Observation, measurement_of
 from forcegp.models.structured_problem import Problem, Training, analytical_parameters, kernel_parameters
 from forcegp.models.structured_settings import save_structured
 
+WITH_PARAMETERS = LearningOptions(tolerance=1e-9)
+"""Default options where θ_A is learned too: L-BFGS then pauses on its way for a step or two."""
 CORRELATION_STATES = 50
 """Training states at which the correlation of Q and Q_z is looked at after a fit."""
 
@@ -91,7 +93,7 @@ class StructuredGP(Model):
 
         Args:
             data: measured accelerations, or any mixture of measurements.
-            options: optimiser and its limits.
+            options: optimiser and its limits; L-BFGS by default, to a tolerance of 1e-9 where θ_A is learned.
             learn: names of the priors whose hyperparameters are learned; the others keep the values and
                 input scales of an earlier fit (two-stage training). Default all; with none, and no noise
                 or analytical parameter to learn, the model is only conditioned.
@@ -105,7 +107,7 @@ class StructuredGP(Model):
             ModelError, DataError, UnknownNameError: the data, or the checkpoint, do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
-        options = options or LearningOptions()
+        options = options or (LearningOptions() if self.analytical_parameters is None else WITH_PARAMETERS)
         learn = self._learned_priors(learn)
         problem = self._problem(self._training(data, learn))
         start = problem.initial(self.learn_noise)
