@@ -314,7 +314,7 @@ class StructuredGP(Model):
         return Prediction(
             mean.reshape(*batch, z.o.shape[-1]),
             None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
-            _parts(system, at, quantity),
+            _parts(system, at, quantity, z.o.shape[-1]),
         )
 
     def force_field(self) -> ForceField:
@@ -346,10 +346,14 @@ def _beginning(begin: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict
     return {key: begin[key].detach().to(value) for key, value in start.items()}
 
 
-def _parts(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> dict[str, slice]:
-    names = [quantity] if isinstance(quantity, str) else list(quantity)
+def _parts(
+    system: ConstrainedSystem, at: States, quantity: str | Sequence[str], width: int
+) -> dict[str, slice]:
+    """Where each quantity is among the columns of all `(width,)`."""
+    if isinstance(quantity, str):
+        return {quantity: slice(0, width)}
     parts, first = {}, 0
-    for name in names:
+    for name in quantity:
         last = first + affine_map(system, at, name).o.shape[-1]
         parts[name], first = slice(first, last), last
     return parts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -20,10 +21,14 @@ from forcegp.rollout.problem import Problem, State
 from forcegp.rollout.run import Progress, run
 from forcegp.rollout.stabilize import stabilized_system
 from forcegp.rollout.trajectory import DivergedError, Rollout
+from forcegp.simulate.threads import one_thread
 
 CLOSED = 5e-4
 """Where contacts can open, one is closed at the start if its error is below this [m]: more than the drift of
 a logged contact, less than a distance that anybody would call off the surface."""
+
+FEW = 8
+"""So many trajectories at most are computed on one thread, as more only slow down work on small tensors."""
 
 Torque = Tensor | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
 """An array over time `(samples, nq)` or `(*batch, samples, nq)`, or a law of (t, q, q̇)."""
@@ -183,16 +188,17 @@ def _run(
     closed = _closed(problem, q, qd) if active is None else active.expand(*whole, -1).reshape(n, -1)
     start = State(q.new_zeros(n, 1), q, qd, closed)
     steps = max(1, round(duration / options.dt))
-    found = run(
-        problem,
-        step_of(options.method),
-        start,
-        options.dt,
-        steps,
-        project=project,
-        speed_limit=options.speed_limit,
-        progress=progress,
-    )
+    with one_thread() if n <= FEW else nullcontext():
+        found = run(
+            problem,
+            step_of(options.method),
+            start,
+            options.dt,
+            steps,
+            project=project,
+            speed_limit=options.speed_limit,
+            progress=progress,
+        )
     names = ("q", "qd", "qdd", "tau", "multiplier", "c", "cd", "active")
     return dataclasses.replace(
         found,
