@@ -53,7 +53,9 @@ def test_the_tip_stays_on_the_table_and_presses(sliding: SimulationResult) -> No
     multiplier = sliding.data.contact_extras["multiplier"]["table"]
     assert float(sliding.c.abs().max()) < DRIFT
     assert bool(sliding.data.contact["table"].all())
-    assert float(multiplier.min()) > 20.0 and float(multiplier.max()) < 100.0
+    # Where the reference keeps to the surface, λ becomes the pressing force but for the error of tracking.
+    low, high = SimulationConfig().pressing_force
+    assert low - 0.5 < float(multiplier.min()) < float(multiplier.max()) < high + 0.5
     assert sliding.saturated == 0 and sliding.beyond_limits == 0
     assert float((sliding.position - sliding.reference.position).norm(dim=-1).max()) < TRACKING
     assert 0.3 < float(sliding.velocity.norm(dim=-1).max()) < 1.0
