@@ -28,7 +28,7 @@ from torch import Tensor
 import forcegp
 from forcegp.data import split_by_stretches
 from forcegp.gp.exact import negative_log_likelihood
-from forcegp.gp.priors import states
+from forcegp.gp.states import states
 from forcegp.models.default_priors import PAPER, default_priors
 from forcegp.models.structured_problem import kernel_parameters
 from forcegp.simulate import simulate

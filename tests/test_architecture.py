@@ -14,7 +14,7 @@ import forcegp
 ROOT = Path(forcegp.__file__).parent
 
 LAYERS = (
-    ("errors", "types", "files", "linalg", "batchlast"),
+    ("errors", "types", "files", "linalg", "batchlast", "threads"),
     ("robot",),
     ("kinematics", "friction", "dynamics"),
     ("compiled", "derivatives", "identification"),

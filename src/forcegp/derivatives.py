@@ -43,6 +43,15 @@ def _pairs(robot: RobotModel, own: Tensor, down: Tensor) -> Tensor:
     return own * E + down * strictly
 
 
+def _gyration(links: dynamics.LinkInertia, omega: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """N = 2 ω×I − tr(I) ω× − 2 h×v× and the linear momentum l of each link."""
+    w = batchlast.skew(omega)
+    trace = links.inertia.diagonal(dim1=0, dim2=1).sum(-1)
+    N = 2.0 * batchlast.product(w, links.inertia) - trace * w
+    N = N - 2.0 * batchlast.product(batchlast.skew(links.moment), batchlast.skew(v))
+    return N, links.mass * v - cross(links.moment, omega)
+
+
 def _inverse_derivatives(
     robot: RobotModel, poses: LinkPoses, links: dynamics.LinkInertia, motion: LinkMotion, qdd: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -60,13 +69,7 @@ def _inverse_derivatives(
     a = motion.acceleration + sum_over(E, l * qdd) - robot.gravity[:, None, None]
     torque, force = dynamics.link_force(links, motion, alpha, a)
 
-    w = batchlast.skew(omega)
-    trace = links.inertia.diagonal(dim1=0, dim2=1).sum(-1)
-    N = 2.0 * batchlast.product(w, links.inertia) - trace * w
-    N = N - 2.0 * batchlast.product(batchlast.skew(links.moment), batchlast.skew(v))
-    momentum = links.mass * v - cross(links.moment, omega)
-
-    N, momentum = sum_over(Et, N), sum_over(Et, momentum)
+    N, momentum = (sum_over(Et, x) for x in _gyration(links, omega, v))
     torque, force = sum_over(Et, torque), sum_over(Et, force)
     whole = dynamics.LinkInertia(Et @ links.mass, sum_over(Et, links.moment), sum_over(Et, links.inertia))
 

@@ -8,7 +8,7 @@ import torch
 import forcegp
 from forcegp.gp.affine import QUANTITIES, affine_map
 from forcegp.gp.exact import negative_log_likelihood
-from forcegp.gp.priors import states
+from forcegp.gp.states import states
 from forcegp.models.observation import COLUMNS, Observation
 from gp.cases import conditioned, draw, logged, mixed_contacts, two_contacts
 from gp.textbook import Textbook

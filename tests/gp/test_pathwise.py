@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 
 from forcegp.gp.pathwise import draw_samples
-from forcegp.gp.priors import JointForcePrior, states
+from forcegp.gp.priors import JointForcePrior
+from forcegp.gp.states import states
 from gp.cases import conditioned, draw, logged, mixed_contacts, two_contacts
 
 COUNT = 1500

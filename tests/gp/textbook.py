@@ -13,8 +13,9 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.gp.affine import affine_map
-from forcegp.gp.kernels import Kernel, Linear, Product, SquaredExponential, Sum, sub
-from forcegp.gp.priors import states
+from forcegp.gp.kernels import Kernel, Linear, Product, Sum, sub
+from forcegp.gp.states import states
+from forcegp.gp.stationary import SquaredExponential
 from forcegp.models.structured_gp import StructuredGP
 
 

@@ -10,7 +10,7 @@ from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError
 from forcegp.gp.learning import LearningOptions
 from forcegp.gp.pathwise import draw_samples
-from forcegp.gp.priors import states
+from forcegp.gp.states import states
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import Model
 from forcegp.models.structured_gp import StructuredGP

@@ -6,7 +6,7 @@ import torch
 
 from forcegp.data import Dataset
 from forcegp.gp.gram import Block, cross_gram
-from forcegp.gp.priors import states
+from forcegp.gp.states import states
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.data import CovarianceData, matrix, series
 

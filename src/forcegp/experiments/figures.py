@@ -14,7 +14,7 @@ from forcegp.experiments.covariance import covariance_blocks
 from forcegp.experiments.fits import Fit, noise_std_of
 from forcegp.experiments.identification import identify_alone, identify_structured
 from forcegp.experiments.multiplier import predicted_multiplier
-from forcegp.experiments.profiles import PAPER_KERNELS, STRUCTURED, Profile
+from forcegp.experiments.profiles import Profile
 from forcegp.experiments.rollouts import rollouts
 from forcegp.experiments.stages import Advance, Stages
 from forcegp.experiments.task import Task
@@ -23,7 +23,14 @@ from forcegp.experiments.window import predicted_window
 from forcegp.files import Header, write_text
 from forcegp.gp.priors import ContactForcePrior
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.report.data import CovarianceData, IdentificationData, MultiplierData, TaskSpaceData, WindowData
+from forcegp.report.data import (
+    PAPER_KERNELS,
+    CovarianceData,
+    IdentificationData,
+    MultiplierData,
+    TaskSpaceData,
+    WindowData,
+)
 from forcegp.report.page import FigureData
 
 DATA = "data.json"
@@ -47,7 +54,7 @@ def all_figures(stages: Stages, sizes: Profile, tasks: Sequence[Task], fits: Seq
     ]
     return FigureData(
         covariance=_covariance(stages, task, next(f for f in shown if f.name == "sgp-zero")),
-        multiplier=_multiplier(stages, sizes, task, [f for f in shown if f.name in STRUCTURED]),
+        multiplier=_multiplier(stages, sizes, task, [f for f in shown if f.name.startswith("sgp")]),
         task_space=_task_space(stages, sizes, task),
         windows=[_window(stages, task, fit) for fit in shown],
         identification=_identification(stages, sizes, tasks),

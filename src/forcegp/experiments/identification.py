@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import torch
@@ -11,7 +12,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.gp.learning import LearningOptions, minimise
 from forcegp.gp.priors import ForcePrior
-from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
 from forcegp.report.data import IdentificationRun, columns, series
 from forcegp.robot.model import RobotModel
 
@@ -19,9 +20,6 @@ WRONG_MASS = 2.5
 """Where the mass of the last link starts [kg]; the truth is 2.0."""
 WRONG_OFFSET = 0.05
 """By how much the position of the last joint is off at the start, each axis [m]."""
-
-TOLERANCE = 1e-9
-"""Of L-BFGS: with θ_A among the unknowns, it pauses on its way for a step or two."""
 
 
 class LastLink(nn.Module):
@@ -113,7 +111,7 @@ def identify_alone(
 
 
 def _options(evaluations: int) -> LearningOptions:
-    return LearningOptions(max_evaluations=evaluations, tolerance=TOLERANCE)
+    return dataclasses.replace(WITH_PARAMETERS, max_evaluations=evaluations)
 
 
 def _run(

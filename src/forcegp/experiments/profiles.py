@@ -6,11 +6,6 @@ from dataclasses import dataclass
 
 from forcegp.errors import UnknownNameError
 
-STRUCTURED = ("sgp-zero", "sgp-mean", "sgp-contact")
-GP_MODELS = ("gp", *STRUCTURED)
-PAPER_KERNELS = ("sgp-zero-se", "sgp-mean-se")
-"""The paper's structured models with its kernel alone."""
-
 
 @dataclass(frozen=True)
 class Profile:

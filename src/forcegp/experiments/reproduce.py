@@ -12,11 +12,11 @@ import torch
 
 from forcegp.experiments.figures import all_figures
 from forcegp.experiments.fits import Fit, fit_model, noise_std_of, score_fit
-from forcegp.experiments.profiles import GP_MODELS, PAPER_KERNELS, Profile, profile_of
+from forcegp.experiments.profiles import Profile, profile_of
 from forcegp.experiments.stages import Progress, Stages, silent
 from forcegp.experiments.task import Task, make_task
 from forcegp.files import write_text
-from forcegp.report.data import SPLITS, Results, Score
+from forcegp.report.data import GP_MODELS, PAPER_KERNELS, SPLITS, Results, Score
 from forcegp.report.markdown import results_markdown
 from forcegp.report.page import write_page
 

@@ -15,10 +15,12 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, split_by_stretches
-from forcegp.gp.kernels import Linear, SquaredExponential
+from forcegp.gp.kernels import Linear
 from forcegp.gp.mean import AnalyticalMean
-from forcegp.gp.priors import ContactForcePrior, JointForcePrior, states
+from forcegp.gp.priors import ContactForcePrior, JointForcePrior
 from forcegp.gp.separation import force_correlation
+from forcegp.gp.states import states
+from forcegp.gp.stationary import SquaredExponential
 from forcegp.models.observation import Observation
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.simulate import SimulationConfig, simulate

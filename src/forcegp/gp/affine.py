@@ -6,7 +6,7 @@ operator from force to λ is −Lᵀ, and λ answers to all impressed forces Q +
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.priors import States
+from forcegp.gp.states import States
 
 
 class AffineMap(NamedTuple):
@@ -111,8 +111,8 @@ QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {
 """The quantities that can be measured and predicted, by name."""
 
 
-def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:
-    """The affine map of a quantity, or of several one above the other.
+def affine_maps(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> dict[str, AffineMap]:
+    """The affine map of a quantity, or of each of several, by name.
 
     Raises:
         UnknownNameError: no such quantity.
@@ -124,11 +124,20 @@ def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[s
     for name in names:
         if name not in QUANTITIES:
             raise UnknownNameError("quantity", name, QUANTITIES)
-    maps = [QUANTITIES[name](system, at) for name in names]
+    return {name: QUANTITIES[name](system, at) for name in names}
+
+
+def stack(maps: Mapping[str, AffineMap]) -> tuple[AffineMap, dict[str, slice]]:
+    """Several affine maps one above the other, and the rows of each."""
+    rows, first = {}, 0
+    for name, z in maps.items():
+        rows[name] = slice(first, first + z.o.shape[-1])
+        first += z.o.shape[-1]
     if len(maps) == 1:
-        return maps[0]
-    return AffineMap(
-        torch.cat([m.B_Q for m in maps], dim=1),
-        torch.cat([m.B_z for m in maps], dim=1),
-        torch.cat([m.o for m in maps], dim=1),
-    )
+        return next(iter(maps.values())), rows
+    return AffineMap(*(torch.cat(parts, dim=1) for parts in zip(*maps.values(), strict=True))), rows
+
+
+def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:
+    """The affine map of a quantity, or of several one above the other; errors as of `affine_maps`."""
+    return stack(affine_maps(system, at, quantity))[0]

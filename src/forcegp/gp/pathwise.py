@@ -18,7 +18,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.gp.exact import target_of
 from forcegp.gp.kernels import Features, FunctionDraw, sub
 from forcegp.gp.posterior import ForcePosterior
-from forcegp.gp.priors import States
+from forcegp.gp.states import States
 
 FEATURES = 1024
 """Random features an output; the covariance of the prior draws errs by about 1/√FEATURES of its scale."""

@@ -14,7 +14,9 @@ from forcegp.gp.affine import AffineMap
 from forcegp.gp.exact import Conditioned, condition
 from forcegp.gp.gram import Block, cross_gram
 from forcegp.gp.kernels import Features, sub
-from forcegp.gp.priors import ForcePrior, Standardization, States
+from forcegp.gp.priors import ForcePrior
+from forcegp.gp.standardization import Standardization
+from forcegp.gp.states import States
 from forcegp.gp.whitening import ForceMean, prior_mean, prior_operators
 
 CHUNK_COLUMNS = 700

@@ -3,71 +3,22 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from forcegp.constraints import ConstrainedSystem, Equations
+from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.errors import ModelError, ShapeError, UnknownNameError
-from forcegp.gp.kernels import Kernel, SquaredExponential
+from forcegp.errors import ModelError, UnknownNameError
+from forcegp.gp.kernels import Kernel
+from forcegp.gp.states import States
+from forcegp.gp.stationary import SquaredExponential
 from forcegp.robot.model import RobotModel
 
 RESERVED = ("noise", "analytical")
 """Prefixes of what is learned beside the hyperparameters of the priors."""
-
-
-@dataclass(frozen=True)
-class States:
-    """A batch of robot states with what the equations of motion say there.
-
-    Attributes:
-        q, qd, tau: `(n, nq)`.
-        active: `(n, n_contacts)` bool.
-        eom: the equations of motion at these states.
-    """
-
-    q: Tensor
-    qd: Tensor
-    tau: Tensor
-    active: Tensor
-    eom: Equations
-
-
-def states(system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> States:
-    """Evaluate the equations of motion at a batch of states."""
-    return States(q, qd, tau, active, system.equations(q, qd, active))
-
-
-def states_at(
-    system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
-) -> tuple[torch.Size, States]:
-    """The common batch of states `(*batch, nq)`, and the states in one row of it; all contacts by default.
-
-    Raises:
-        ShapeError: an argument does not fit the system, or is not finite.
-    """
-    given = {"q": q, "qd": qd, "tau": tau}
-    system.robot.check_state(**given)
-    for name, x in given.items():
-        if not bool(torch.isfinite(x).all()):
-            raise ShapeError(f"{name} holds values that are not finite", expected="finite numbers")
-    try:
-        batch = torch.broadcast_shapes(*(x.shape[:-1] for x in given.values()))
-    except RuntimeError as cause:
-        got = {name: tuple(x.shape) for name, x in given.items()}
-        raise ShapeError(
-            "q, qd and tau are not one batch", expected="shapes that broadcast", got=got
-        ) from cause
-    contacts = len(system.contacts)
-    if active is None:
-        active = torch.ones(contacts, dtype=torch.bool, device=q.device)
-    system.active_rows(active, batch)
-    rows = batch.numel()
-    q, qd, tau = (x.expand(*batch, x.shape[-1]).reshape(rows, x.shape[-1]) for x in given.values())
-    return batch, states(system, q, qd, tau, active.expand(*batch, contacts).reshape(rows, contacts))
 
 
 class ForcePrior(ABC):
@@ -308,31 +259,3 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
             )
     for prior in priors:
         prior.check(system)
-
-
-@dataclass(frozen=True)
-class Standardization:
-    """Shift and scale of each named input, x ↦ (x − mean)/std, from training data.
-
-    Inputs that are constant to rounding keep the scale 1, and are listed in `constant`.
-    """
-
-    mean: Mapping[str, Tensor]
-    std: Mapping[str, Tensor]
-    constant: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, features: Mapping[str, Tensor]) -> Standardization:
-        """Mean and standard deviation of each column."""
-        mean = {name: x.mean(0) for name, x in features.items()}
-        std, constant = {}, []
-        for name, x in features.items():
-            spread = x.std(0, correction=0)
-            fixed = spread <= 1e-12 * (1.0 + mean[name].abs())
-            constant += [f"{name}[{i}]" for i in fixed.nonzero()[:, 0].tolist()]
-            std[name] = torch.where(fixed, 1.0, spread)
-        return cls(mean, std, tuple(constant))
-
-    def apply(self, features: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The standardized features."""
-        return {name: (x - self.mean[name]) / self.std[name] for name, x in features.items()}

@@ -13,7 +13,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.gp.affine import affine_map
 from forcegp.gp.posterior import ForcePosterior
-from forcegp.gp.priors import States
+from forcegp.gp.states import States
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:

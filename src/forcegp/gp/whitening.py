@@ -18,7 +18,9 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.gp.affine import AffineMap, affine_map
 from forcegp.gp.gram import Block
-from forcegp.gp.priors import ForcePrior, Standardization, States, states
+from forcegp.gp.priors import ForcePrior
+from forcegp.gp.standardization import Standardization
+from forcegp.gp.states import States, states
 from forcegp.linalg import null_space_basis
 
 VANISHING = 1e-12
@@ -46,10 +48,14 @@ class Measurement:
     active: Tensor
     values: Tensor
 
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """q, q̇, τ, which contacts are closed, and the values."""
+        return self.q, self.qd, self.tau, self.active, self.values
+
     def __getitem__(self, rows: Tensor) -> Measurement:
         """The values at some of the states."""
-        parts = (self.q, self.qd, self.tau, self.active, self.values)
-        return Measurement(self.quantity, *(part[rows] for part in parts))
+        return Measurement(self.quantity, *(part[rows] for part in self.tensors))
 
 
 @dataclass(frozen=True)

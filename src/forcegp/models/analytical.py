@@ -18,7 +18,7 @@ from forcegp.data import Dataset
 from forcegp.gp.affine import affine_map
 from forcegp.gp.learning import Learned, LearningOptions, minimise
 from forcegp.gp.mean import AnalyticalMean
-from forcegp.gp.priors import states
+from forcegp.gp.states import states
 from forcegp.gp.whitening import Measurement, prior_mean
 from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction
 from forcegp.models.flat import flat_states

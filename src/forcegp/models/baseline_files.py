@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError
-from forcegp.gp.priors import Standardization
+from forcegp.gp.standardization import Standardization
 from forcegp.models.analytical import AnalyticalModel, Window
 from forcegp.models.base import not_fitted
 from forcegp.models.folder import ModelHeader, Settings, settings_of, write_model

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
+from forcegp.gp.kernels import Kernel, Linear
 from forcegp.gp.mean import AnalyticalMean, mean_of
 from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior, NormalForcePrior
+from forcegp.gp.stationary import SquaredExponential
 
 PAPER = SquaredExponential()
 """The paper's kernel of a joint force (eq. 31)."""

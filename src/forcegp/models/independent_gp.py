@@ -18,7 +18,8 @@ from forcegp.gp.gram import Block, cross_gram
 from forcegp.gp.hyperprior import bounds_of, initial_hyperparameters, negative_log_prior
 from forcegp.gp.kernels import sub
 from forcegp.gp.learning import Learned, LearningOptions, minimise
-from forcegp.gp.priors import JointForcePrior, Standardization
+from forcegp.gp.priors import JointForcePrior
+from forcegp.gp.standardization import Standardization
 from forcegp.models.base import FitProgress, FitResult, Model, Prediction, not_fitted, only_qdd
 from forcegp.models.flat import flat_states
 from forcegp.models.observation import NoiseStd, Observation, measurement_of

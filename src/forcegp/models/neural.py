@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
-from forcegp.gp.priors import Standardization
+from forcegp.gp.standardization import Standardization
 from forcegp.models.base import FitProgress, FitResult, Model, Prediction, not_fitted, only_qdd
 from forcegp.models.flat import flat_states
 from forcegp.models.minibatch import BatchOptions, train

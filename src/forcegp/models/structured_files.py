@@ -10,12 +10,12 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.gp.mean import AnalyticalMean
-from forcegp.gp.priors import Standardization
+from forcegp.gp.standardization import Standardization
 from forcegp.gp.whitening import Measurement
 from forcegp.models.folder import ModelHeader, settings_of
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.models.structured_problem import Training
 from forcegp.models.structured_settings import COLUMNS, StructuredSettings
+from forcegp.models.structured_training import Training
 
 
 def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

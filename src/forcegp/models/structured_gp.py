@@ -15,21 +15,28 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.affine import affine_map
+from forcegp.gp.affine import affine_maps, stack
 from forcegp.gp.checkpoint import Checkpoint
 from forcegp.gp.exact import target_of
 from forcegp.gp.learning import Learned, LearningOptions
 from forcegp.gp.mean import AnalyticalMean, mean_of
 from forcegp.gp.pathwise import draw_samples
 from forcegp.gp.posterior import ForcePosterior, posterior
-from forcegp.gp.priors import ForcePrior, Standardization, States, check_priors, states, states_at
+from forcegp.gp.priors import ForcePrior, check_priors
 from forcegp.gp.separation import force_correlation
+from forcegp.gp.states import States, states, states_at
 from forcegp.gp.whitening import Measurement
 from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction, not_fitted
 from forcegp.models.default_priors import default_priors
-from forcegp.models.observation import NoiseStd, Observation, measurement_of
-from forcegp.models.structured_problem import Problem, Training, analytical_parameters, kernel_parameters
+from forcegp.models.observation import NoiseStd, Observation
+from forcegp.models.structured_problem import (
+    Problem,
+    analytical_parameters,
+    beginning,
+    kernel_parameters,
+)
 from forcegp.models.structured_settings import save_structured
+from forcegp.models.structured_training import Training, training_of
 
 WITH_PARAMETERS = LearningOptions(tolerance=1e-9)
 """Default options where θ_A is learned too: L-BFGS then pauses on its way for a step or two."""
@@ -128,7 +135,7 @@ class StructuredGP(Model):
                 progress(evaluations, options.max_evaluations, value)
 
         saved = None if checkpoint is None else self._checkpoint(Path(checkpoint), problem, options, start)
-        first = None if begin is None else _beginning(begin, start)
+        first = None if begin is None else beginning(begin, start)
         learned = problem.solve(start, held, options, report, saved, first)
         self._adopt(problem, {**held, **learned.tensors})
         if saved is not None:
@@ -176,21 +183,7 @@ class StructuredGP(Model):
         return chosen
 
     def _training(self, data: Dataset | Sequence[Observation], learn: Sequence[str]) -> Training:
-        observations = [Observation(data)] if isinstance(data, Dataset) else list(data)
-        if not observations:
-            raise ModelError(
-                "there is nothing to learn from", expected="at least one observation", got="none"
-            )
-        pairs = [measurement_of(o, self.system, self.noise_std) for o in observations]
-        at = [self._states(m) for m, _ in pairs]
-        scales = []
-        for p, prior in enumerate(self.force_priors):
-            if prior.name not in learn and self.training is not None:
-                scales.append(self.training.scales[p])
-                continue
-            features = [prior.features(self.system, a) for a in at]
-            scales.append(Standardization.of({k: torch.cat([f[k] for f in features]) for k in features[0]}))
-        return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales))
+        return training_of(data, self.system, self.force_priors, self.noise_std, self.training, learn)
 
     def _states(self, m: Measurement) -> States:
         return states(self.system, m.q, m.qd, m.tau, m.active)
@@ -201,11 +194,7 @@ class StructuredGP(Model):
     def _checkpoint(
         self, path: Path, problem: Problem, options: LearningOptions, start: dict[str, Tensor]
     ) -> Checkpoint:
-        columns = ("q", "qd", "tau", "active", "values")
-        data = [getattr(m, name) for m in problem.training.measurements for name in columns]
-        priors = [(type(prior).__name__, prior.name, prior.kernel) for prior in self.force_priors]
-        settings = (self.mean, priors, options, list(start))
-        return Checkpoint(path, Checkpoint.key_of(*settings, *data, *problem.training.noise_std))
+        return Checkpoint(path, problem.key(options, list(start)))
 
     def _adopt(self, problem: Problem, tensors: dict[str, Tensor]) -> None:
         """Keep learned values and condition on the training data."""
@@ -308,13 +297,13 @@ class StructuredGP(Model):
         fitted = self.posterior
         system = system or self.system
         batch, at = states_at(system, q, qd, tau, active)
-        z = affine_map(system, at, quantity)
+        z, parts = stack(affine_maps(system, at, quantity))
         mean = fitted.read_mean(system, at, z)
         spread = fitted.read_covariance(system, at, z) if covariance else None
         return Prediction(
             mean.reshape(*batch, z.o.shape[-1]),
             None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
-            _parts(system, at, quantity, z.o.shape[-1]),
+            parts,
         )
 
     def force_field(self) -> ForceField:
@@ -326,34 +315,3 @@ class StructuredGP(Model):
     def save(self, path: str | Path) -> None:
         """Write the model as a folder; `forcegp.load_model` reads it back exactly."""
         save_structured(self, path)
-
-
-def _beginning(begin: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Where learning begins: at given values of what is learned.
-
-    Raises:
-        ModelError: a value is missing, or of another shape.
-    """
-    for key, value in start.items():
-        got = begin[key].shape if key in begin else None
-        if got != value.shape:
-            raise ModelError(
-                f"the hyperparameters to begin with do not fit: {key}",
-                expected=tuple(value.shape),
-                got="none" if got is None else tuple(got),
-                hint="take those of a model with the same priors",
-            )
-    return {key: begin[key].detach().to(value) for key, value in start.items()}
-
-
-def _parts(
-    system: ConstrainedSystem, at: States, quantity: str | Sequence[str], width: int
-) -> dict[str, slice]:
-    """Where each quantity is among the columns of all `(width,)`."""
-    if isinstance(quantity, str):
-        return {quantity: slice(0, width)}
-    parts, first = {}, 0
-    for name in quantity:
-        last = first + affine_map(system, at, name).o.shape[-1]
-        parts[name], first = slice(first, last), last
-    return parts

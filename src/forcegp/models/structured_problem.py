@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,50 +11,19 @@ import torch
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.data import farthest_points, standardized
+from forcegp.errors import ModelError
 from forcegp.gp.checkpoint import Checkpoint
 from forcegp.gp.exact import negative_log_likelihood
 from forcegp.gp.hyperprior import bounds_of, initial_hyperparameters, negative_log_prior
 from forcegp.gp.learning import Learned, LearningOptions, Progress, minimise
-from forcegp.gp.priors import ForcePrior, Standardization
-from forcegp.gp.whitening import ForceMean, Measurement, WhitenedRows, combine, whiten
+from forcegp.gp.priors import ForcePrior
+from forcegp.gp.whitening import ForceMean, WhitenedRows, combine, whiten
+from forcegp.models.structured_training import Training
 
 NOISE = "noise."
 ANALYTICAL = "analytical."
 OWN = (NOISE, ANALYTICAL)
 """Prefixes of what is learned beside the hyperparameters of the priors."""
-
-
-@dataclass(frozen=True)
-class Training:
-    """What a fitted model keeps of its training data.
-
-    Attributes:
-        measurements: the values conditioned on.
-        noise_std: of each measurement, as given `(d,)`.
-        scales: standardization of each prior's inputs.
-    """
-
-    measurements: tuple[Measurement, ...]
-    noise_std: tuple[Tensor, ...]
-    scales: tuple[Standardization, ...]
-
-    @property
-    def samples(self) -> int:
-        """Number of samples in all measurements."""
-        return sum(len(m.q) for m in self.measurements)
-
-    def thinned(self, samples: int) -> Training:
-        """About so many samples: the farthest points among the distinct states of each measurement."""
-        share = samples / self.samples
-        thin = tuple(m[_spread(m, math.ceil(share * len(m.q)))] for m in self.measurements)
-        return dataclasses.replace(self, measurements=thin)
-
-
-def _spread(m: Measurement, count: int) -> Tensor:
-    """Rows of distinct states that are far from each other, at most `count`."""
-    x = standardized(torch.cat([m.q, m.qd, m.tau], dim=-1))
-    return farthest_points(x, min(count, len(x.unique(dim=0))))
 
 
 def kernel_parameters(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -66,6 +34,24 @@ def kernel_parameters(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 def analytical_parameters(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """The analytical parameters θ_A among learned tensors, by their name in the module."""
     return {k.removeprefix(ANALYTICAL): v for k, v in tensors.items() if k.startswith(ANALYTICAL)}
+
+
+def beginning(begin: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Where learning begins: at given values of what is learned.
+
+    Raises:
+        ModelError: a value is missing, or of another shape.
+    """
+    for key, value in start.items():
+        got = begin[key].shape if key in begin else None
+        if got != value.shape:
+            raise ModelError(
+                f"the hyperparameters to begin with do not fit: {key}",
+                expected=tuple(value.shape),
+                got="none" if got is None else tuple(got),
+                hint="take those of a model with the same priors",
+            )
+    return {key: begin[key].detach().to(value) for key, value in start.items()}
 
 
 @dataclass(frozen=True)
@@ -119,6 +105,12 @@ class Problem:
             start |= {ANALYTICAL + name: value.detach().clone() for name, value in named}
         return start
 
+    def key(self, options: LearningOptions, names: list[str]) -> str:
+        """What tells the learning of some tensors on these data, with these options, from any other."""
+        data = [value for m in self.training.measurements for value in m.tensors]
+        priors = [(type(prior).__name__, prior.name, prior.kernel) for prior in self.priors]
+        return Checkpoint.key_of(self.mean, priors, options, names, *data, *self.training.noise_std)
+
     def objective(
         self, tensors: dict[str, Tensor], held: dict[str, Tensor], center: dict[str, Tensor]
     ) -> Tensor:
@@ -158,7 +150,11 @@ class Problem:
             def objective(tensors: dict[str, Tensor]) -> Tensor:
                 return problem.objective(tensors, held, start) - constant
 
-            learned = minimise(objective, begin, options, analytical, bounds, note)
+            def whole(evaluations: int, value: float, best: dict[str, Tensor]) -> None:
+                if note is not None:
+                    note(evaluations, value + constant, best)
+
+            learned = minimise(objective, begin, options, analytical, bounds, whole)
             history = [value + constant for value in learned.history]
             return dataclasses.replace(learned, value=learned.value + constant, history=history)
 

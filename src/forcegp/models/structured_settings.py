@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field
 
 from forcegp.errors import ModelError
-from forcegp.gp import kernels
+from forcegp.gp import kernels, stationary
 from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior, NormalForcePrior
 from forcegp.models.base import not_fitted
 from forcegp.models.folder import Settings, write_model
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from forcegp.models.structured_gp import StructuredGP
 
 STATIONARY = {
-    "squared_exponential": kernels.SquaredExponential,
-    "matern32": kernels.Matern32,
-    "matern52": kernels.Matern52,
+    "squared_exponential": stationary.SquaredExponential,
+    "matern32": stationary.Matern32,
+    "matern52": stationary.Matern52,
 }
 PAIRS = {"sum": kernels.Sum, "product": kernels.Product}
 COLUMNS = ("q", "qd", "tau", "active", "values")

@@ -9,29 +9,28 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 from torch import Tensor
 
-from forcegp.constraints import (
-    Baumgarte,
-    ConstrainedSystem,
-    Constraint,
-    Cylinder,
-    Plane,
-    PointConnection,
-    Sphere,
-    Surface,
-    SurfaceContact,
-)
+from forcegp.constraints import Baumgarte, ConstrainedSystem, Constraint
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.models.system_records import (
+    BaumgarteRecord,
+    PointConnectionRecord,
+    RobotRecord,
+    SurfaceContactRecord,
+    SystemRecord,
+    UnsavedRecord,
+    contact_record,
+    fields_of,
+)
 from forcegp.robot.model import RobotModel
 
 PREFIX = "system."
 """Of the names of the robot's tensors."""
-Point = tuple[float, float, float]
 SHAPES: dict[str, tuple[str | int, ...]] = {
     "placement_rotation": ("nq", 3, 3),
     "placement_position": ("nq", 3),
@@ -45,120 +44,7 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "gravity": (3,),
 }
 """Shape of each tensor of a robot; one number a joint where not named."""
-POINTS = ("point", "other_point", "normal", "center", "axis")
 MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
-
-
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class _Robot(_Record):
-    name: str
-    joint_names: tuple[str, ...]
-    joint_types: tuple[Literal["revolute", "prismatic"], ...]
-    parents: tuple[int, ...]
-    frame_names: tuple[str, ...]
-    frame_parents: tuple[int, ...]
-    remarks: tuple[str, ...]
-
-
-class _Plane(_Record):
-    type: Literal["plane"] = "plane"
-    normal: Point
-    offset: float
-
-    def build(self) -> Surface:
-        return Plane(self.normal, self.offset)
-
-
-class _Sphere(_Record):
-    type: Literal["sphere"] = "sphere"
-    center: Point
-    radius: float
-
-    def build(self) -> Surface:
-        return Sphere(self.center, self.radius)
-
-
-class _Cylinder(_Record):
-    type: Literal["cylinder"] = "cylinder"
-    center: Point
-    axis: Point
-    radius: float
-
-    def build(self) -> Surface:
-        return Cylinder(self.center, self.axis, self.radius)
-
-
-class _SurfaceContact(_Record):
-    type: Literal["surface_contact"] = "surface_contact"
-    name: str
-    frame: str
-    point: Point
-    surface: Annotated[_Plane | _Sphere | _Cylinder, Field(discriminator="type")]
-
-    def build(self) -> Constraint:
-        return SurfaceContact(self.name, self.frame, self.point, self.surface.build())
-
-
-class _PointConnection(_Record):
-    type: Literal["point_connection"] = "point_connection"
-    name: str
-    frame: str
-    point: Point
-    other_frame: str | None
-    other_point: Point
-
-    def build(self) -> Constraint:
-        return PointConnection(self.name, self.frame, self.point, self.other_frame, self.other_point)
-
-
-class _Unsaved(_Record):
-    """The place of a constraint that only Python code can describe."""
-
-    type: Literal["unsaved"] = "unsaved"
-    name: str
-    described_by: str
-
-
-class _Baumgarte(_Record):
-    natural_frequency: float
-    damping_ratio: float
-
-
-class _System(_Record):
-    robot: _Robot
-    contacts: tuple[
-        Annotated[_SurfaceContact | _PointConnection | _Unsaved, Field(discriminator="type")], ...
-    ]
-    baumgarte: _Baumgarte | None
-
-
-def _fields(value: Any, record: type[_Record]) -> dict[str, Any]:
-    """The attributes of a value that a record keeps."""
-    names = [name for name in record.model_fields if name not in ("type", "surface")]
-    kept = {name: getattr(value, name) for name in names}
-    return kept | {name: tuple(map(float, kept[name])) for name in POINTS if name in kept}
-
-
-def _surface_record(surface: Surface) -> _Plane | _Sphere | _Cylinder | None:
-    if type(surface) is Plane:
-        return _Plane(**_fields(surface, _Plane))
-    if type(surface) is Sphere:
-        return _Sphere(**_fields(surface, _Sphere))
-    return _Cylinder(**_fields(surface, _Cylinder)) if type(surface) is Cylinder else None
-
-
-def _contact_record(contact: Constraint) -> _SurfaceContact | _PointConnection | _Unsaved:
-    if type(contact) is PointConnection:
-        return _PointConnection(**_fields(contact, _PointConnection))
-    if type(contact) is not SurfaceContact:
-        return _Unsaved(name=contact.name, described_by=type(contact).__name__)
-    surface = _surface_record(contact.surface)
-    if surface is None:
-        return _Unsaved(name=contact.name, described_by=type(contact.surface).__name__)
-    return _SurfaceContact(**_fields(contact, _SurfaceContact), surface=surface)
 
 
 def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -171,10 +57,10 @@ def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Te
         The JSON object, and detached copies of the tensors on the CPU.
     """
     robot, rule = system.robot, system.baumgarte
-    record = _System(
-        robot=_Robot(**_fields(robot, _Robot)),
-        contacts=tuple(_contact_record(contact) for contact in system.contacts),
-        baumgarte=None if rule is None else _Baumgarte(**_fields(rule, _Baumgarte)),
+    record = SystemRecord(
+        robot=RobotRecord(**fields_of(robot, RobotRecord)),
+        contacts=tuple(contact_record(contact) for contact in system.contacts),
+        baumgarte=None if rule is None else BaumgarteRecord(**fields_of(rule, BaumgarteRecord)),
     )
     tensors = {
         PREFIX + field.name: value.detach().to("cpu", copy=True).contiguous()
@@ -202,7 +88,7 @@ def unpack_system(
         ModelError: a field or tensor is missing, damaged or not valid, or a constraint is to be given.
     """
     try:
-        record = _System.model_validate(dict(json))
+        record = SystemRecord.model_validate(dict(json))
     except ValidationError as cause:
         first = cause.errors()[0]
         place = ".".join(str(part) for part in ("system", *first["loc"]))
@@ -222,9 +108,11 @@ def unpack_system(
 
 
 def _contact(
-    record: _SurfaceContact | _PointConnection | _Unsaved, source: str, given: ConstrainedSystem | None
+    record: SurfaceContactRecord | PointConnectionRecord | UnsavedRecord,
+    source: str,
+    given: ConstrainedSystem | None,
 ) -> Constraint:
-    if not isinstance(record, _Unsaved):
+    if not isinstance(record, UnsavedRecord):
         return record.build()
     if given is None:
         raise ModelError(
@@ -234,7 +122,7 @@ def _contact(
     return given.contact(record.name)
 
 
-def _robot(record: _Robot, tensors: Mapping[str, Tensor], source: str) -> RobotModel:
+def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> RobotModel:
     sizes = {"nq": len(record.joint_names), "nf": len(record.frame_names)}
     joints = {"joint_types": sizes["nq"], "parents": sizes["nq"], "frame_parents": sizes["nf"]}
     for name, length in joints.items():
@@ -256,7 +144,7 @@ def _robot(record: _Robot, tensors: Mapping[str, Tensor], source: str) -> RobotM
     return RobotModel(**{name: getattr(record, name) for name in type(record).model_fields}, **own)
 
 
-def _check_parents(record: _Robot, source: str) -> None:
+def _check_parents(record: RobotRecord, source: str) -> None:
     """Parents come before their children, and frames belong to joints that exist."""
     for name, parents, limit in (
         ("parents", record.parents, None),

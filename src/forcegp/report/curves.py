@@ -9,13 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from forcegp.report.data import SPLITS, IdentificationData, PaperNumbers, Results, Score
+from forcegp.report.data import GP_MODELS, SPLITS, IdentificationData, PaperNumbers, Results, Score
 from forcegp.report.style import AXES, INK, MARKERS, Picture, colour, draw, label
 
 WIDTH = 4.6
-GP_MODELS = ("gp", "sgp-zero", "sgp-mean", "sgp-contact")
-PAPER_KERNELS = ("sgp-zero-se", "sgp-mean-se")
-"""The paper's structured models with its kernel alone: in tables, not in figures."""
 FLOOR = (2.0 / torch.pi) ** 0.5
 """Mean magnitude of standard normal noise: no model's error against noisy accelerations is smaller."""
 

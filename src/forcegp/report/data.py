@@ -15,6 +15,9 @@ from forcegp.files import Header
 Series = list[float]
 DIGITS = 7
 """Significant digits kept in series that are only drawn."""
+GP_MODELS = ("gp", "sgp-zero", "sgp-mean", "sgp-contact")
+PAPER_KERNELS = ("sgp-zero-se", "sgp-mean-se")
+"""The paper's structured models with its kernel alone: in tables, not in figures."""
 SPLITS = {"stretches": "held-out stretches", "selection": "paper's split"}
 """The two ways of choosing test samples, by name, and what they are called."""
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from forcegp.report.curves import FLOOR, GP_MODELS
+from forcegp.report.curves import FLOOR
 from forcegp.report.data import (
+    GP_MODELS,
     IdentificationData,
     IdentificationRun,
     MultiplierData,

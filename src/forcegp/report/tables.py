@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from forcegp.report.curves import GP_MODELS, PAPER_KERNELS
-from forcegp.report.data import SPLITS, PaperNumbers, Results, Score
+from forcegp.report.data import GP_MODELS, PAPER_KERNELS, SPLITS, PaperNumbers, Results, Score
 from forcegp.report.style import label
 
 NONE = "–"

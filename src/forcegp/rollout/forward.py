@@ -21,7 +21,7 @@ from forcegp.rollout.problem import Problem, State
 from forcegp.rollout.run import Progress, run
 from forcegp.rollout.stabilize import stabilized_system
 from forcegp.rollout.trajectory import DivergedError, Rollout
-from forcegp.simulate.threads import one_thread
+from forcegp.threads import one_thread
 
 CLOSED = 5e-4
 """Where contacts can open, one is closed at the start if its error is below this [m]: more than the drift of

@@ -15,8 +15,8 @@ from forcegp.simulate.control import control_torque, tool_motion
 from forcegp.simulate.engine import Engine, make_engine
 from forcegp.simulate.plan import Plan, make_plan
 from forcegp.simulate.result import Log, SimulationResult, make_result
-from forcegp.simulate.threads import one_thread
 from forcegp.simulate.touch import any_row, contact_forces, land
+from forcegp.threads import one_thread
 
 RUNAWAY_SPEED = 50.0
 """A joint faster than this [rad/s] is no motion that anybody planned."""
