@@ -134,14 +134,24 @@ def test_bands_that_hold_too_little_or_too_much_are_named() -> None:
     assert both is not None and both.agrees is False
     assert "outside: S-GP, analytical mean, S-GP, mean and contact prior." in both.text
     assert bands(rollouts(model_path("analytical", 0.1))) is None
+    narrow = model_path("sgp-mean", 0.1, 0.7)
+    calibrated = narrow.model_copy(update={"inflation": 1.5, "calibrated_coverage": 0.9})
+    widened = bands(rollouts(calibrated))
+    assert widened is not None and widened.agrees and "0.700, widened by 1.50 0.900" in widened.text
+    mixed = bands(rollouts(calibrated, model_path("sgp-contact", 0.1, 0.7)))
+    assert mixed is not None and not mixed.agrees
 
 
 def test_the_rollout_table_has_errors_coverage_and_drift() -> None:
     table = rollout_table(rollouts())
     assert "2 starts, 0.5 s" in table.caption
     rows = {row[0]: row[1:] for row in table.rows}
-    assert rows["Neural network, 80"] == ("1", "diverged", "–", "1.0e-04")
-    assert rows["S-GP, analytical mean"] == ("1", "30", "0.900", "1.0e-04")
+    assert rows["Neural network, 80"] == ("1", "diverged", "–", "–", "1.0e-04")
+    assert rows["S-GP, analytical mean"] == ("1", "30", "0.900", "–", "1.0e-04")
+    calibrated = model_path("sgp-mean", 0.1, 0.7).model_copy(
+        update={"inflation": 1.5, "calibrated_coverage": 0.9}
+    )
+    assert rollout_table(rollouts(calibrated)).rows[0][-3:-1] == ("0.700", "0.900 (× 1.50)")
     plain = rollout_table(rollouts(model_path("analytical", 0.1)))
     assert "bands" not in plain.caption
 

@@ -147,6 +147,11 @@ def test_comparison_tells_models_apart_and_the_page_holds_them(tmp_path) -> None
     assert found.error_at("sgp-mean", 0.25) < found.error_at("analytical", 0.25)
     assert found.error_at("analytical", 0.25) < found.error_at("nn", 0.25)
     assert 0.0 <= found.coverage("sgp-mean") <= 1.0
+    factor = found.inflation("sgp-mean", 0.8)
+    assert found.coverage("sgp-mean", 0.8, 1.001 * factor) >= 0.8
+    assert found.coverage("sgp-mean", 0.8, 0.9 * factor) < 0.8
+    again = compare({"sgp-mean": models["sgp-mean"]}, log(), 0.3, torch.tensor([0, 215]), 3)
+    assert torch.equal(again.predicted_tip("sgp-mean"), found.predicted_tip("sgp-mean"))
     start = found.predicted_tip("analytical")[:, 0]
     assert torch.allclose(start, simulated(1.0).position[[0, 215]], atol=1e-12)
     data = rollout_data(found)
@@ -173,6 +178,8 @@ def test_a_selected_log_cannot_be_compared_with() -> None:
     models: dict[str, Model] = {"analytical": AnalyticalModel(arm(Baumgarte()))}
     with pytest.raises(DataError, match="too short"):
         compare(models, data, 50.0)
+    with pytest.raises(DataError, match="too short"):
+        compare(models, data, 0.1, torch.tensor([0, len(data) - 2]))
     with pytest.raises(DataError, match="order of time"):
         compare(models, data[torch.randperm(len(data), generator=torch.Generator().manual_seed(0))], 0.1)
 

@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
+
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.experiments.fits import Fit
@@ -21,9 +23,8 @@ from forcegp.simulate import simulate
 ROLLOUTS = "data.json"
 OTHER_MOTION = 1000
 """Added to the task's seed for the motion that no model saw."""
-BAND_SECONDS, BAND_STARTS = 2.0, 5
-"""At most so long [s], and from so many starts, are function samples rolled out: each costs a trajectory more
-from every start."""
+BAND_SECONDS = 2.0
+"""At most so long are function samples rolled out [s]: each costs a trajectory more from every start."""
 
 
 def rollouts(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]) -> RolloutData:
@@ -44,7 +45,7 @@ def rollouts(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]) ->
             "starts": sizes.rollout_starts,
             "samples": sizes.rollout_samples,
             "band_seconds": BAND_SECONDS,
-            "band_starts": BAND_STARTS,
+            "calibrated": True,
         },
         inputs=[simulated, *(fit.stage for fit in fits)],
     )
@@ -81,8 +82,14 @@ def _roll(
         return lambda done, total: advance(done, total, what)
 
     paths = compare(models, data, seconds, starts, system=system, progress=reported("means"))
-    seconds, starts, samples = min(BAND_SECONDS, seconds), min(BAND_STARTS, starts), sizes.rollout_samples
+    seconds, samples = min(BAND_SECONDS, seconds), sizes.rollout_samples
     bands = compare(
         sampled, data, seconds, starts, samples, system=system, progress=reported("function samples")
     )
-    write_text(folder / ROLLOUTS, with_bands(rollout_data(paths), rollout_data(bands)).to_json())
+    held = torch.tensor([first for first, _ in task.stretches()][:starts])
+    seconds = min(seconds, sizes.stretch)
+    calibration = compare(
+        sampled, task.data, seconds, held, samples, system=system, progress=reported("their calibration")
+    )
+    found = with_bands(rollout_data(paths), rollout_data(bands, calibration))
+    write_text(folder / ROLLOUTS, found.to_json())

@@ -43,6 +43,8 @@ class ModelPath(Part):
         lost: probability that contact was lost by then, over samples; empty without samples.
         errors: tip error after each horizon, median over the starts [m]; `None` where over half diverged.
         coverage: share of logged tip coordinates within the band; `None` without samples.
+        inflation: factor on the band that holds the right share of another motion, where one was tried.
+        calibrated_coverage: share within the band that is longer by that factor.
         worst_drift: largest constraint error of mean and samples over all starts [m].
         diverged_at: when the first trajectory was given up [s].
     """
@@ -57,6 +59,8 @@ class ModelPath(Part):
     lost: Series
     errors: list[float | None]
     coverage: float | None
+    inflation: float | None = None
+    calibrated_coverage: float | None = None
     worst_drift: float | None
     diverged_at: float | None
 
@@ -92,7 +96,7 @@ class RolloutData(Header):
     """
 
     FORMAT: ClassVar[str] = "forcegp-rollout"
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
     MAX_BYTES: ClassVar[int] = 1 << 24
 
     t: Series
@@ -109,8 +113,13 @@ class RolloutData(Header):
     films: list[Film]
 
 
-def rollout_data(found: Comparison) -> RolloutData:
-    """The data of the section from a comparison; curves are those of its first start."""
+def rollout_data(found: Comparison, calibration: Comparison | None = None) -> RolloutData:
+    """The data of the section from a comparison; curves are those of its first start.
+
+    Args:
+        found: the comparison.
+        calibration: one of the same models with another motion, which bands are made longer to hold.
+    """
     horizons = [h for h in HORIZONS if h <= float(found.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(found.t[1] - found.t[0]))))
     joints = [arm_points(found.system.robot, found.q[0, ::stride], found)]
@@ -129,7 +138,7 @@ def rollout_data(found: Comparison) -> RolloutData:
         band_seconds=float(found.t[-1]),
         level=LEVEL,
         horizons=horizons,
-        models=[_model_path(found, name, horizons) for name in found.predicted],
+        models=[_model_path(found, name, horizons, calibration) for name in found.predicted],
         frame_times=series(found.t[::stride]),
         bodies=joints[0].shape[1],
         films=films,
@@ -154,12 +163,14 @@ def with_bands(paths: RolloutData, bands: RolloutData) -> RolloutData:
 def _with_bands(path: ModelPath, band: ModelPath) -> ModelPath:
     drifts = [x.worst_drift for x in (path, band) if x.worst_drift is not None]
     times = [x.diverged_at for x in (path, band) if x.diverged_at is not None]
-    names = ("tip_bands", "multiplier_band", "lost", "coverage")
+    names = ("tip_bands", "multiplier_band", "lost", "coverage", "inflation", "calibrated_coverage")
     worst = {"worst_drift": max(drifts, default=None), "diverged_at": min(times, default=None)}
     return path.model_copy(update={name: getattr(band, name) for name in names} | worst)
 
 
-def _model_path(found: Comparison, name: str, horizons: list[float]) -> ModelPath:
+def _model_path(
+    found: Comparison, name: str, horizons: list[float], calibration: Comparison | None
+) -> ModelPath:
     rolled = found.predicted[name]
     n = _sound(rolled.q[0])
     samples, contacts = rolled.samples, rolled.system.m > 0
@@ -167,6 +178,7 @@ def _model_path(found: Comparison, name: str, horizons: list[float]) -> ModelPat
     known = bool(torch.isfinite(multiplier).all()) and len(multiplier) > 0
     errors = [found.error_at(name, horizon) for horizon in horizons]
     times = [d.t for d in (*rolled.diverged, *(samples.diverged if samples else ()))]
+    inflation = calibration.inflation(name) if samples and calibration else None
     drifts = [x.drift.nan_to_num(0.0).abs().max() for x in (rolled, samples) if x is not None and contacts]
     return ModelPath(
         model=name,
@@ -179,6 +191,8 @@ def _model_path(found: Comparison, name: str, horizons: list[float]) -> ModelPat
         lost=series(rolled.contact_lost()[0, :n, 0]) if samples and contacts else [],
         errors=[e if math.isfinite(e) else None for e in errors],
         coverage=found.coverage(name) if samples else None,
+        inflation=inflation,
+        calibrated_coverage=None if inflation is None else found.coverage(name, inflation=inflation),
         worst_drift=float(torch.stack(drifts).max()) if drifts else None,
         diverged_at=min(times) if times else None,
     )

@@ -41,15 +41,24 @@ def tip_error(data: RolloutData) -> Finding | None:
 
 def bands(data: RolloutData) -> Finding | None:
     """Whether bands over function samples hold as much of the simulated motion as they should."""
-    shares = {path.model: path.coverage for path in data.models if path.coverage is not None}
-    if not shares:
+    sampled = [path for path in data.models if path.coverage is not None]
+    if not sampled:
         return None
-    outside = [label(m) for m, share in shares.items() if not HELD[0] <= share <= HELD[1]]
-    listed = ", ".join(f"{label(m)} {share:.3f}" for m, share in shares.items())
+    calibrated = all(path.calibrated_coverage is not None for path in sampled)
+    listed = []
+    for path in sampled:
+        text = f"{label(path.model)} {path.coverage:.3f}"
+        if path.calibrated_coverage is not None:
+            text += f", widened by {path.inflation:.2f} {path.calibrated_coverage:.3f}"
+        listed.append(text)
+    shares = {p.model: p.calibrated_coverage if calibrated else p.coverage for p in sampled}
+    outside = [label(m) for m, s in shares.items() if s is None or not HELD[0] <= s <= HELD[1]]
     text = (
         f"Share of simulated tip positions in {data.level:.0%} bands over function samples, "
-        f"{data.band_starts} starts, {data.band_seconds:.3g} s (wanted: {HELD[0]:.2f} to {HELD[1]:.2f}): "
-        f"{listed}" + (f"; outside: {', '.join(outside)}." if outside else ".")
+        f"{data.band_starts} starts, {data.band_seconds:.3g} s (wanted: {HELD[0]:.2f} to {HELD[1]:.2f}), "
+        + ("as they are and widened to hold held-out stretches of the training run: " if calibrated else "")
+        + "; ".join(listed)
+        + (f"; outside: {', '.join(outside)}." if outside else ".")
     )
     return Finding("Bands of trajectories", not outside, text)
 

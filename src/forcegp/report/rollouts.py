@@ -131,18 +131,27 @@ def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
 
 def rollout_table(data: RolloutData) -> Table:
     """Tip errors at the horizons, coverage of the bands and largest drift."""
-    heads = ("model", *(f"after {h:g} s [mm]" for h in data.horizons), "in band", "largest |c(q)| [m]")
+    heads = (
+        "model",
+        *(f"after {h:g} s [mm]" for h in data.horizons),
+        "in band",
+        "widened",
+        "largest |c(q)| [m]",
+    )
     rows = []
     for path in data.models:
         errors = ["diverged" if e is None else f"{1e3 * e:.3g}" for e in path.errors]
         coverage = "–" if path.coverage is None else f"{path.coverage:.3f}"
+        calibrated = path.calibrated_coverage
+        widened = "–" if calibrated is None else f"{calibrated:.3f} (× {path.inflation:.2f})"
         drift = "–" if path.worst_drift is None else f"{path.worst_drift:.1e}"
-        rows.append((label(path.model), *errors, coverage, drift))
+        rows.append((label(path.model), *errors, coverage, widened, drift))
     caption = f"Tip error in open loop (median over {data.starts} starts)"
     if any(path.coverage is not None for path in data.models):
         caption += (
             f"; share of simulated tip positions in the {data.level:.0%} bands over function samples "
-            f"({data.band_starts} starts, {data.band_seconds:.3g} s)"
+            f"({data.band_starts} starts, {data.band_seconds:.3g} s), and in the bands widened by the factor "
+            "that held-out stretches of the training run ask for"
         )
     return Table(caption, heads, tuple(rows))
 

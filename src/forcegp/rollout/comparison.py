@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,7 @@ from forcegp.errors import DataError
 from forcegp.models.base import Model
 from forcegp.rollout.forward import RolloutOptions, rollout_model
 from forcegp.rollout.run import Progress
-from forcegp.rollout.trajectory import Rollout
+from forcegp.rollout.trajectory import Bands, Rollout
 
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Times at which tip errors are reported [s]."""
@@ -72,17 +73,39 @@ class Comparison:
         step = int((self.t - horizon).abs().argmin())
         return float(self.tip_error(model)[:, step].median())
 
-    def coverage(self, model: str, level: float = LEVEL) -> float:
+    def coverage(self, model: str, level: float = LEVEL, inflation: float = 1.0) -> float:
         """Share of tip coordinates that the band over samples holds, of all starts and times but the first.
 
         On a surface only the coordinates along it count, as the constraint leaves none across.
+
+        Args:
+            model: name.
+            level: part of the samples that the band holds.
+            inflation: factor on the half-widths of the band, such as `inflation` of another comparison.
         """
+        logged, band = self._tip_along(model, level)
+        band = band.widened(inflation)
+        inside = (logged >= band.lower) & (logged <= band.upper)
+        return float(inside.to(self.q.dtype).mean())
+
+    def inflation(self, model: str, level: float = LEVEL) -> float:
+        """Factor by which bands must be longer to hold `level` of these tip coordinates (split conformal).
+
+        The `level`-quantile of |logged − median| / (half-width on that side). Bands of trajectories like
+        these, widened by it, hold about that share, whatever the model got wrong.
+        """
+        logged, band = self._tip_along(model, level)
+        apart = logged - band.median
+        half = torch.where(apart < 0.0, band.median - band.lower, band.upper - band.median)
+        ratio = (apart.abs() / half).nan_to_num(torch.inf).flatten().sort().values
+        return float(ratio[min(math.ceil(level * len(ratio)), len(ratio) - 1)])
+
+    def _tip_along(self, model: str, level: float) -> tuple[Tensor, Bands]:
+        """Logged tip coordinates `(k, T − 1, d)`, along the surface if there is one, and the band of each."""
         along = self._tangents()
         sampled = (self.sampled_tip(model)[..., None, :] @ along)[..., 0, :]
         logged = (self.tip[..., None, :] @ along)[..., 0, :]
-        band = self.predicted[model].bands(sampled, level)
-        inside = (logged >= band.lower) & (logged <= band.upper)
-        return float(inside[:, 1:].to(self.q.dtype).mean())
+        return logged[:, 1:], self.predicted[model].bands(sampled[:, :, 1:], level)
 
     def _tangents(self) -> Tensor:
         """Orthonormal directions along the surface under the logged tip `(k, T, 3, 2)`, or all axes."""
@@ -114,7 +137,7 @@ def compare(
     models: Mapping[str, Model],
     data: Dataset,
     duration: float,
-    starts: int = 1,
+    starts: int | Tensor = 1,
     samples: int = 0,
     *,
     system: ConstrainedSystem | None = None,
@@ -127,7 +150,7 @@ def compare(
         models: fitted models by name.
         data: a log in the order of time.
         duration: of each trajectory [s].
-        starts: how many, evenly spread over the log.
+        starts: how many, evenly spread over the log, or the rows to start from.
         samples: function samples of the models that have them.
         system: robot and contacts of the log; those of the first model by default.
         options: how the rollouts are computed; a diverging one is kept up to there.
@@ -187,18 +210,21 @@ def _period(data: Dataset) -> float:
     return data.header.dt or float((data.t[1:] - data.t[:-1]).median())
 
 
-def _starts(data: Dataset, steps: int, count: int) -> Tensor:
-    """Rows `(count,)` that `steps` further rows of the same trajectory follow, evenly spread."""
-    last = len(data) - 1 - steps
-    fits = torch.arange(max(last + 1, 0))
+def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
+    """Rows `(count,)` that `steps` more of the same trajectory follow: those given, or evenly spread."""
+    count = starts if isinstance(starts, int) else len(starts)
+    fits = torch.arange(max(len(data) - steps, 0))
     fits = fits[data.segment[fits] == data.segment[fits + steps]]
-    if len(fits) < count or not data.header.ordered:
+    sound = len(fits) >= count if isinstance(starts, int) else bool(torch.isin(starts, fits).all())
+    if not sound or not data.header.ordered:
         raise DataError(
             "the log is too short for the rollouts, or not in the order of time",
             expected=f"{count} starts with {steps} further samples in the same trajectory",
             got=f"{len(data)} samples, {len(fits)} such starts",
             hint="a shorter duration, or a log that was not selected from",
         )
+    if not isinstance(starts, int):
+        return starts
     return fits[torch.linspace(0, len(fits) - 1, count).round().long()]
 
 

@@ -60,6 +60,11 @@ class Bands(NamedTuple):
     upper: Tensor
     median: Tensor
 
+    def widened(self, inflation: float) -> Bands:
+        """The band with both halves longer by a factor, about the same median."""
+        lower = self.median + inflation * (self.lower - self.median)
+        return Bands(lower, self.median + inflation * (self.upper - self.median), self.median)
+
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
