@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     )
     from forcegp.data import Dataset, SavitzkyGolay
     from forcegp.evaluation import Evaluation, evaluate
+    from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior
     from forcegp.gp.learning import LearningOptions
     from forcegp.gp.mean import AnalyticalMean
-    from forcegp.gp.priors import ContactForcePrior, JointForcePrior, NormalForcePrior, OperatorForcePrior
+    from forcegp.gp.priors import JointForcePrior, NormalForcePrior, OperatorForcePrior
     from forcegp.models.analytical import AnalyticalModel
     from forcegp.models.files import load_model
     from forcegp.models.independent_gp import IndependentGP
@@ -40,7 +41,7 @@ _HOME = {
     "AnalyticalParameters": "robot",
     "Baumgarte": "constraints",
     "ConstrainedSystem": "constraints",
-    "ContactForcePrior": "gp.priors",
+    "ContactForcePrior": "gp.contact_priors",
     "Cylinder": "constraints",
     "Dataset": "data",
     "Evaluation": "evaluation",
@@ -61,6 +62,7 @@ _HOME = {
     "Scene": "scene",
     "Sphere": "constraints",
     "StructuredGP": "models.structured_gp",
+    "SlidingFrictionPrior": "gp.contact_priors",
     "SurfaceContact": "constraints",
     "TaskSpaceControl": "rollout",
     "compiled": "",
@@ -101,6 +103,7 @@ __all__ = [
     "RolloutOptions",
     "SavitzkyGolay",
     "Scene",
+    "SlidingFrictionPrior",
     "Sphere",
     "StructuredGP",
     "SurfaceContact",

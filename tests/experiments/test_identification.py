@@ -15,7 +15,7 @@ from forcegp.experiments.identification import (
     identify_structured,
     wrong_parameters,
 )
-from forcegp.gp.priors import ContactForcePrior
+from forcegp.gp.contact_priors import ContactForcePrior
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 

@@ -8,8 +8,11 @@ import torch
 from torch import Tensor
 
 import forcegp
-from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior
-from forcegp.models.default_priors import CONTACT_FRICTION, REMAINING
+from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior
+from forcegp.gp.kernels import Linear
+from forcegp.gp.priors import ForcePrior, JointForcePrior
+from forcegp.gp.stationary import SquaredExponential
+from forcegp.models.default_priors import REMAINING
 
 CONTACTS = ("table", "ball")
 NOISE = 0.1
@@ -72,8 +75,8 @@ def logged(
 def all_priors() -> list[ForcePrior]:
     return [
         JointForcePrior(REMAINING),
-        ContactForcePrior("table", CONTACT_FRICTION),
-        ContactForcePrior("ball"),
+        ContactForcePrior("table", Linear(("velocity",)) + SquaredExponential()),
+        SlidingFrictionPrior("ball"),
     ]
 
 

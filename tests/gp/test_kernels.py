@@ -22,6 +22,7 @@ DRAWS = 20_000
 SE, M32, M52, LIN = SquaredExponential(), Matern32(), Matern52(), Linear()
 KERNELS: dict[str, Kernel] = {
     "squared exponential": SE,
+    "shared length-scales": SquaredExponential(shared=True),
     "matern 3/2": M32,
     "matern 5/2": M52,
     "linear": LIN,
@@ -30,6 +31,7 @@ KERNELS: dict[str, Kernel] = {
     "of one input": SquaredExponential(("qd",)),
     "sum": SE + LIN,
     "product": SquaredExponential(("q",)) * Matern52(("qd",)),
+    "shared in a product": Linear(("qd",), ard=False) * Matern52(("q",), shared=True),
     "nested": (Linear(("q",)) + Matern32()) * SquaredExponential(("qd",)),
 }
 kernels = pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS.keys())
@@ -67,7 +69,7 @@ def by_hand(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict, k: in
         slopes = [math.exp(float(v)) ** 2 for v in given.expand(len(a))]
         bias = math.exp(float(params["log_bias_std"][k])) ** 2
         return bias + sum(s * p * q for s, p, q in zip(slopes, a, b, strict=True))
-    lengths = [math.exp(float(v)) for v in params["log_lengthscale"][k]]
+    lengths = [math.exp(float(v)) for v in params["log_lengthscale"][0 if kernel.shared else k]]
     r = math.sqrt(sum(((p - q) / s) ** 2 for p, q, s in zip(a, b, lengths, strict=True)))
     variance = math.exp(float(params["log_std"][k])) ** 2
     profile = {

@@ -20,10 +20,11 @@ from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.errors import DataError, ForceGPError, ModelError, ShapeError, UnknownNameError
 from forcegp.gp.affine import QUANTITIES
 from forcegp.gp.checkpoint import Checkpoint
+from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior
 from forcegp.gp.hyperprior import negative_log_prior
 from forcegp.gp.kernels import Linear
 from forcegp.gp.learning import LearningOptions
-from forcegp.gp.priors import ContactForcePrior, JointForcePrior, OperatorForcePrior
+from forcegp.gp.priors import JointForcePrior, OperatorForcePrior
 from forcegp.gp.stationary import Matern52, SquaredExponential
 from forcegp.models.observation import Observation
 from forcegp.models.structured_gp import StructuredGP
@@ -387,9 +388,11 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "inputs": (
         lambda: JointForcePrior(inputs=("qdd",)),
         UnknownNameError,
-        "unknown input of a joint force prior",
+        r"unknown input of force prior 'joint'",
     ),
     "no inputs": (lambda: JointForcePrior(inputs=()), ModelError, "depends on nothing"),
+    "contact inputs": (lambda: ContactForcePrior("table", inputs=("q",)), UnknownNameError, "contact_table"),
+    "smoothing": (lambda: SlidingFrictionPrior("table", smoothing=0.0), ModelError, "smoothing speed"),
     "kernel": (
         lambda: fitted(force_priors=[JointForcePrior(Linear(("x",)))]),
         UnknownNameError,

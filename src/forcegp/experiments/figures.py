@@ -21,7 +21,7 @@ from forcegp.experiments.task import Task
 from forcegp.experiments.task_space import task_space_motion
 from forcegp.experiments.window import predicted_window
 from forcegp.files import Header, write_text
-from forcegp.gp.priors import ContactForcePrior
+from forcegp.models.default_priors import contact_priors
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.data import (
     PAPER_KERNELS,
@@ -185,4 +185,4 @@ def _identification(stages: Stages, sizes: Profile, tasks: Sequence[Task]) -> Id
 
 def _unknown_forces(task: Task) -> dict[str, list | None]:
     """Priors on the friction that the identification does not know."""
-    return {"sgp-mean": None, "sgp-contact": [ContactForcePrior(task.system.contact_names[0])]}
+    return {"sgp-mean": None, "sgp-contact": list(contact_priors(task.system))}

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, split_by_stretches
+from forcegp.gp.contact_priors import ContactForcePrior
 from forcegp.gp.kernels import Linear
 from forcegp.gp.mean import AnalyticalMean
-from forcegp.gp.priors import ContactForcePrior, JointForcePrior
+from forcegp.gp.priors import JointForcePrior
 from forcegp.gp.separation import force_correlation
 from forcegp.gp.states import states
 from forcegp.gp.stationary import SquaredExponential

@@ -30,7 +30,7 @@ Parameters = Mapping[str, Tensor]
 Initial = dict[str, Tensor]
 
 LINEAR_PAIRS = 8
-"""How many times fewer random features a factor of a product has where the other one is linear."""
+"""How many times fewer random features a factor of a product has for each linear factor of the other one."""
 
 
 def sub(params: Parameters, prefix: str) -> dict[str, Tensor]:
@@ -188,9 +188,10 @@ class Product(Sum):
                     product = Product(getattr(inner, part), getattr(self, other))
                     terms.append(product.draw(own | rest, features, generator))
                 return SumDraw(terms[0], terms[1])
-        if isinstance(self.left, Linear) or isinstance(self.right, Linear):
+        linear = max(_linear_factors(self.left), _linear_factors(self.right))
+        if linear:
             # A linear factor has few features and all of them matter, so the other one is given fewer.
-            few = max(1, features // LINEAR_PAIRS)
+            few = max(1, features // (LINEAR_PAIRS * linear))
             return OuterDraw(
                 self.left.draw(sub(params, "left"), few, generator),
                 self.right.draw(sub(params, "right"), few, generator),
@@ -199,3 +200,11 @@ class Product(Sum):
         left = self.left.draw(sub(params, "left"), features, generator)
         right = self.right.draw(sub(params, "right"), features, generator)
         return ProductDraw(left, right, features, int(torch.randint(2**31, (1,), generator=generator)))
+
+
+def _linear_factors(kernel: Kernel) -> int:
+    """Number of factors of a kernel that is linear, or a product of linear ones; 0 for any other."""
+    if isinstance(kernel, Product):
+        left, right = _linear_factors(kernel.left), _linear_factors(kernel.right)
+        return left + right if left and right else 0
+    return int(isinstance(kernel, Linear))

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.contact import SurfaceContact
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.gp.kernels import Kernel
 from forcegp.gp.states import States
@@ -57,9 +56,18 @@ class ForcePrior(ABC):
         """Raise a typed error where the prior does not fit the system."""
 
 
-def _check_inputs(prior: JointForcePrior | ContactForcePrior) -> None:
-    if not prior.inputs:
-        raise ModelError(f"force prior {prior.name!r} depends on nothing", expected="one input at least")
+def check_inputs(name: str, inputs: tuple[str, ...], known: tuple[str, ...]) -> None:
+    """Check what a force depends on.
+
+    Raises:
+        ModelError: on nothing.
+        UnknownNameError: on something that is not known.
+    """
+    if not inputs:
+        raise ModelError(f"force prior {name!r} depends on nothing", expected="one input at least")
+    for given in inputs:
+        if given not in known:
+            raise UnknownNameError(f"input of force prior {name!r}", given, known)
 
 
 @dataclass(frozen=True)
@@ -83,10 +91,7 @@ class JointForcePrior(ForcePrior):
     in_contact_only: bool = False
 
     def __post_init__(self) -> None:
-        for name in self.inputs:
-            if name not in ("q", "qd", "tau"):
-                raise UnknownNameError("input of a joint force prior", name, ("q", "qd", "tau"))
-        _check_inputs(self)
+        check_inputs(self.name, self.inputs, ("q", "qd", "tau"))
 
     def outputs(self, robot: RobotModel) -> int:
         return robot.nq
@@ -143,62 +148,6 @@ class NormalForcePrior(ForcePrior):
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         return at.eom.A.mT @ at.eom.L.mT
-
-
-@dataclass(frozen=True)
-class ContactForcePrior(ForcePrior):
-    """A prior on the Cartesian dissipative force F_z at a contact, tangential to the surface.
-
-    E = J_Eᵀ (1 − n nᵀ) where the contact is closed and 0 elsewhere, as in a system without contacts; the
-    inputs are the position and velocity of the touching point.
-
-    Args:
-        contact: name of a surface contact of the system.
-        kernel: covariance of each Cartesian component.
-        inputs: which of `position`, `velocity` the force depends on.
-        name: prefix of the hyperparameters; the contact's name by default.
-    """
-
-    contact: str
-    kernel: Kernel = field(default_factory=SquaredExponential)
-    inputs: tuple[str, ...] = ("position", "velocity")
-    name: str = ""
-    in_contact_only: bool = True
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "name", self.name or f"contact_{self.contact}")
-        for name in self.inputs:
-            if name not in ("position", "velocity"):
-                raise UnknownNameError("input of a contact force prior", name, ("position", "velocity"))
-        _check_inputs(self)
-
-    def check(self, system: ConstrainedSystem) -> None:
-        if not isinstance(system.contact(self.contact), SurfaceContact):
-            raise ModelError(
-                f"contact {self.contact!r} has no surface, so no tangential force",
-                expected="a SurfaceContact",
-                got=type(system.contact(self.contact)).__name__,
-            )
-
-    def outputs(self, robot: RobotModel) -> int:
-        return 3
-
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        if not system.contacts:
-            return {name: at.q.new_zeros(len(at.q), 3) for name in self.inputs}
-        self.check(system)
-        point = at.eom.contact_points[self.contact]
-        return {name: getattr(point, name) for name in self.inputs}
-
-    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        if not system.contacts:
-            return at.q.new_zeros(*at.q.shape, 3)
-        self.check(system)
-        point = at.eom.contact_points[self.contact]
-        n = torch.nn.functional.normalize(point.normal, dim=-1)
-        tangential = point.jacobian - n[..., :, None] * (n[..., None, :] @ point.jacobian)
-        closed = at.active[:, system.contact_names.index(self.contact)]
-        return torch.where(closed[:, None, None], tangential.mT, 0.0)
 
 
 @dataclass(frozen=True)

@@ -19,15 +19,20 @@ LARGEST_EXPONENT = 300.0
 
 @dataclass(frozen=True)
 class _Stationary(Kernel):
-    """σ² g(r) of the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination)."""
+    """σ² g(r) of the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination).
+
+    With `shared=True` the length-scales are those of all outputs, each with its own σ: fewer hyperparameters
+    to overfit, and one distance to compute.
+    """
 
     inputs: tuple[str, ...] | None = None
+    shared: bool = False
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = width_of(self.inputs, widths)
         scale = math.log(math.sqrt(width))
         return {
-            "log_lengthscale": torch.full((outputs, width), scale, dtype=torch.float64),
+            "log_lengthscale": torch.full((1 if self.shared else outputs, width), scale, dtype=torch.float64),
             "log_std": torch.zeros(outputs, dtype=torch.float64) + log_std,
         }
 
@@ -61,7 +66,7 @@ class _Stationary(Kernel):
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         lengthscale = params["log_lengthscale"].exp()
-        k, width = lengthscale.shape
+        k, width = len(params["log_std"]), lengthscale.shape[-1]
         omega = self.frequencies((k, features, width), generator).to(lengthscale) / lengthscale[:, None, :]
         phase = 2.0 * math.pi * torch.rand(k, features, dtype=torch.float64, generator=generator)
         return FourierDraw(self.inputs, omega, phase.to(lengthscale), params["log_std"].exp())
@@ -69,7 +74,7 @@ class _Stationary(Kernel):
 
 @dataclass(frozen=True)
 class SquaredExponential(_Stationary):
-    """k = σ² exp(−r²/2), a length-scale for each input and output (eq. 31)."""
+    """k = σ² exp(−r²/2), a length-scale for each input and, unless shared, output (eq. 31)."""
 
     def profile(self, r2: Tensor) -> Tensor:
         return torch.exp((-0.5 * r2).clamp(-LARGEST_EXPONENT, 0.0))

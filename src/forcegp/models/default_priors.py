@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior
 from forcegp.gp.kernels import Kernel, Linear
 from forcegp.gp.mean import AnalyticalMean, mean_of
-from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior, NormalForcePrior
+from forcegp.gp.priors import ForcePrior, JointForcePrior, NormalForcePrior
 from forcegp.gp.stationary import SquaredExponential
 
 PAPER = SquaredExponential()
 """The paper's kernel of a joint force (eq. 31)."""
-WHOLE = Linear() + SquaredExponential()
-"""Of a force that includes the motor torque, which enters linearly."""
-REMAINING = Linear(("qd",), ard=False) * SquaredExponential(("q",)) + SquaredExponential()
+ANGLES, RATES = SquaredExponential(("q",), shared=True), Linear(("qd",), ard=False)
+"""What depends on the configuration; what is linear in the speed of the joints."""
+WHOLE = Linear() + ANGLES + RATES * RATES * ANGLES + SquaredExponential(("qd",), shared=True)
+"""Of a force that includes the motor torque, which enters linearly: weight, which the configuration decides,
+bias and damping, which there are quadratic and linear in the speed, and any friction of the joints."""
+REMAINING = RATES * ANGLES + SquaredExponential(shared=True)
 """Of a force without it: damping that depends on the configuration, and anything else."""
-CONTACT_FRICTION = Linear(("velocity",)) + SquaredExponential()
-"""Of the friction at a contact: viscous, and anything else."""
 
 
 def default_priors(
@@ -33,7 +35,17 @@ def default_priors(
     return (joint, NormalForcePrior(joint)) if system.m else (joint,)
 
 
-def contact_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """A prior on the friction of each contact with a surface; a joint force prior where there is none."""
+def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
+    """A prior on the friction of each contact with a surface; a joint force prior where there is none.
+
+    Args:
+        system: robot and contacts.
+        kernel: covariance of each Cartesian component of any tangential force; by default the force is
+            friction that opposes sliding.
+    """
     surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
-    return tuple(ContactForcePrior(name, CONTACT_FRICTION) for name in surfaces) or (JointForcePrior(),)
+    if kernel is None:
+        priors = [SlidingFrictionPrior(name) for name in surfaces]
+    else:
+        priors = [ContactForcePrior(name, kernel) for name in surfaces]
+    return tuple(priors) or (JointForcePrior(),)

@@ -52,9 +52,12 @@ def _structured(mean: str, kernel: Kernel | None = None) -> Callable[..., Model]
     return make
 
 
-def _contact(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
-    options = {"mean": "analytical", "force_priors": contact_priors(system)} | options
-    return StructuredGP(system, noise_std=noise_std, **options)
+def _contact(kernel: Kernel | None = None) -> Callable[..., Model]:
+    def make(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+        options = {"mean": "analytical", "force_priors": contact_priors(system, kernel)} | options
+        return StructuredGP(system, noise_std=noise_std, **options)
+
+    return make
 
 
 MODELS: dict[str, Entry] = {
@@ -65,7 +68,8 @@ MODELS: dict[str, Entry] = {
     "sgp-mean": Entry("structured GP around the analytical forces", _structured("analytical")),
     "sgp-zero-se": Entry("sgp-zero with the paper's kernel alone", _structured("zero", PAPER)),
     "sgp-mean-se": Entry("sgp-mean with the paper's kernel alone", _structured("analytical", PAPER)),
-    "sgp-contact": Entry("structured GP with mean and a prior on the contact's friction alone", _contact),
+    "sgp-contact": Entry("structured GP with mean and a prior on the contact's friction alone", _contact()),
+    "sgp-contact-se": Entry("the same with any tangential force and the paper's kernel", _contact(PAPER)),
 }
 """The models, simplest first."""
 

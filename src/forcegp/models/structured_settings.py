@@ -9,7 +9,8 @@ from pydantic import Field
 
 from forcegp.errors import ModelError
 from forcegp.gp import kernels, stationary
-from forcegp.gp.priors import ContactForcePrior, ForcePrior, JointForcePrior, NormalForcePrior
+from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior
+from forcegp.gp.priors import ForcePrior, JointForcePrior, NormalForcePrior
 from forcegp.models.base import not_fitted
 from forcegp.models.folder import Settings, write_model
 
@@ -30,9 +31,10 @@ class StationaryKernel(Settings):
 
     type: Literal["squared_exponential", "matern32", "matern52"]
     inputs: tuple[str, ...] | None
+    shared: bool = False
 
     def build(self) -> kernels.Kernel:
-        return STATIONARY[self.type](self.inputs)
+        return STATIONARY[self.type](self.inputs, self.shared)
 
 
 class LinearKernel(Settings):
@@ -87,6 +89,21 @@ class ContactPrior(Settings):
         return ContactForcePrior(self.contact, self.kernel.build(), self.inputs, self.name)
 
 
+class SlidingPrior(Settings):
+    """A `SlidingFrictionPrior`."""
+
+    type: Literal["sliding_friction"] = "sliding_friction"
+    name: str
+    contact: str
+    kernel: KernelSettings
+    inputs: tuple[str, ...]
+    smoothing: float
+
+    def build(self) -> ForcePrior:
+        kernel = self.kernel.build()
+        return SlidingFrictionPrior(self.contact, kernel, self.inputs, self.name, smoothing=self.smoothing)
+
+
 class NormalPrior(Settings):
     """A `NormalForcePrior`."""
 
@@ -98,13 +115,16 @@ class NormalPrior(Settings):
         return NormalForcePrior(JointForcePrior(like.kernel.build(), like.inputs, like.periodic, like.name))
 
 
+PriorSettings = JointPrior | ContactPrior | SlidingPrior | NormalPrior
+
+
 class StructuredSettings(Settings):
     """What is kept of a structured Gaussian process beside its tensors."""
 
     mean: tuple[str, ...]
     noise_std: float | tuple[float, ...]
     learn_noise: bool
-    priors: tuple[Annotated[JointPrior | ContactPrior | NormalPrior, Field(discriminator="type")], ...]
+    priors: tuple[Annotated[PriorSettings, Field(discriminator="type")], ...]
     measured: tuple[str, ...]
     constant: tuple[tuple[str, ...], ...]
 
@@ -119,8 +139,8 @@ def _kernel_settings(kernel: kernels.Kernel) -> StationaryKernel | LinearKernel 
         return LinearKernel(inputs=kernel.inputs, ard=kernel.ard)
     for name, kind in STATIONARY.items():
         if type(kernel) is kind:
-            inputs = getattr(kernel, "inputs")  # noqa: B009  (every stationary kernel has it)
-            return StationaryKernel(type=name, inputs=inputs)  # pyright: ignore[reportArgumentType]
+            inputs, shared = getattr(kernel, "inputs"), getattr(kernel, "shared")  # noqa: B009
+            return StationaryKernel(type=name, inputs=inputs, shared=shared)  # pyright: ignore[reportArgumentType]
     raise ModelError(
         f"a kernel of type {type(kernel).__name__} cannot be saved",
         expected=", ".join([*STATIONARY, "linear", *PAIRS]),
@@ -132,7 +152,7 @@ def _joint_settings(prior: JointForcePrior) -> JointPrior:
     return JointPrior(name=prior.name, kernel=kernel, inputs=prior.inputs, periodic=prior.periodic)
 
 
-def _prior_settings(prior: ForcePrior) -> JointPrior | ContactPrior | NormalPrior:
+def _prior_settings(prior: ForcePrior) -> PriorSettings:
     kernel = _kernel_settings(prior.kernel)
     if type(prior) is JointForcePrior:
         return _joint_settings(prior)
@@ -140,9 +160,17 @@ def _prior_settings(prior: ForcePrior) -> JointPrior | ContactPrior | NormalPrio
         return NormalPrior(like=_joint_settings(prior.like))
     if type(prior) is ContactForcePrior:
         return ContactPrior(name=prior.name, contact=prior.contact, kernel=kernel, inputs=prior.inputs)
+    if type(prior) is SlidingFrictionPrior:
+        return SlidingPrior(
+            name=prior.name,
+            contact=prior.contact,
+            kernel=kernel,
+            inputs=prior.inputs,
+            smoothing=prior.smoothing,
+        )
     raise ModelError(
         f"force prior {prior.name!r} of type {type(prior).__name__} holds Python code and cannot be saved",
-        expected="JointForcePrior, NormalForcePrior or ContactForcePrior",
+        expected="JointForcePrior, NormalForcePrior, ContactForcePrior or SlidingFrictionPrior",
     )
 
 

@@ -16,7 +16,7 @@ Series = list[float]
 DIGITS = 7
 """Significant digits kept in series that are only drawn."""
 GP_MODELS = ("gp", "sgp-zero", "sgp-mean", "sgp-contact")
-PAPER_KERNELS = ("sgp-zero-se", "sgp-mean-se")
+PAPER_KERNELS = ("sgp-zero-se", "sgp-mean-se", "sgp-contact-se")
 """The paper's structured models with its kernel alone: in tables, not in figures."""
 SPLITS = {"stretches": "held-out stretches", "selection": "paper's split"}
 """The two ways of choosing test samples, by name, and what they are called."""

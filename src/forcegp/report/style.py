@@ -41,6 +41,7 @@ LABELS = {
     "sgp-contact": "S-GP, mean and contact prior",
     "sgp-zero-se": "S-GP, zero mean, paper's kernel",
     "sgp-mean-se": "S-GP, analytical mean, paper's kernel",
+    "sgp-contact-se": "S-GP, mean and contact prior, paper's kernel",
 }
 """What a model is called in figures and tables."""
 
