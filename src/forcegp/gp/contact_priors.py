@@ -19,7 +19,7 @@ from forcegp.robot.model import RobotModel
 
 
 @dataclass(frozen=True)
-class _SurfaceForcePrior(ForcePrior):
+class SurfaceForcePrior(ForcePrior):
     """A force at a contact with a surface, where it is closed; inputs are those of the touching point."""
 
     contact: str
@@ -66,7 +66,7 @@ class _SurfaceForcePrior(ForcePrior):
 
 
 @dataclass(frozen=True)
-class ContactForcePrior(_SurfaceForcePrior):
+class ContactForcePrior(SurfaceForcePrior):
     """A prior on the Cartesian dissipative force F_z at a contact, tangential to the surface.
 
     E = J_Eᵀ (1 − n nᵀ) where the contact is closed and 0 elsewhere, as in a system without contacts; the
@@ -90,7 +90,7 @@ class ContactForcePrior(_SurfaceForcePrior):
 
 
 @dataclass(frozen=True)
-class SlidingFrictionPrior(_SurfaceForcePrior):
+class SlidingFrictionPrior(SurfaceForcePrior):
     """A prior on the friction that opposes sliding: F_z = −(θ_v + θ_d / √(|v|² + ε²)) v, v = (1 − n nᵀ) ṗ_E.
 
     The unknowns are two scalar functions of the touching point, viscous friction θ_v [N s/m] and dry friction

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from forcegp.errors import ModelError
 from forcegp.gp import kernels, stationary
-from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior
+from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior, SurfaceForcePrior
 from forcegp.gp.priors import ForcePrior, JointForcePrior, NormalForcePrior
 from forcegp.models.base import not_fitted
 from forcegp.models.folder import Settings, write_model
@@ -76,32 +76,33 @@ class JointPrior(Settings):
         return JointForcePrior(self.kernel.build(), self.inputs, self.periodic, self.name)
 
 
-class ContactPrior(Settings):
-    """A `ContactForcePrior`."""
+class SurfacePrior(Settings):
+    """What priors on the force at a contact with a surface share."""
 
-    type: Literal["contact"] = "contact"
     name: str
     contact: str
     kernel: KernelSettings
     inputs: tuple[str, ...]
+
+
+class ContactPrior(SurfacePrior):
+    """A `ContactForcePrior`."""
+
+    type: Literal["contact"] = "contact"
 
     def build(self) -> ForcePrior:
         return ContactForcePrior(self.contact, self.kernel.build(), self.inputs, self.name)
 
 
-class SlidingPrior(Settings):
+class SlidingPrior(SurfacePrior):
     """A `SlidingFrictionPrior`."""
 
     type: Literal["sliding_friction"] = "sliding_friction"
-    name: str
-    contact: str
-    kernel: KernelSettings
-    inputs: tuple[str, ...]
     smoothing: float
 
     def build(self) -> ForcePrior:
-        kernel = self.kernel.build()
-        return SlidingFrictionPrior(self.contact, kernel, self.inputs, self.name, smoothing=self.smoothing)
+        kernel, smoothing = self.kernel.build(), self.smoothing
+        return SlidingFrictionPrior(self.contact, kernel, self.inputs, self.name, smoothing=smoothing)
 
 
 class NormalPrior(Settings):
@@ -158,16 +159,12 @@ def _prior_settings(prior: ForcePrior) -> PriorSettings:
         return _joint_settings(prior)
     if type(prior) is NormalForcePrior:
         return NormalPrior(like=_joint_settings(prior.like))
-    if type(prior) is ContactForcePrior:
-        return ContactPrior(name=prior.name, contact=prior.contact, kernel=kernel, inputs=prior.inputs)
-    if type(prior) is SlidingFrictionPrior:
-        return SlidingPrior(
-            name=prior.name,
-            contact=prior.contact,
-            kernel=kernel,
-            inputs=prior.inputs,
-            smoothing=prior.smoothing,
-        )
+    if isinstance(prior, SurfaceForcePrior):
+        shared = {"name": prior.name, "contact": prior.contact, "kernel": kernel, "inputs": prior.inputs}
+        if type(prior) is ContactForcePrior:
+            return ContactPrior(**shared)
+        if type(prior) is SlidingFrictionPrior:
+            return SlidingPrior(**shared, smoothing=prior.smoothing)
     raise ModelError(
         f"force prior {prior.name!r} of type {type(prior).__name__} holds Python code and cannot be saved",
         expected="JointForcePrior, NormalForcePrior, ContactForcePrior or SlidingFrictionPrior",
