@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
-from forcegp.gp.pathwise import draw_samples
+from forcegp.gp.pathwise import CHUNK_STATES, draw_samples
 from forcegp.gp.priors import JointForcePrior
 from forcegp.gp.states import states
 from gp.cases import conditioned, draw, logged, mixed_contacts, two_contacts
@@ -61,3 +62,17 @@ def test_a_sample_is_one_function() -> None:
     assert torch.allclose(chosen, Q[own, torch.arange(5)], rtol=1e-12, atol=1e-12)
     other = draw_samples(model.posterior, 3, torch.Generator().manual_seed(5), features=64)
     assert not torch.allclose(Q, other.forces(system, at)[0])
+
+
+@pytest.mark.parametrize(
+    ("count", "runs"), [(CHUNK_STATES + 3, 1), (5, CHUNK_STATES // 2), (2, CHUNK_STATES + 1)]
+)
+def test_each_sample_at_its_own_states(count: int, runs: int) -> None:
+    """However many states are looked at together, the forces are those of each sample at all states."""
+    system = two_contacts()
+    model = conditioned(logged(system, 6))
+    samples = draw_samples(model.posterior, count, torch.Generator().manual_seed(4), features=64)
+    q, qd, tau = draw(count * runs, seed=7)
+    at = states(system, q, qd, tau, mixed_contacts(count * runs))
+    Q, Q_z = samples.forces(system, at, torch.arange(count).repeat_interleave(runs))
+    assert torch.allclose(samples.total_force(system, at), Q + Q_z, rtol=1e-10, atol=1e-10)

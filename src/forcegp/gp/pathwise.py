@@ -23,6 +23,9 @@ from forcegp.gp.states import States
 FEATURES = 1024
 """Random features an output; the covariance of the prior draws errs by about 1/√FEATURES of its scale."""
 
+CHUNK_STATES = 48
+"""States at which samples are evaluated at once, so that intermediate arrays stay small."""
+
 UNMEASURED = 4
 """How many times fewer of them a prior has whose force no row shows."""
 
@@ -111,15 +114,24 @@ class PosteriorSamples:
             `(samples · k, nq)` [N m, N].
         """
         Q_bar = self.posterior.mean(system, at)
+        runs = len(at.q) // self.count
+        step = max(1, CHUNK_STATES // max(runs, 1))
+        chunks = [range(i, min(i + step, self.count)) for i in range(0, self.count, step)]
         for p, features in enumerate(self.posterior.features(system, at)):
-            parts = [
-                k.unflatten(1, (self.count, -1)) @ w
-                for k, w in zip(self._bases(p, features), self._weights_by_sample[p], strict=True)
-            ]
-            force = sum(parts[1:], start=parts[0])[..., 0].flatten(1).mT
+            force = torch.cat([self._own_force(p, features, samples, runs) for samples in chunks])
             E = self.posterior.priors[p].operator(system, at)
             Q_bar = Q_bar + (E @ force[..., None])[..., 0]
         return Q_bar
+
+    def _own_force(self, p: int, features: Features, samples: range, runs: int) -> Tensor:
+        """Forces of prior p from some samples, each at its own runs: `(samples · runs, components)`."""
+        own = slice(samples.start * runs, samples.stop * runs)
+        bases = self._bases(p, {name: x[own] for name, x in features.items()})
+        parts = [
+            k.unflatten(1, (len(samples), runs)) @ w[:, samples.start : samples.stop]
+            for k, w in zip(bases, self._weights_by_sample[p], strict=True)
+        ]
+        return sum(parts[1:], start=parts[0])[..., 0].flatten(1).mT
 
 
 def draw_samples(
