@@ -45,7 +45,7 @@ def rollouts(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]) ->
             "starts": sizes.rollout_starts,
             "samples": sizes.rollout_samples,
             "band_seconds": BAND_SECONDS,
-            "calibrated": True,
+            "calibration": "held-out stretches, evenly spread",
         },
         inputs=[simulated, *(fit.stage for fit in fits)],
     )
@@ -86,7 +86,8 @@ def _roll(
     bands = compare(
         sampled, data, seconds, starts, samples, system=system, progress=reported("function samples")
     )
-    held = torch.tensor([first for first, _ in task.stretches()][:starts])
+    held = torch.tensor([first for first, _ in task.stretches()])
+    held = held[torch.linspace(0, len(held) - 1, min(starts, len(held))).round().long()]
     seconds = min(seconds, sizes.stretch)
     calibration = compare(
         sampled, task.data, seconds, held, samples, system=system, progress=reported("their calibration")
