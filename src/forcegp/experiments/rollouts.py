@@ -45,7 +45,7 @@ def rollouts(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]) ->
             "starts": sizes.rollout_starts,
             "samples": sizes.rollout_samples,
             "band_seconds": BAND_SECONDS,
-            "calibration": "held-out stretches, evenly spread, at all phases",
+            "calibration": "held-out stretches, evenly spread",
         },
         inputs=[simulated, *(fit.stage for fit in fits)],
     )
@@ -86,32 +86,11 @@ def _roll(
     bands = compare(
         sampled, data, seconds, starts, samples, system=system, progress=reported("function samples")
     )
+    held = torch.tensor([first for first, _ in task.stretches()])
+    held = held[torch.linspace(0, len(held) - 1, min(starts, len(held))).round().long()]
     seconds = min(seconds, sizes.stretch)
     calibration = compare(
-        sampled,
-        task.data,
-        seconds,
-        _calibration_starts(task, seconds, starts),
-        samples,
-        system=system,
-        progress=reported("their calibration"),
+        sampled, task.data, seconds, held, samples, system=system, progress=reported("their calibration")
     )
     found = with_bands(rollout_data(paths), rollout_data(bands, calibration))
     write_text(folder / ROLLOUTS, found.to_json())
-
-
-def _calibration_starts(task: Task, seconds: float, most: int) -> torch.Tensor:
-    """Rows of held-out stretches, spread over the log and over what a stretch is longer than a trajectory.
-
-    Stretches begin where a line of the motion does; starts at any of its phases are like those they are for.
-    """
-    stretches, dt = task.stretches(), task.data.header.dt
-    assert dt is not None
-    chosen = torch.linspace(0, len(stretches) - 1, min(most, len(stretches))).round().long().tolist()
-    steps = round(seconds / dt)
-    rows = []
-    for i, k in enumerate(chosen):
-        first, end = stretches[k]
-        spare = max(0, end - first - 1 - steps)
-        rows.append(first + round(spare * i / max(1, len(chosen) - 1)))
-    return torch.tensor(rows)
