@@ -1,5 +1,6 @@
 """Function samples along a trajectory, the probability of lost contact, and comparisons with a log."""
 
+import math
 from functools import cache
 
 import pytest
@@ -16,7 +17,15 @@ from forcegp.models.base import Model
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.rollout_data import RolloutData, rollout_data
 from forcegp.report.rollouts import PAGE, animation_source, write_rollouts
-from forcegp.rollout import ForceLaw, RolloutOptions, beside_log, compare, contact_loss_probability, rollout
+from forcegp.rollout import (
+    Comparison,
+    ForceLaw,
+    RolloutOptions,
+    beside_log,
+    compare,
+    contact_loss_probability,
+    rollout,
+)
 from rollout_cases import arm, simulated
 
 DRIFT = 1e-4
@@ -136,7 +145,7 @@ class Freefloating(AnalyticalModel):
         return super().predict(q, qd, tau, "qdd_free", active=active, covariance=covariance)
 
 
-def test_comparison_tells_models_apart_and_the_page_holds_them(tmp_path) -> None:
+def test_comparison_tells_models_apart_and_the_page_holds_them(tmp_path, monkeypatch) -> None:
     system = arm(Baumgarte())
     models: dict[str, Model] = {
         "analytical": AnalyticalModel(system),
@@ -156,6 +165,12 @@ def test_comparison_tells_models_apart_and_the_page_holds_them(tmp_path) -> None
     assert torch.allclose(start, simulated(1.0).position[[0, 215]], atol=1e-12)
     data = rollout_data(found)
     assert RolloutData.from_json(data.to_json(), "test", DataError) == data
+    path = rollout_data(found, found).models[2]
+    assert path.inflation == found.inflation("sgp-mean") and (path.calibrated_coverage or 0.0) >= 0.9
+    with monkeypatch.context() as nothing_left:
+        nothing_left.setattr(Comparison, "inflation", lambda *_: math.inf)
+        path = rollout_data(found, found).models[2]
+        assert path.inflation is path.calibrated_coverage is None
     nn = data.models[1]
     assert nn.multiplier == [] and nn.drift[-1] < -1e-3, "it sinks through the table"
     page = write_rollouts(tmp_path, "Test", data).read_text()

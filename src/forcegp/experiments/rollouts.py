@@ -45,7 +45,6 @@ def rollouts(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]) ->
             "starts": sizes.rollout_starts,
             "samples": sizes.rollout_samples,
             "band_seconds": BAND_SECONDS,
-            "calibration": "held-out stretches, evenly spread",
         },
         inputs=[simulated, *(fit.stage for fit in fits)],
     )

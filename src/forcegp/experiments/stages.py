@@ -21,8 +21,8 @@ from forcegp.errors import DataError, ForceGPError
 from forcegp.files import Header, atomic_directory, write_text
 
 STAGE_FILE = "stage.json"
-FORMAT = 1
-"""Raised where the files that stages leave change."""
+FORMAT = 2
+"""Raised where what stages compute changes, in a way that their settings do not show."""
 
 
 @runtime_checkable

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, field
 
 import torch
@@ -54,9 +55,9 @@ class SurfaceForcePrior(ForcePrior):
         closed = at.active[:, system.contact_names.index(self.contact)]
         return torch.where(closed[:, None, None], self.directions(at), 0.0)
 
+    @abstractmethod
     def directions(self, at: States) -> Tensor:
         """E(x) `(n, nq, outputs)` where the contact is closed."""
-        raise NotImplementedError
 
     def _tangential(self, at: States) -> Tensor:
         """(1 − n nᵀ) J_E `(n, 3, nq)`."""

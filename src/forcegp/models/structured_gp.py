@@ -134,7 +134,9 @@ class StructuredGP(Model):
             if progress is not None:
                 progress(evaluations, options.max_evaluations, value)
 
-        saved = None if checkpoint is None else self._checkpoint(Path(checkpoint), problem, options, start)
+        saved = None
+        if checkpoint is not None:
+            saved = Checkpoint(Path(checkpoint), problem.key(options, list(start)))
         first = None if begin is None else beginning(begin, start)
         learned = problem.solve(start, held, options, report, saved, first)
         self._adopt(problem, {**held, **learned.tensors})
@@ -190,11 +192,6 @@ class StructuredGP(Model):
 
     def _problem(self, training: Training) -> Problem:
         return Problem(self.system, self.force_priors, self.mean, training, self.analytical_parameters)
-
-    def _checkpoint(
-        self, path: Path, problem: Problem, options: LearningOptions, start: dict[str, Tensor]
-    ) -> Checkpoint:
-        return Checkpoint(path, problem.key(options, list(start)))
 
     def _adopt(self, problem: Problem, tensors: dict[str, Tensor]) -> None:
         """Keep learned values and condition on the training data."""

@@ -178,7 +178,8 @@ def _model_path(
     known = bool(torch.isfinite(multiplier).all()) and len(multiplier) > 0
     errors = [found.error_at(name, horizon) for horizon in horizons]
     times = [d.t for d in (*rolled.diverged, *(samples.diverged if samples else ()))]
-    inflation = calibration.inflation(name) if samples and calibration else None
+    factor = calibration.inflation(name) if samples and calibration else math.inf
+    inflation = factor if math.isfinite(factor) else None
     drifts = [x.drift.nan_to_num(0.0).abs().max() for x in (rolled, samples) if x is not None and contacts]
     return ModelPath(
         model=name,

@@ -91,14 +91,15 @@ class Comparison:
     def inflation(self, model: str, level: float = LEVEL) -> float:
         """Factor by which bands must be longer to hold `level` of these tip coordinates (split conformal).
 
-        The `level`-quantile of |logged − median| / (half-width on that side). Bands of trajectories like
-        these, widened by it, hold about that share, whatever the model got wrong.
+        The ⌈(n + 1) level⌉-th smallest of n ratios |logged − median| / (half-width on that side). Bands of
+        trajectories like these, widened by it, hold about that share, whatever the model got wrong. It is
+        infinite where too few samples are left for a band.
         """
         logged, band = self._tip_along(model, level)
         apart = logged - band.median
         half = torch.where(apart < 0.0, band.median - band.lower, band.upper - band.median)
         ratio = (apart.abs() / half).nan_to_num(torch.inf).flatten().sort().values
-        return float(ratio[min(math.ceil(level * len(ratio)), len(ratio) - 1)])
+        return float(ratio[min(math.ceil((len(ratio) + 1) * level), len(ratio)) - 1])
 
     def _tip_along(self, model: str, level: float) -> tuple[Tensor, Bands]:
         """Logged tip coordinates `(k, T − 1, d)`, along the surface if there is one, and the band of each."""
