@@ -27,7 +27,9 @@ KERNELS: dict[str, Kernel] = {
     "matern 5/2": M52,
     "linear": LIN,
     "linear with one slope": Linear(ard=False),
+    "linear with shared slopes": Linear(shared=True),
     "damping": Linear(("qd",), ard=False) * SquaredExponential(("q",)),
+    "quadratic": Linear(("qd",), shared=True) * Linear(("qd",), shared=True) * SquaredExponential(("q",)),
     "of one input": SquaredExponential(("qd",)),
     "sum": SE + LIN,
     "product": SquaredExponential(("q",)) * Matern52(("qd",)),
@@ -65,8 +67,9 @@ def by_hand(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict, k: in
     a = [float(v) for n in names for v in x1[n][i]]
     b = [float(v) for n in names for v in x2[n][j]]
     if isinstance(kernel, Linear):
-        given = params["log_slope_std"][k]
-        slopes = [math.exp(float(v)) ** 2 for v in given.expand(len(a))]
+        given = params["log_slope_std"][0 if kernel.shared else k]
+        size = math.exp(float(params["log_std"][k])) ** 2 if kernel.shared else 1.0
+        slopes = [size * math.exp(float(v)) ** 2 for v in given.expand(len(a))]
         bias = math.exp(float(params["log_bias_std"][k])) ** 2
         return bias + sum(s * p * q for s, p, q in zip(slopes, a, b, strict=True))
     lengths = [math.exp(float(v)) for v in params["log_lengthscale"][0 if kernel.shared else k]]

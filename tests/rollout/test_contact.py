@@ -1,13 +1,18 @@
 """Unilateral contact: lift-off and landing where closed forms say, impacts, no false loss."""
 
 import math
+from functools import cache
 
 import pytest
 import torch
 
 from forcegp.constraints import Baumgarte
+from forcegp.data import Dataset, select_points
 from forcegp.errors import ModelError
-from forcegp.rollout import AccelerationLaw, RolloutOptions, rollout
+from forcegp.gp.learning import LearningOptions
+from forcegp.models.registry import create
+from forcegp.rollout import AccelerationLaw, RolloutOptions, contact_loss_probability, rollout
+from forcegp.simulate import SimulationConfig, simulate
 from rollout_cases import ANALYTICAL, GRAVITY, SLIDER_MASS, arm, pulled_off, simulated, slider
 
 WEIGHT = SLIDER_MASS * GRAVITY
@@ -129,3 +134,38 @@ def test_lift_off_of_the_arm_is_the_simulator_s() -> None:
     assert not event.closed
     assert abs(event.t * 240 - 50) <= 2.0
     assert float((found.q[:60] - data.q[start : start + 60]).abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["sgp-mean", "sgp-contact"])
+def test_lift_off_is_learned_from_sliding(name: str) -> None:
+    """Learned with noise on another motion that never lifts off, the loss is where PyBullet has it."""
+    data = pulled_off(viscous_friction=1.0)
+    lost = int((~data.contact["table"]).nonzero()[0, 0])
+    model = create(name, arm(Baumgarte()), noise_std=0.1)
+    model.fit(sliding(), options=LearningOptions(max_evaluations=40))
+    for before in (24, 60):
+        start = lost - before
+        found = model.rollout(
+            data.q[start],
+            data.qd[start],
+            data.tau[start:],
+            (before + 12) / 240,
+            samples=10,
+            active=torch.tensor([True]),
+            options=unilateral(),
+        )
+        opened = [event.t * 240 for event in found.events if not event.closed]
+        assert len(opened) == 1
+        assert abs(opened[0] - before) <= 2.0
+    rows = torch.arange(lost - 10, lost + 5)
+    loss = contact_loss_probability(model, data.q[rows], data.qd[rows], data.tau[rows])[:, 0]
+    assert bool((loss.diff() > -1e-9).all())
+    assert float(loss[0]) < 0.001
+    assert float(loss[-1]) > 0.999
+
+
+@cache
+def sliding() -> Dataset:
+    """Sixty noisy points of a motion with friction."""
+    run = simulate(arm(Baumgarte()), SimulationConfig(duration=5.0, seed=1)).data
+    return run[select_points(run, 60)]

@@ -25,6 +25,8 @@ OTHER_MOTION = 1000
 """Added to the task's seed for the motion that no model saw."""
 BAND_SECONDS = 2.0
 """At most so long are function samples rolled out [s]: each costs a trajectory more from every start."""
+CALIBRATION_STARTS = 2
+"""Trajectories that bands are calibrated on, for each of those that they are tried on."""
 
 
 def rollouts(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]) -> RolloutData:
@@ -85,11 +87,37 @@ def _roll(
     bands = compare(
         sampled, data, seconds, starts, samples, system=system, progress=reported("function samples")
     )
-    held = torch.tensor([first for first, _ in task.stretches()])
-    held = held[torch.linspace(0, len(held) - 1, min(starts, len(held))).round().long()]
     seconds = min(seconds, sizes.stretch)
     calibration = compare(
-        sampled, task.data, seconds, held, samples, system=system, progress=reported("their calibration")
+        sampled,
+        task.data,
+        seconds,
+        _calibration_starts(task, seconds, CALIBRATION_STARTS * starts),
+        samples,
+        system=system,
+        progress=reported("their calibration"),
     )
     found = with_bands(rollout_data(paths), rollout_data(bands, calibration))
     write_text(folder / ROLLOUTS, found.to_json())
+
+
+def _calibration_starts(task: Task, seconds: float, most: int) -> torch.Tensor:
+    """Rows of held-out stretches, spread over the log and over what a stretch is longer than a trajectory.
+
+    Stretches begin where a line of the motion does; starts at any of its phases are like those they are for.
+    """
+    stretches, dt = task.stretches(), task.data.header.dt
+    assert dt is not None
+    chosen = torch.linspace(0, len(stretches) - 1, min(most, len(stretches))).round().long().tolist()
+    steps = round(seconds / dt)
+    rows = []
+    for i, k in enumerate(chosen):
+        first, end = stretches[k]
+        spare = max(0, end - first - 1 - steps)
+        rows.append(first + round(spare * _phase(i)))
+    return torch.tensor(rows)
+
+
+def _phase(i: int) -> float:
+    """The i-th of numbers spread over [0, 1), in an order that follows no other (golden ratio)."""
+    return (0.5 + i * 0.6180339887498949) % 1.0

@@ -21,7 +21,7 @@ from forcegp.errors import DataError, ForceGPError
 from forcegp.files import Header, atomic_directory, write_text
 
 STAGE_FILE = "stage.json"
-FORMAT = 2
+FORMAT = 3
 """Raised where what stages compute changes, in a way that their settings do not show."""
 
 

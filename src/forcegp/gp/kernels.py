@@ -98,32 +98,43 @@ def width_of(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
 
 @dataclass(frozen=True)
 class Linear(Kernel):
-    """k = Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs.
+    """k = s² Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs.
 
-    With `ard=False` all inputs share one σ: fewer hyperparameters to overfit, and no slope that learning
-    takes for zero.
+    Fewer hyperparameters to overfit: with `ard=False` all inputs have one σ, and there is no slope that
+    learning takes for zero; with `shared=True` the σ_d are those of all outputs, each with its own s and σ_0.
     """
 
     inputs: tuple[str, ...] | None = None
     ard: bool = True
+    shared: bool = False
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = width_of(self.inputs, widths)
         # Standardized inputs have unit variance: every column and the bias get the same share.
         share = torch.zeros(outputs, dtype=torch.float64) + log_std - 0.5 * math.log(width + 1.0)
-        return {"log_slope_std": share[:, None].repeat(1, width if self.ard else 1), "log_bias_std": share}
+        columns = width if self.ard else 1
+        if self.shared:
+            slopes = {"log_slope_std": share.new_zeros(1, columns), "log_std": share}
+        else:
+            slopes = {"log_slope_std": share[:, None].repeat(1, columns)}
+        return slopes | {"log_bias_std": share}
+
+    def _slope_std(self, params: Parameters) -> Tensor:
+        """s σ_d `(k, w)`, or `(k, 1)` where all inputs have one."""
+        log = params["log_slope_std"]
+        return torch.exp(log + params["log_std"][:, None] if self.shared else log)
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        slope = params["log_slope_std"].exp()[:, None, :]
+        slope = self._slope_std(params)[:, None, :]
         product = (stacked(x1, self.inputs) * slope) @ (stacked(x2, self.inputs) * slope).mT
         return product + torch.exp(2.0 * params["log_bias_std"])[:, None, None]
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        scaled = stacked(x, self.inputs) * params["log_slope_std"].exp()[:, None, :]
+        scaled = stacked(x, self.inputs) * self._slope_std(params)[:, None, :]
         return (scaled * scaled).sum(-1) + torch.exp(2.0 * params["log_bias_std"])[:, None]
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return LinearDraw(self.inputs, params["log_slope_std"].exp(), params["log_bias_std"].exp())
+        return LinearDraw(self.inputs, self._slope_std(params), params["log_bias_std"].exp())
 
 
 @dataclass(frozen=True)

@@ -43,9 +43,10 @@ class LinearKernel(Settings):
     type: Literal["linear"] = "linear"
     inputs: tuple[str, ...] | None
     ard: bool = True
+    shared: bool = False
 
     def build(self) -> kernels.Kernel:
-        return kernels.Linear(self.inputs, self.ard)
+        return kernels.Linear(self.inputs, self.ard, self.shared)
 
 
 class PairKernel(Settings):
@@ -137,7 +138,7 @@ def _kernel_settings(kernel: kernels.Kernel) -> StationaryKernel | LinearKernel 
             type="product" if isinstance(kernel, kernels.Product) else "sum", left=left, right=right
         )
     if type(kernel) is kernels.Linear:
-        return LinearKernel(inputs=kernel.inputs, ard=kernel.ard)
+        return LinearKernel(inputs=kernel.inputs, ard=kernel.ard, shared=kernel.shared)
     for name, kind in STATIONARY.items():
         if type(kernel) is kind:
             inputs, shared = getattr(kernel, "inputs"), getattr(kernel, "shared")  # noqa: B009
