@@ -39,7 +39,7 @@ DRIFT = [
     ("none", "semi_implicit_euler", 0),
     ("none", "rk4", 0),
     ("baumgarte", "semi_implicit_euler", 100),
-    ("baumgarte", "rk4", 0),
+    ("baumgarte", "rk4", 100),
     ("projection", "semi_implicit_euler", 100),
 ]
 """Stabilization, method, and function samples beside the mean."""

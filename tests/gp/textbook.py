@@ -28,6 +28,8 @@ def covariance(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict) ->
     a, b = (torch.cat([x[name] for name in kernel.inputs or tuple(x)], dim=-1) for x in (x1, x2))
     if isinstance(kernel, Linear):
         slopes, bias = params["log_slope_std"].exp() ** 2, params["log_bias_std"].exp() ** 2
+        if kernel.shared:
+            slopes = params["log_std"].exp()[:, None] ** 2 * slopes
         return torch.einsum("kd,nd,md->knm", slopes.expand(-1, a.shape[-1]), a, b) + bias[:, None, None]
     assert isinstance(kernel, SquaredExponential)
     return squared_exponential(params, a, b)

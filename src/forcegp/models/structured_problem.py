@@ -163,14 +163,28 @@ class Problem:
         begin = saved if saved is not None else begin
         begins = self._begins(start, options) if begin is None else [begin]
         best: Learned | None = None
-        for first in begins:
+        for cold in begins:
+            first = cold
             for samples in self._fewer(options.warm_start) if begin is None else []:
                 small = dataclasses.replace(self, training=self.training.thinned(samples))
-                first = run(small, first, None).tensors
-            learned = run(self, first, note)
+                first = run(small, small._better(first, cold, held, start), None).tensors
+            learned = run(self, self._better(first, cold, held, start), note)
             best = learned if best is None or learned.value < best.value else best
         assert best is not None
         return best
+
+    @torch.no_grad()
+    def _better(
+        self,
+        warm: dict[str, Tensor],
+        cold: dict[str, Tensor],
+        held: dict[str, Tensor],
+        center: dict[str, Tensor],
+    ) -> dict[str, Tensor]:
+        """Where to begin: what fewer samples taught may be far off where they were too few to tell."""
+        if warm is cold:
+            return cold
+        return min((warm, cold), key=lambda tensors: float(self.objective(tensors, held, center)))
 
     def _fewer(self, first: int | None) -> list[int]:
         """Numbers of samples to learn on first, each twice the one before, up to half of all."""
