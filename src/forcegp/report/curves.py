@@ -13,6 +13,8 @@ from forcegp.report.data import GP_MODELS, SPLITS, IdentificationData, PaperNumb
 from forcegp.report.style import AXES, INK, MARKERS, Picture, colour, draw, label
 
 WIDTH = 4.6
+MASS_RANGE = 1.0
+"""How far from the truth a mass is shown [kg]: first steps of the optimiser go further."""
 FLOOR = (2.0 / torch.pi) ** 0.5
 """Mean magnitude of standard normal noise: no model's error against noisy accelerations is smaller."""
 
@@ -91,7 +93,8 @@ def draw_identification(data: IdentificationData) -> list[Picture]:
             axes.plot(run.mass, color=colour(run.model), label=label(run.model))
         axes.set_xlabel("evaluation")
         axes.set_ylabel("mass of the last link [kg]")
-        _legend(figure, axes)
+        axes.set_ylim(data.true_mass - MASS_RANGE, data.true_mass + MASS_RANGE)
+        _legend(figure, axes, columns=2)
 
     def paint_offset(figure: Figure) -> None:
         rows = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
@@ -161,7 +164,7 @@ def _ends(results: Results, split: str, measure: Measure) -> str:
     return "; ".join(words) + "."
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
+def _legend(figure: Figure, axes: Axes, columns: int = 3) -> None:
     handles, names = axes.get_legend_handles_labels()
     unique = dict(zip(names, handles, strict=True))
-    figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=min(3, len(unique)))
+    figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=min(columns, len(unique)))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from forcegp.files import write_text
 from forcegp.report.covariance import draw_force_prior, draw_operators, draw_structured
-from forcegp.report.curves import draw_identification, draw_learning_curve, draw_residual
+from forcegp.report.curves import MASS_RANGE, draw_identification, draw_learning_curve, draw_residual
 from forcegp.report.data import (
     SPLITS,
     CovarianceData,
@@ -174,7 +174,8 @@ def _identification(data: IdentificationData) -> FigureBlock:
         "Mass of the last link, started at 2.5 kg, and error of the last joint's position, started "
         f"0.05 m off along each axis, learned from {data.points} points together with "
         "the unknown friction; the analytical model alone, which has no room for the friction, "
-        "beside them. At every evaluation the best parameters so far. The dotted line marks 1 mm.",
+        "beside them. At every evaluation the best parameters so far; of the mass, what is further than "
+        f"{MASS_RANGE:g} kg from the truth is cut off. The dotted line marks 1 mm.",
         tuple(draw_identification(data)),
         "stages/figures/identification/",
     )
