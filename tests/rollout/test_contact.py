@@ -150,7 +150,6 @@ def test_lift_off_is_learned_from_sliding(name: str) -> None:
             data.qd[start],
             data.tau[start:],
             (before + 12) / 240,
-            samples=10,
             active=torch.tensor([True]),
             options=unilateral(),
         )
