@@ -27,9 +27,9 @@ from torch import Tensor
 
 import forcegp
 from forcegp.data import split_by_stretches
-from forcegp.gp.exact import negative_log_likelihood
-from forcegp.gp.states import states
-from forcegp.models.default_priors import PAPER, default_priors
+from forcegp.forces.priors.default import PAPER, default_priors
+from forcegp.forces.states import states
+from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.models.structured_problem import kernel_parameters
 from forcegp.simulate import simulate
 

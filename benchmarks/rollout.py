@@ -23,12 +23,12 @@ from results_page import table, write_section
 from torch import Tensor
 
 from forcegp.constraints.projection import project_state
+from forcegp.control.plan import make_plan
 from forcegp.data import Dataset, select_points
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.rollout import RolloutOptions, TaskSpaceControl
 from forcegp.scene import load_scene
 from forcegp.simulate import SimulationConfig, SimulationResult, simulate
-from forcegp.simulate.plan import make_plan
 
 TARGETS = {0: 5.0, 100: 60.0}
 """Seconds that a rollout of ten seconds may take, by number of samples."""

@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 
 import forcegp
-from forcegp.experiments.separation import separate
+from forcegp.paper.separation import separate
 
 
 def main() -> None:

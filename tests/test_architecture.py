@@ -21,13 +21,15 @@ LAYERS = (
     ("constraints",),
     ("data",),
     ("gp",),
+    ("forces",),
+    ("storage",),
+    ("control",),
     ("simulate",),
     ("scene",),
-    ("models",),
-    ("rollout",),
+    ("rollout", "models"),
     ("evaluation",),
     ("report",),
-    ("experiments",),
+    ("paper",),
     ("cli",),
 )
 """From the lowest to the highest: a part imports parts of its own row and of rows above it in this list."""

@@ -14,7 +14,7 @@ from torch import Tensor
 import forcegp
 from forcegp import evaluate
 from forcegp.errors import DataError, ModelError
-from forcegp.gp.learning import LearningOptions
+from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, FitResult, Model, Prediction
 from random_data import NOISE_STD, random_data, table_system
 

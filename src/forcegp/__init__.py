@@ -21,38 +21,40 @@ if TYPE_CHECKING:
     )
     from forcegp.data import Dataset, SavitzkyGolay
     from forcegp.evaluation import Evaluation, evaluate
-    from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior
-    from forcegp.gp.learning import LearningOptions
-    from forcegp.gp.mean import AnalyticalMean
-    from forcegp.gp.priors import JointForcePrior, NormalForcePrior, OperatorForcePrior
+    from forcegp.forces.mean import AnalyticalMean
+    from forcegp.forces.measurements import Observation
+    from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+    from forcegp.forces.priors.joint import JointForcePrior
+    from forcegp.forces.priors.normal_force import NormalForcePrior
+    from forcegp.forces.priors.operator import OperatorForcePrior
+    from forcegp.gp.optimise import LearningOptions
     from forcegp.models.analytical import AnalyticalModel
-    from forcegp.models.files import load_model
     from forcegp.models.independent_gp import IndependentGP
+    from forcegp.models.load import load_model
     from forcegp.models.neural import NeuralNetwork
-    from forcegp.models.observation import Observation
     from forcegp.models.structured_gp import StructuredGP
     from forcegp.robot import AnalyticalParameters, RobotModel, load_robot
     from forcegp.rollout import Rollout, RolloutOptions, TaskSpaceControl, contact_loss_probability
     from forcegp.scene import Scene, load_scene
 
 _HOME = {
-    "AnalyticalMean": "gp.mean",
+    "AnalyticalMean": "forces.mean",
     "AnalyticalModel": "models.analytical",
     "AnalyticalParameters": "robot",
     "Baumgarte": "constraints",
     "ConstrainedSystem": "constraints",
-    "ContactForcePrior": "gp.contact_priors",
+    "ContactForcePrior": "forces.priors.contact",
     "Cylinder": "constraints",
     "Dataset": "data",
     "Evaluation": "evaluation",
     "ImplicitSurface": "constraints",
     "IndependentGP": "models.independent_gp",
-    "JointForcePrior": "gp.priors",
-    "LearningOptions": "gp.learning",
+    "JointForcePrior": "forces.priors.joint",
+    "LearningOptions": "gp.optimise",
     "NeuralNetwork": "models.neural",
-    "NormalForcePrior": "gp.priors",
-    "Observation": "models.observation",
-    "OperatorForcePrior": "gp.priors",
+    "NormalForcePrior": "forces.priors.normal_force",
+    "Observation": "forces.measurements",
+    "OperatorForcePrior": "forces.priors.operator",
     "Plane": "constraints",
     "PointConnection": "constraints",
     "RobotModel": "robot",
@@ -62,7 +64,7 @@ _HOME = {
     "Scene": "scene",
     "Sphere": "constraints",
     "StructuredGP": "models.structured_gp",
-    "SlidingFrictionPrior": "gp.contact_priors",
+    "SlidingFrictionPrior": "forces.priors.contact",
     "SurfaceContact": "constraints",
     "TaskSpaceControl": "rollout",
     "compiled": "",
@@ -72,7 +74,7 @@ _HOME = {
     "evaluate": "evaluation",
     "identification": "",
     "kinematics": "",
-    "load_model": "models.files",
+    "load_model": "models.load",
     "load_robot": "robot",
     "load_scene": "scene",
 }

@@ -7,7 +7,7 @@ import torch
 
 from forcegp import AnalyticalModel
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.learning import LearningOptions
+from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import Window
 from forcegp.models.minibatch import BatchOptions
 from forcegp.robot.inertia import pseudo_inertia

@@ -13,7 +13,7 @@ import torch
 
 import forcegp
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.learning import LearningOptions
+from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import Model
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.registry import MODELS, create

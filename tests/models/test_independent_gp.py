@@ -10,8 +10,8 @@ from torch import Tensor
 
 from forcegp import IndependentGP
 from forcegp.errors import DataError, ModelError, ShapeError
-from forcegp.gp.exact import negative_log_likelihood
-from forcegp.gp.learning import LearningOptions
+from forcegp.gp.likelihood import negative_log_likelihood
+from forcegp.gp.optimise import LearningOptions
 from random_data import NOISE_STD, random_data, table_system
 
 ROUNDING = 1e-9

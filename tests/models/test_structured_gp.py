@@ -18,18 +18,19 @@ from torch import Tensor
 import forcegp
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.errors import DataError, ForceGPError, ModelError, ShapeError, UnknownNameError
-from forcegp.gp.affine import QUANTITIES
-from forcegp.gp.checkpoint import Checkpoint
-from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior
-from forcegp.gp.hyperprior import negative_log_prior
+from forcegp.forces.measurements import Observation
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.operator import OperatorForcePrior
+from forcegp.forces.quantities import QUANTITIES
+from forcegp.forces.start import negative_log_prior
 from forcegp.gp.kernels import Linear
-from forcegp.gp.learning import LearningOptions
-from forcegp.gp.priors import JointForcePrior, OperatorForcePrior
+from forcegp.gp.optimise import LearningOptions
 from forcegp.gp.stationary import Matern52, SquaredExponential
-from forcegp.models.observation import Observation
 from forcegp.models.structured_gp import StructuredGP
-from gp.cases import all_priors, conditioned, draw, logged, mixed_contacts, two_contacts
-from gp.textbook import Textbook
+from forcegp.storage.checkpoint import Checkpoint
+from forces.cases import all_priors, conditioned, draw, logged, mixed_contacts, two_contacts
+from forces.textbook import Textbook
 from random_data import random_data, table_system
 
 SHORT = LearningOptions(max_evaluations=4)
@@ -463,7 +464,7 @@ class Interrupted(Exception):
 
 def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data, path = logged(two_contacts(), 12), tmp_path / "fit.safetensors"
-    monkeypatch.setattr("forcegp.gp.checkpoint.INTERVAL", 0.0)
+    monkeypatch.setattr("forcegp.storage.checkpoint.INTERVAL", 0.0)
     seen: list[float] = []
 
     def stop(evaluations: int, most: int, value: float) -> None:

@@ -9,7 +9,7 @@ import torch
 from forcegp.constraints import Baumgarte
 from forcegp.data import Dataset, select_points
 from forcegp.errors import ModelError
-from forcegp.gp.learning import LearningOptions
+from forcegp.gp.optimise import LearningOptions
 from forcegp.models.registry import create
 from forcegp.rollout import AccelerationLaw, RolloutOptions, contact_loss_probability, rollout
 from forcegp.simulate import SimulationConfig, simulate

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from forcegp.constraints import Baumgarte
+from forcegp.control.plan import make_plan
 from forcegp.errors import ForceGPError, ShapeError, UnknownNameError
 from forcegp.rollout import DivergedError, Feedback, ForceLaw, RolloutOptions, TaskSpaceControl, rollout
 from forcegp.simulate import SimulationConfig
-from forcegp.simulate.plan import make_plan
 from rollout_cases import ANALYTICAL, arm, simulated, slider
 
 

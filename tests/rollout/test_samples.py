@@ -9,9 +9,9 @@ import torch
 from forcegp.constraints import Baumgarte
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError
-from forcegp.gp.learning import LearningOptions
-from forcegp.gp.pathwise import draw_samples
-from forcegp.gp.states import states
+from forcegp.forces.samples import draw_samples
+from forcegp.forces.states import states
+from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import Model
 from forcegp.models.structured_gp import StructuredGP

@@ -31,7 +31,7 @@ def evaluate(
     """
     from forcegp.evaluation import evaluate as run
     from forcegp.files import write_json
-    from forcegp.models.files import load_model
+    from forcegp.models.load import load_model
 
     regression = load_model(model)
     test = data_of_robot(read_data(data), regression.system.robot)
@@ -39,7 +39,7 @@ def evaluate(
         result = run(regression, test, progress=progress)
     figures: dict[str, object] = dict(result.summary())
     if out is not None:
-        from forcegp.experiments.window import opening, predicted_window
+        from forcegp.paper.window import opening, predicted_window
         from forcegp.report.evaluation import write_evaluation
 
         write_json(out / "evaluation.json", result.to_dict())

@@ -49,7 +49,7 @@ def predict(
     """
     import torch
 
-    from forcegp.models.files import load_model
+    from forcegp.models.load import load_model
 
     regression = load_model(model)
     test = data_of_robot(read_data(data), regression.system.robot)

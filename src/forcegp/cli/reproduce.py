@@ -26,7 +26,7 @@ def reproduce(
 
     forcegp reproduce --profile paper --out out/paper --seed 1
     """
-    from forcegp.experiments.reproduce import run
+    from forcegp.paper.reproduce import run
 
     def say(line: str) -> None:
         typer.echo(line, err=True)

@@ -54,7 +54,7 @@ def rollout(
 
     forcegp rollout -m model/ -d run.parquet --start 2400 --samples 50 -o rollout/
     """
-    from forcegp.models.files import load_model
+    from forcegp.models.load import load_model
     from forcegp.rollout import RolloutOptions
 
     regression = load_model(model)

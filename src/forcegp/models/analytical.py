@@ -15,15 +15,15 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.gp.affine import affine_map
-from forcegp.gp.learning import Learned, LearningOptions, minimise
-from forcegp.gp.mean import AnalyticalMean
-from forcegp.gp.states import states
-from forcegp.gp.whitening import Measurement, prior_mean
+from forcegp.forces.mean import AnalyticalMean
+from forcegp.forces.measurements import Observation, measurement_of
+from forcegp.forces.projection import Measurement, prior_mean
+from forcegp.forces.quantities import affine_map
+from forcegp.forces.states import states
+from forcegp.gp.optimise import Learned, LearningOptions, minimise
 from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction
 from forcegp.models.flat import flat_states
 from forcegp.models.minibatch import BatchOptions, Loss, train
-from forcegp.models.observation import Observation, measurement_of
 from forcegp.robot.parameters import AnalyticalParameters
 
 LearnedFigures = Mapping[str, Sequence[str] | Literal["all"]]

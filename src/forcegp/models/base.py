@@ -14,7 +14,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
-from forcegp.gp.states import States
+from forcegp.forces.states import States
 
 if TYPE_CHECKING:
     from forcegp.rollout.forward import Torque

@@ -14,10 +14,10 @@ from forcegp.errors import ForceGPError, ModelError
 from forcegp.gp.standardization import Standardization
 from forcegp.models.analytical import AnalyticalModel, Window
 from forcegp.models.base import not_fitted
-from forcegp.models.folder import ModelHeader, Settings, settings_of, write_model
 from forcegp.models.independent_gp import IndependentGP, IndependentTraining
 from forcegp.models.neural import NeuralNetwork
-from forcegp.models.system_files import take
+from forcegp.storage.folder import ModelHeader, Settings, settings_of, write_model
+from forcegp.storage.system import take
 
 STATES: tuple[str, ...] = ("q", "qd", "tau")
 

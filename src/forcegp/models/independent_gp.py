@@ -13,16 +13,16 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.gp.exact import Conditioned, condition, negative_log_likelihood
-from forcegp.gp.gram import Block, cross_gram
-from forcegp.gp.hyperprior import bounds_of, initial_hyperparameters, negative_log_prior
+from forcegp.forces.measurements import NoiseStd, Observation, measurement_of
+from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.start import bounds_of, initial_hyperparameters, negative_log_prior
 from forcegp.gp.kernels import sub
-from forcegp.gp.learning import Learned, LearningOptions, minimise
-from forcegp.gp.priors import JointForcePrior
+from forcegp.gp.likelihood import Conditioned, condition, negative_log_likelihood
+from forcegp.gp.optimise import Learned, LearningOptions, minimise
 from forcegp.gp.standardization import Standardization
+from forcegp.gp.structured_covariance import Block, cross_gram
 from forcegp.models.base import FitProgress, FitResult, Model, Prediction, not_fitted, only_qdd
 from forcegp.models.flat import flat_states
-from forcegp.models.observation import NoiseStd, Observation, measurement_of
 
 CHUNK_STATES = 2000
 """States predicted at a time, which bounds the memory."""

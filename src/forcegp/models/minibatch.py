@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, NumericalError
-from forcegp.gp.learning import Learned
+from forcegp.gp.optimise import Learned
 from forcegp.models.base import FitProgress
 
 Loss = Callable[[Mapping[str, Tensor], Tensor], Tensor]

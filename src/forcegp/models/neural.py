@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
+from forcegp.forces.measurements import Observation, measurement_of
 from forcegp.gp.standardization import Standardization
 from forcegp.models.base import FitProgress, FitResult, Model, Prediction, not_fitted, only_qdd
 from forcegp.models.flat import flat_states
 from forcegp.models.minibatch import BatchOptions, train
-from forcegp.models.observation import Observation, measurement_of
 
 PAPER_ARCHITECTURES: tuple[tuple[int, ...], ...] = ((80,), (30, 20), (200, 200, 200, 200))
 """Widths of the hidden layers of the three networks of the paper."""

@@ -8,13 +8,13 @@ from typing import Any
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
+from forcegp.forces.measurements import NoiseStd
+from forcegp.forces.priors.default import PAPER, contact_priors, default_priors
 from forcegp.gp.kernels import Kernel
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import Model
-from forcegp.models.default_priors import PAPER, contact_priors, default_priors
 from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.neural import NeuralNetwork
-from forcegp.models.observation import NoiseStd
 from forcegp.models.structured_gp import StructuredGP
 
 

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.gp.mean import AnalyticalMean
+from forcegp.forces.mean import AnalyticalMean
+from forcegp.forces.projection import Measurement
 from forcegp.gp.standardization import Standardization
-from forcegp.gp.whitening import Measurement
-from forcegp.models.folder import ModelHeader, settings_of
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_settings import COLUMNS, StructuredSettings
 from forcegp.models.structured_training import Training
+from forcegp.storage.folder import ModelHeader, settings_of
 
 
 def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

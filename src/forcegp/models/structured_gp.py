@@ -15,20 +15,19 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.affine import affine_maps, stack
-from forcegp.gp.checkpoint import Checkpoint
-from forcegp.gp.exact import target_of
-from forcegp.gp.learning import Learned, LearningOptions
-from forcegp.gp.mean import AnalyticalMean, mean_of
-from forcegp.gp.pathwise import draw_samples
-from forcegp.gp.posterior import ForcePosterior, posterior
-from forcegp.gp.priors import ForcePrior, check_priors
-from forcegp.gp.separation import force_correlation
-from forcegp.gp.states import States, states, states_at
-from forcegp.gp.whitening import Measurement
+from forcegp.forces.identifiability import force_correlation
+from forcegp.forces.mean import AnalyticalMean, mean_of
+from forcegp.forces.measurements import NoiseStd, Observation
+from forcegp.forces.posterior import ForcePosterior, posterior
+from forcegp.forces.priors.base import ForcePrior, check_priors
+from forcegp.forces.priors.default import default_priors
+from forcegp.forces.projection import Measurement
+from forcegp.forces.quantities import affine_maps, stack
+from forcegp.forces.samples import draw_samples
+from forcegp.forces.states import States, states, states_at
+from forcegp.gp.likelihood import target_of
+from forcegp.gp.optimise import Learned, LearningOptions
 from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction, not_fitted
-from forcegp.models.default_priors import default_priors
-from forcegp.models.observation import NoiseStd, Observation
 from forcegp.models.structured_problem import (
     Problem,
     analytical_parameters,
@@ -37,6 +36,7 @@ from forcegp.models.structured_problem import (
 )
 from forcegp.models.structured_settings import save_structured
 from forcegp.models.structured_training import Training, training_of
+from forcegp.storage.checkpoint import Checkpoint
 
 WITH_PARAMETERS = LearningOptions(tolerance=1e-9)
 """Default options where θ_A is learned too: L-BFGS then pauses on its way for a step or two."""

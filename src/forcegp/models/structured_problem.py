@@ -12,13 +12,13 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.gp.checkpoint import Checkpoint
-from forcegp.gp.exact import negative_log_likelihood
-from forcegp.gp.hyperprior import bounds_of, initial_hyperparameters, negative_log_prior
-from forcegp.gp.learning import Learned, LearningOptions, Progress, minimise
-from forcegp.gp.priors import ForcePrior
-from forcegp.gp.whitening import ForceMean, WhitenedRows, combine, whiten
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.projection import ForceMean, WhitenedRows, combine, whiten
+from forcegp.forces.start import bounds_of, initial_hyperparameters, negative_log_prior
+from forcegp.gp.likelihood import negative_log_likelihood
+from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
 from forcegp.models.structured_training import Training
+from forcegp.storage.checkpoint import Checkpoint
 
 NOISE = "noise."
 ANALYTICAL = "analytical."

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field
 
 from forcegp.errors import ModelError
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior, SurfaceForcePrior
+from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.gp import kernels, stationary
-from forcegp.gp.contact_priors import ContactForcePrior, SlidingFrictionPrior, SurfaceForcePrior
-from forcegp.gp.priors import ForcePrior, JointForcePrior, NormalForcePrior
 from forcegp.models.base import not_fitted
-from forcegp.models.folder import Settings, write_model
+from forcegp.storage.folder import Settings, write_model
 
 if TYPE_CHECKING:
     from forcegp.models.structured_gp import StructuredGP

@@ -13,11 +13,11 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, farthest_points, standardized
 from forcegp.errors import ModelError
-from forcegp.gp.priors import ForcePrior
+from forcegp.forces.measurements import NoiseStd, Observation, measurement_of
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.projection import Measurement
+from forcegp.forces.states import states
 from forcegp.gp.standardization import Standardization
-from forcegp.gp.states import states
-from forcegp.gp.whitening import Measurement
-from forcegp.models.observation import NoiseStd, Observation, measurement_of
 
 
 @dataclass(frozen=True)

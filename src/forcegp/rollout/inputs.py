@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Equations
+from forcegp.control.plan import Plan
+from forcegp.control.task_space import Gains, Target, control_torque, tool_motion
 from forcegp.errors import ShapeError, UnknownNameError
-from forcegp.simulate.control import Gains, Target, control_torque, tool_motion
-from forcegp.simulate.plan import Plan
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6

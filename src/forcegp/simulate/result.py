@@ -9,14 +9,14 @@ from torch import Tensor
 
 from forcegp import kinematics
 from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.control.config import SimulationConfig
+from forcegp.control.plan import Plan
+from forcegp.control.task_space import tool_motion
+from forcegp.control.trajectory import Reference
 from forcegp.data.dataset import Dataset
 from forcegp.data.header import DataHeader
 from forcegp.simulate.check import acceleration_mismatch
-from forcegp.simulate.config import SimulationConfig
-from forcegp.simulate.control import tool_motion
-from forcegp.simulate.plan import Plan
 from forcegp.simulate.touch import Touch
-from forcegp.simulate.trajectory import Reference
 
 
 @dataclass(frozen=True)

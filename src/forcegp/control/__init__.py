@@ -1,0 +1,1 @@
+"""Motions to follow and the task-space controller that follows them."""

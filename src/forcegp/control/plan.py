@@ -1,0 +1,135 @@
+"""The plan of a motion: reference, posture, orientation and start, drawn before anything moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp import kinematics
+from forcegp.constraints.contact import SurfaceContact
+from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.control.config import SimulationConfig
+from forcegp.control.placement import inverse_kinematics, tool_rotation
+from forcegp.control.task_space import Target
+from forcegp.control.trajectory import Chart, Reference, draw_waypoints, straight_lines
+from forcegp.errors import ForceGPError
+from forcegp.robot.model import RobotModel
+
+TASK_ROWS = 6
+"""Position and orientation of the tool."""
+STARTS = 64
+"""Random joint positions that inverse kinematics starts from; those near zero give the natural postures."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that the controller is to follow.
+
+    Attributes:
+        contact: name of the contact that the tool has, `None` in free space.
+        frame, point: the tool point.
+        reference: the motion of the tool point.
+        targets: the controller's targets, `(n, …)`, one a sample.
+        start: `(nq,)` joint positions at the first waypoint.
+    """
+
+    contact: str | None
+    frame: str
+    point: Sequence[float]
+    reference: Reference
+    targets: Target
+    start: Tensor
+
+    def target(self, k: int) -> Target:
+        """The target of sample k."""
+        return Target(*(values[k] for values in self.targets))
+
+
+def make_plan(system: ConstrainedSystem, config: SimulationConfig, generator: torch.Generator) -> Plan:
+    """Draw a motion of the tool over the surface of the system's first contact, or in free space.
+
+    Args:
+        system: robot and contacts.
+        config: rectangle, times, forces.
+        generator: source of the random numbers.
+
+    Raises:
+        ForceGPError: the robot has fewer than six joints.
+        NumericalError: the rectangle's centre or the first waypoint is out of reach.
+    """
+    robot = system.robot
+    _check_joints(robot)
+    contact = next((c for c in system.contacts if isinstance(c, SurfaceContact)), None)
+    frame, point = (contact.frame, contact.point) if contact else (config.frame, config.point)
+    frame = robot.frame_names[-1] if frame is None else frame
+    center = kinematics.as_point(robot, config.center)
+    chart = Chart.about(center, contact.surface if contact else None)
+    reference = _draw_reference(chart, config, generator)
+    rotation = tool_rotation(chart.axes[2], chart.axes[0], _tool_axis(kinematics.as_point(robot, point)))
+    draws = 2.0 * torch.rand(STARTS, robot.nq, dtype=torch.float64, generator=generator) - 1.0
+    starts = (torch.linspace(0.0, math.pi, STARTS)[:, None] * draws).to(robot.dtype)
+    nearest = torch.zeros(robot.nq, dtype=robot.dtype)
+    home = inverse_kinematics(robot, frame, point, chart.center, rotation, starts, nearest)
+    start = inverse_kinematics(robot, frame, point, reference.waypoints[0], rotation, home[None], home)
+    postures = _draw_postures(robot, home, frame, point, len(reference.travel_time), config, generator)
+    targets = Target(
+        reference.position,
+        reference.velocity,
+        reference.acceleration,
+        rotation.expand(config.steps, 3, 3),
+        postures[reference.segment],
+        _draw_push(reference, config, generator),
+    )
+    return Plan(contact.name if contact else None, frame, point, reference, targets, start)
+
+
+def _check_joints(robot: RobotModel) -> None:
+    if robot.nq < TASK_ROWS:
+        raise ForceGPError(
+            f"robot {robot.name!r} cannot follow a tool pose",
+            expected=f"at least {TASK_ROWS} joints for position and orientation",
+            got=f"{robot.nq} joints",
+        )
+
+
+def _tool_axis(point: Tensor) -> Tensor:
+    """The direction of the tool point in its frame, or the frame's z axis for a point at its origin."""
+    if float(torch.linalg.vector_norm(point)) == 0.0:
+        return torch.tensor([0.0, 0.0, 1.0], dtype=point.dtype)
+    return torch.nn.functional.normalize(point, dim=-1)
+
+
+def _draw_reference(chart: Chart, config: SimulationConfig, generator: torch.Generator) -> Reference:
+    lines = math.ceil(config.duration / config.travel_time)
+    waypoints = draw_waypoints(
+        lines + 1, config.size, config.lift_height, config.lift_probability, generator
+    ).to(chart.center.dtype)
+    t = torch.arange(config.steps, dtype=chart.center.dtype) * config.dt
+    return straight_lines(chart, waypoints, t, config.travel_time, config.max_acceleration)
+
+
+def _draw_postures(
+    robot: RobotModel,
+    home: Tensor,
+    frame: str,
+    point: Sequence[float],
+    segments: int,
+    config: SimulationConfig,
+    generator: torch.Generator,
+) -> Tensor:
+    """`(segments, nq)` postures off the home posture along the null space, where the elbow swings."""
+    J = kinematics.frame_jacobian(robot, home, frame, point)
+    free = torch.linalg.svd(J)[2][TASK_ROWS:]
+    swing = 2.0 * torch.rand(segments, len(free), dtype=torch.float64, generator=generator) - 1.0
+    return home + config.elbow_swing * swing.to(robot.dtype) @ free
+
+
+def _draw_push(reference: Reference, config: SimulationConfig, generator: torch.Generator) -> Tensor:
+    """`(n,)` force into the surface, one draw a line, none on lines off the surface."""
+    low, high = config.pressing_force
+    draws = torch.rand(len(reference.travel_time), dtype=torch.float64, generator=generator)
+    return (low + (high - low) * draws).to(reference.t.dtype)[reference.segment] * reference.on_surface

@@ -1,0 +1,35 @@
+"""How far data tell apart the joint force Q and the contact's dissipative force Q_z (remark 3.3).
+
+Accelerations in contact depend on Q + Q_z alone. What separates the two is where they act (Q_z only in
+contact, along the tangent), on what they depend, and measurements of either. Their posterior correlation
+says how far that goes: at −1 only the sum is known, at 0 each is known as well as the data allow.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.quantities import affine_map
+from forcegp.forces.states import States
+
+
+def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
+    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 where one is certain.
+
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i).
+
+    Args:
+        posterior: over latent forces.
+        system: robot and contacts.
+        at: n states.
+    """
+    z = affine_map(system, at, ("joint_force", "contact_friction"))
+    covariance = posterior.read_covariance(system, at, z)
+    nq = system.robot.nq
+    cross = covariance[:, :nq, nq:].diagonal(dim1=-2, dim2=-1)
+    own = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)
+    scale = (own[:, :nq] * own[:, nq:]).sqrt()
+    return torch.where(scale > 0.0, cross / scale.where(scale > 0.0, 1.0), 0.0).clamp(-1.0, 1.0)

@@ -1,0 +1,53 @@
+"""The force priors that models have unless they are given others."""
+
+from __future__ import annotations
+
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.forces.mean import AnalyticalMean, mean_of
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.normal_force import NormalForcePrior
+from forcegp.gp.kernels import Kernel, Linear
+from forcegp.gp.stationary import SquaredExponential
+
+PAPER = SquaredExponential()
+"""The paper's kernel of a joint force (eq. 31)."""
+ANGLES, RATES = SquaredExponential(("q",), shared=True), Linear(("qd",), shared=True)
+"""What depends on the configuration; what is linear in the speed of the joints."""
+WHOLE = Linear(("tau",)) + ANGLES + RATES * RATES * ANGLES + SquaredExponential(("qd",), shared=True)
+"""Of a force that includes the motor torque, which enters linearly: weight, which the configuration decides,
+bias and damping, which there are quadratic and linear in the speed, and any friction of the joints."""
+REMAINING = RATES * ANGLES + SquaredExponential(shared=True)
+"""Of a force without it: damping that depends on the configuration, and anything else."""
+
+
+def default_priors(
+    system: ConstrainedSystem, mean: str | AnalyticalMean = "zero", kernel: Kernel | None = None
+) -> tuple[ForcePrior, ...]:
+    """A joint force prior, with what accelerations do not show left open where there are contacts.
+
+    Args:
+        system: robot and contacts.
+        mean: the model's prior mean, which decides what is left to the prior.
+        kernel: covariance of each joint force; by default `REMAINING` where the mean includes the motor
+            torque, `WHOLE` elsewhere.
+    """
+    joint = JointForcePrior(kernel or (REMAINING if "actuation" in mean_of(mean).terms else WHOLE))
+    return (joint, NormalForcePrior(joint)) if system.m else (joint,)
+
+
+def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
+    """A prior on the friction of each contact with a surface; a joint force prior where there is none.
+
+    Args:
+        system: robot and contacts.
+        kernel: covariance of each Cartesian component of any tangential force; by default the force is
+            friction that opposes sliding.
+    """
+    surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
+    if kernel is None:
+        priors = [SlidingFrictionPrior(name) for name in surfaces]
+    else:
+        priors = [ContactForcePrior(name, kernel) for name in surfaces]
+    return tuple(priors) or (JointForcePrior(),)

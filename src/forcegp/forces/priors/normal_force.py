@@ -1,0 +1,56 @@
+"""A prior on the part of the joint force along the constraint, which no acceleration shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.states import States
+from forcegp.gp.kernels import Kernel
+from forcegp.robot.model import RobotModel
+
+
+@dataclass(frozen=True)
+class NormalForcePrior(ForcePrior):
+    """What accelerations in contact never show: a joint force along the constraint, E = Aᵀ Lᵀ = I − P.
+
+    H Aᵀ = 0, so a force Aᵀ g(x) changes the multiplier by −g(x) and no acceleration. A joint force prior
+    alone takes its smoothness for knowledge of that part, and gives multipliers that are too sure. This
+    independent process of the same size, with the hyperparameters of the joint force prior, leaves open
+    what is open, until a force sensor or the like says more.
+
+    Args:
+        like: the joint force prior whose kernel, inputs and hyperparameters it shares.
+    """
+
+    like: JointForcePrior = field(default_factory=JointForcePrior)
+    in_contact_only: bool = True
+
+    @property
+    def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return f"{self.like.name}_normal"
+
+    @property
+    def kernel(self) -> Kernel:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.like.kernel
+
+    @property
+    def measurable(self) -> bool:
+        return False
+
+    @property
+    def prefix(self) -> str:
+        return self.like.name
+
+    def outputs(self, robot: RobotModel) -> int:
+        return self.like.outputs(robot)
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return self.like.features(system, at)
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        return at.eom.A.mT @ at.eom.L.mT

@@ -1,0 +1,56 @@
+"""A prior on any force, carried by an operator of the user."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ModelError
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.states import States
+from forcegp.gp.kernels import Kernel
+from forcegp.gp.stationary import SquaredExponential
+from forcegp.robot.model import RobotModel
+
+
+@dataclass(frozen=True)
+class OperatorForcePrior(ForcePrior):
+    """A prior on any force, carried by a user-given operator ("any analytical tensor of appropriate size").
+
+    Args:
+        name: prefix of the hyperparameters.
+        size: number of components of f.
+        operator_function: maps `(system, states)` to E(x) `(n, nq, size)`.
+        feature_function: maps `(system, states)` to named inputs `(n, w)`; q, q̇, τ by default.
+        kernel: covariance of each component.
+        in_contact_only: whether the force belongs to Q_z.
+    """
+
+    name: str
+    size: int
+    operator_function: Callable[[ConstrainedSystem, States], Tensor]
+    feature_function: Callable[[ConstrainedSystem, States], dict[str, Tensor]] | None = None
+    kernel: Kernel = field(default_factory=SquaredExponential)
+    in_contact_only: bool = False
+
+    def outputs(self, robot: RobotModel) -> int:
+        return self.size
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        if self.feature_function is None:
+            return {"q": at.q, "qd": at.qd, "tau": at.tau}
+        return self.feature_function(system, at)
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        E = self.operator_function(system, at)
+        expected = (len(at.q), at.q.shape[-1], self.size)
+        if tuple(E.shape) != expected:
+            raise ModelError(
+                f"the operator of force prior {self.name!r} has the wrong shape",
+                expected=expected,
+                got=tuple(E.shape),
+            )
+        return E

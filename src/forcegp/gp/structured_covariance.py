@@ -1,0 +1,238 @@
+"""Gram matrices of force priors seen through operators, and their derivatives.
+
+A block holds `n` samples with `r` rows each. Between two samples the covariance of their rows is
+Σ_k W[i,:,k] k_k(x_i, x_j) W[j,:,k]ᵀ, summed over the components k of every prior: the block-by-block
+form of H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by block, sample, row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from forcegp.gp.kernels import Features, Kernel, Parameters, sub
+
+CHUNK_ELEMENTS = 400_000
+"""Size of the intermediate arrays of one chunk of samples; they should stay in the processor's cache."""
+
+
+@runtime_checkable
+class Process(Protocol):
+    """A Gaussian process by its kernel and the prefix of its hyperparameters."""
+
+    @property
+    def kernel(self) -> Kernel:
+        """Covariance of each component."""
+        ...
+
+    @property
+    def prefix(self) -> str:
+        """Prefix of the hyperparameters; another process's where they are shared."""
+        ...
+
+
+@dataclass(frozen=True)
+class Block:
+    """Samples that share a number of rows.
+
+    Attributes:
+        features: standardized kernel inputs of each prior, `(n, w)` by name.
+        operators: W of each prior, `(n, r, components)`.
+        target: whitened residual `(n, r)`.
+    """
+
+    features: tuple[Features, ...]
+    operators: tuple[Tensor, ...]
+    target: Tensor
+
+    @property
+    def rows(self) -> int:
+        """Number of rows, n r."""
+        return self.target.numel()
+
+
+def offsets(blocks: Sequence[Block]) -> list[int]:
+    """First row of each block, and the number of rows."""
+    starts = [0]
+    for block in blocks:
+        starts.append(starts[-1] + block.rows)
+    return starts
+
+
+def _chunks(n: int, size: int) -> Iterator[tuple[int, int]]:
+    step = max(1, CHUNK_ELEMENTS // max(size, 1))
+    for first in range(0, n, step):
+        yield first, min(first + step, n)
+
+
+def _add_rows(out: Tensor, W1: Tensor, k: Tensor, W2: Tensor, lower: bool) -> None:
+    """Add Σ_k W1 k W2ᵀ to `out`, chunk by chunk; only up to the diagonal where `lower`."""
+    r = W1.shape[1]
+    W2k = W2.permute(2, 0, 1)
+    for i, j in _chunks(len(W1), W2.numel()):
+        n = j if lower else len(W2)
+        weighted = k[:, i:j, :n].transpose(0, 1)[..., None] * W2k[:, :n]
+        out[i * r : j * r, : n * W2.shape[1]] += (W1[i:j] @ weighted.flatten(2)).flatten(0, 1)
+
+
+def _silent(one: Block, two: Block, p: int) -> bool:
+    """Whether prior p contributes nothing between two blocks."""
+    return not (bool(one.operators[p].any()) and bool(two.operators[p].any()))
+
+
+def cross_gram(
+    priors: Sequence[Process], params: Parameters, blocks1: Sequence[Block], blocks2: Sequence[Block]
+) -> Tensor:
+    """Covariance between the rows of two lists of blocks, `(rows1, rows2)`."""
+    starts1, starts2 = offsets(blocks1), offsets(blocks2)
+    like = blocks1[0].target
+    K = torch.zeros(starts1[-1], starts2[-1], dtype=like.dtype, device=like.device)
+    for p, prior in enumerate(priors):
+        own = sub(params, prior.prefix)
+        for g, one in enumerate(blocks1):
+            for h, two in enumerate(blocks2):
+                if _silent(one, two, p):
+                    continue
+                k = prior.kernel.covariance(own, one.features[p], two.features[p])
+                part = K[starts1[g] : starts1[g + 1], starts2[h] : starts2[h + 1]]
+                _add_rows(part, one.operators[p], k, two.operators[p], lower=False)
+    return K
+
+
+def gram(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
+    """Covariance of the rows of blocks with unit white noise, `(rows, rows)`; the lower triangle is valid."""
+    starts = offsets(blocks)
+    like = blocks[0].target
+    K = torch.zeros(starts[-1], starts[-1], dtype=like.dtype, device=like.device)
+    for p, prior in enumerate(priors):
+        own = sub(params, prior.prefix)
+        for g, one in enumerate(blocks):
+            for h in range(g + 1):
+                two = blocks[h]
+                if _silent(one, two, p):
+                    continue
+                k = prior.kernel.covariance(own, one.features[p], two.features[p])
+                part = K[starts[g] : starts[g + 1], starts[h] : starts[h + 1]]
+                _add_rows(part, one.operators[p], k, two.operators[p], lower=g == h)
+    K.diagonal().add_(1.0)
+    return K
+
+
+@dataclass
+class GramGradient:
+    """Derivatives of a scalar with respect to what a Gram matrix is made of.
+
+    Attributes:
+        params: by hyperparameter name.
+        features: by block, prior and input name.
+        operators: by block and prior.
+    """
+
+    params: dict[str, Tensor]
+    features: list[list[dict[str, Tensor]]]
+    operators: list[list[Tensor]]
+
+
+def gram_gradient(
+    priors: Sequence[Process],
+    params: Parameters,
+    blocks: Sequence[Block],
+    K_inv: Tensor,
+    alpha: Tensor,
+    with_operators: bool,
+) -> GramGradient:
+    """Derivatives of ½ log|K| + ½ yᵀK⁻¹y, from dK = ½(K⁻¹ − ααᵀ) in closed form.
+
+    With G = K⁻¹ − ααᵀ the derivative for the kernel between samples i and j is ½ W_iᵀ G_ij W_j; only
+    the kernels themselves are differentiated automatically.
+
+    Args:
+        priors, params, blocks: as given to `gram`.
+        K_inv: `(rows, rows)`, the lower triangle is read.
+        alpha: `(rows,)` K⁻¹ y.
+        with_operators: whether to compute derivatives for operators and features too.
+    """
+    starts = offsets(blocks)
+    result = GramGradient(
+        {key: torch.zeros_like(value) for key, value in params.items()},
+        [[{n: torch.zeros_like(x) for n, x in f.items()} for f in block.features] for block in blocks],
+        [[torch.zeros_like(W) for W in block.operators] for block in blocks],
+    )
+    for p, prior in enumerate(priors):
+        own = sub(params, prior.prefix)
+        for g, one in enumerate(blocks):
+            for h in range(g + 1):
+                two = blocks[h]
+                if _silent(one, two, p):
+                    continue
+                leaves, k = _kernel_with_leaves(prior, own, one.features[p], two.features[p], with_operators)
+                into = (result.operators[g][p], result.operators[h][p]) if with_operators else None
+                dk = _kernel_gradient(
+                    K_inv[starts[g] : starts[g + 1], starts[h] : starts[h + 1]],
+                    (alpha[starts[g] : starts[g + 1]], alpha[starts[h] : starts[h + 1]]),
+                    (one.operators[p], two.operators[p]),
+                    k.detach(),
+                    g == h,
+                    into,
+                )
+                grads = torch.autograd.grad(k, list(leaves.values()), dk, allow_unused=True)
+                for (kind, key), grad in zip(leaves, grads, strict=True):
+                    if grad is None:
+                        continue
+                    if kind == "param":
+                        result.params[f"{prior.prefix}.{key}"] += grad
+                    else:
+                        result.features[g if kind == "one" else h][p][key] += grad
+    return result
+
+
+def _kernel_with_leaves(
+    prior: Process, own: Parameters, f1: Features, f2: Features, with_features: bool
+) -> tuple[dict[tuple[str, str], Tensor], Tensor]:
+    """The kernel matrix with a graph to fresh leaves of its parameters and, on request, its inputs."""
+    leaves = {("param", key): value.detach().requires_grad_() for key, value in own.items()}
+    one: Mapping[str, Tensor] = f1
+    two: Mapping[str, Tensor] = f2
+    if with_features:
+        leaves |= {("one", key): x.detach().requires_grad_() for key, x in f1.items()}
+        leaves |= {("two", key): x.detach().requires_grad_() for key, x in f2.items()}
+        one, two = ({key: leaves[side, key] for key in f1} for side in ("one", "two"))
+    with torch.enable_grad():
+        k = prior.kernel.covariance({key: leaves["param", key] for key in own}, one, two)
+    return leaves, k
+
+
+def _kernel_gradient(
+    K_inv: Tensor,
+    alpha: tuple[Tensor, Tensor],
+    operators: tuple[Tensor, Tensor],
+    k: Tensor,
+    lower: bool,
+    into: tuple[Tensor, Tensor] | None,
+) -> Tensor:
+    """Derivative for the kernel matrix `(components, n, n')`; adds those for the operators to `into`.
+
+    On a diagonal block the lower triangle carries the weight of both.
+    """
+    W1, W2 = operators
+    r, s = W1.shape[1], W2.shape[1]
+    dk = torch.zeros_like(k)
+    W2k = W2.permute(2, 0, 1)
+    for i, j in _chunks(len(W1), W2.numel()):
+        n = j if lower else len(W2)
+        G = torch.addr(K_inv[i * r : j * r, : n * s], alpha[0][i * r : j * r], alpha[1][: n * s], alpha=-1.0)
+        if lower:
+            own = G[:, i * s :]
+            own.copy_(0.5 * (torch.tril(own) + torch.tril(own, -1).mT))
+        G = G.unflatten(0, (j - i, r))
+        Z = (W1[i:j].mT @ G).unflatten(2, (n, s))
+        dk[:, i:j, :n] = (Z * W2k[:, :n]).sum(-1).transpose(0, 1)
+        if into is not None:
+            weighted = k[:, i:j, :n].transpose(0, 1)[..., None] * W2k[:, :n]
+            into[0][i:j] += G @ weighted.flatten(2).mT
+            into[1][:n] += torch.einsum("kij,ikjb->jbk", k[:, i:j, :n], Z)
+    return dk

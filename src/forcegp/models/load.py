@@ -1,0 +1,50 @@
+"""Reading a saved model of any kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import UnknownNameError
+from forcegp.models.analytical import AnalyticalModel
+from forcegp.models.base import Model
+from forcegp.models.baseline_files import load_analytical, load_independent, load_network
+from forcegp.models.independent_gp import IndependentGP
+from forcegp.models.neural import NeuralNetwork
+from forcegp.models.structured_files import load_structured
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.storage.folder import HEADER_FILE, ModelHeader, own_tensors, read_model
+from forcegp.storage.system import unpack_system
+
+Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], Model]
+
+LOADERS: dict[str, Loader] = {
+    AnalyticalModel.kind: load_analytical,
+    NeuralNetwork.kind: load_network,
+    IndependentGP.kind: load_independent,
+    StructuredGP.kind: load_structured,
+}
+"""What reads each kind of models."""
+
+
+def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> Model:
+    """Read a model that `Model.save` wrote; it predicts the same, bit for bit.
+
+    Args:
+        path: the folder.
+        system: where to take constraints from that only Python code describes (an `ImplicitSurface`);
+            robot and other constraints are those in the folder.
+
+    Raises:
+        ModelError: no model is there, it is damaged, or a constraint is to be given.
+        UnknownNameError: the model is of a kind that this release does not know.
+    """
+    header, tensors = read_model(path)
+    source = str(Path(path) / HEADER_FILE)
+    if header.kind not in LOADERS:
+        raise UnknownNameError(f"kind of models in {source}", header.kind, LOADERS)
+    own = unpack_system(header.system, tensors, source, system)
+    return LOADERS[header.kind](header, own_tensors(tensors), own, source)

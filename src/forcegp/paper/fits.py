@@ -1,0 +1,178 @@
+"""Fitted models and their scores: one stage a fit, one stage a score."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from forcegp.errors import DataError
+from forcegp.evaluation import evaluate
+from forcegp.files import Header, write_text
+from forcegp.models.base import Model
+from forcegp.models.load import load_model
+from forcegp.models.neural import NeuralNetwork
+from forcegp.models.registry import create
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.paper.memory import peak_memory, reset_peak
+from forcegp.paper.profiles import Profile
+from forcegp.paper.stages import Advance, Stage, Stages
+from forcegp.paper.task import Task
+from forcegp.report.data import Score
+
+MODEL, FIT, SCORE = "model", "fit.json", "score.json"
+
+
+NETWORKS = {"nn-30-20": (30, 20), "nn-200x4": (200, 200, 200, 200)}
+"""Hidden layers of the paper's other networks."""
+
+
+class FitRecord(Header):
+    """How a fit went; times in seconds, memory in byte."""
+
+    FORMAT: ClassVar[str] = "forcegp-fit"
+    VERSION: ClassVar[int] = 1
+
+    seconds: float
+    evaluations: int
+    converged: bool
+    objective: float
+    log_marginal_likelihood: float | None
+    jitter: float
+    message: str
+    peak_memory: int | None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model that has been fitted.
+
+    Attributes:
+        name: of the model.
+        points: training points.
+        split: where the training points come from.
+        task: the simulated run.
+        stage: its folder.
+    """
+
+    name: str
+    points: int
+    split: str
+    task: Task
+    stage: Stage
+
+    def load(self) -> Model:
+        """The model from its files."""
+        return load_model(self.stage / MODEL)
+
+    def record(self) -> FitRecord:
+        """How the fit went."""
+        return FitRecord.from_json((self.stage / FIT).read_bytes(), str(self.stage / FIT), DataError)
+
+
+def noise_std_of(task: Task) -> float:
+    """The noise on the accelerations that models are told [rad/s²]."""
+    noise = task.data.header.noise_std
+    assert noise is not None
+    return noise
+
+
+def fit_model(
+    stages: Stages, task: Task, name: str, split: str, points: int, before: Fit | None = None
+) -> Fit:
+    """Fit a model on the first training points of a split, or take up what was done before.
+
+    Args:
+        stages: where it is kept.
+        task: the simulated run.
+        name: of the model.
+        split: where the training points come from.
+        points: how many.
+        before: the same model on fewer points, at whose hyperparameters a structured GP begins.
+    """
+    begins = [] if before is None else [before.stage]
+    stage = stages.run(
+        f"fit/seed-{task.seed}/{split}/{name}-{points}",
+        lambda folder, advance: _fit(task, name, split, points, before, folder, advance),
+        settings={"model": name, "points": points, "noise_std": noise_std_of(task), "seed": task.seed},
+        inputs=[task.simulated, task.selected, *begins],
+    )
+    return Fit(name, points, split, task, stage)
+
+
+def _fit(
+    task: Task, name: str, split: str, points: int, before: Fit | None, folder: Path, advance: Advance
+) -> None:
+    model = make_model(name, task)
+    resettable = reset_peak()
+    data, progress = task.train(split, points), fit_progress(advance)
+    smaller = None if before is None else before.load()
+    if isinstance(model, StructuredGP) and isinstance(smaller, StructuredGP):
+        result = model.fit(data, begin=smaller.hyperparameters, progress=progress)
+    else:
+        result = model.fit(data, progress=progress)
+    model.save(folder / MODEL)
+    memory = peak_memory() if resettable else None
+    record = FitRecord(
+        seconds=result.seconds,
+        evaluations=result.evaluations,
+        converged=result.converged,
+        objective=result.objective,
+        log_marginal_likelihood=result.log_marginal_likelihood,
+        jitter=result.jitter,
+        message=result.message,
+        peak_memory=memory,
+    )
+    write_text(folder / FIT, record.to_json())
+
+
+def make_model(name: str, task: Task) -> Model:
+    """An unfitted model by its registry name, or one of the paper's other networks."""
+    if name in NETWORKS:
+        return NeuralNetwork(task.system, NETWORKS[name], task.seed)
+    return create(name, task.system, noise_std=noise_std_of(task), seed=task.seed)
+
+
+def fit_progress(advance: Advance) -> Callable[[int, int, float], None]:
+    """A fit's progress on a bar, with the objective beside it."""
+
+    def progress(evaluations: int, most: int, objective: float) -> None:
+        advance(evaluations, most, f"objective {objective:.6g}")
+
+    return progress
+
+
+def score_fit(stages: Stages, profile: Profile, fit: Fit) -> Score:
+    """The score of a fit on test samples of its split, or what was found before."""
+    stage = stages.run(
+        f"score/seed-{fit.task.seed}/{fit.split}/{fit.name}-{fit.points}",
+        lambda folder, _: _score(profile, fit, folder),
+        settings={"test_samples": profile.test_samples},
+        inputs=[fit.stage],
+    )
+    return Score.model_validate_json((stage / SCORE).read_bytes())
+
+
+def _score(profile: Profile, fit: Fit, folder: Path) -> None:
+    model, test = fit.load(), fit.task.test(fit.split, profile.test_samples)
+    found, record = evaluate(model, test), fit.record()
+    score = Score(
+        model=fit.name,
+        points=fit.points,
+        split=fit.split,
+        seed=fit.task.seed,
+        noisy_mae=found.noisy_mae,
+        clean_mae=found.clean_mae,
+        coverage_noisy=found.coverage_noisy,
+        coverage_clean=found.coverage_clean,
+        nlpd=found.nlpd,
+        residual=found.residual,
+        test_samples=found.samples,
+        fit_seconds=record.seconds,
+        predict_seconds=found.seconds_per_state * found.samples,
+        peak_memory=record.peak_memory,
+        evaluations=record.evaluations,
+        converged=record.converged,
+    )
+    write_text(folder / SCORE, score.model_dump_json(indent=2))

@@ -1,0 +1,1 @@
+"""Models and systems as folders of versioned JSON and safetensors."""

@@ -1,0 +1,191 @@
+"""A constrained system as JSON and tensors, so that a saved model needs no other file.
+
+The robot is kept as the tensors of `RobotModel`, bit for bit. Constraints written by the user in Python
+(an `ImplicitSurface`, a constraint of one's own) cannot be kept: their place is marked, and reading
+takes them from a system that the caller gives.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from pydantic import ValidationError
+from torch import Tensor
+
+from forcegp.constraints import Baumgarte, ConstrainedSystem, Constraint
+from forcegp.errors import ForceGPError, ModelError
+from forcegp.robot.model import RobotModel
+from forcegp.storage.records import (
+    BaumgarteRecord,
+    PointConnectionRecord,
+    RobotRecord,
+    SurfaceContactRecord,
+    SystemRecord,
+    UnsavedRecord,
+    contact_record,
+    fields_of,
+)
+
+PREFIX = "system."
+"""Of the names of the robot's tensors."""
+SHAPES: dict[str, tuple[str | int, ...]] = {
+    "placement_rotation": ("nq", 3, 3),
+    "placement_position": ("nq", 3),
+    "axis": ("nq", 3),
+    "com": ("nq", 3),
+    "inertia": ("nq", 3, 3),
+    "frame_rotation": ("nf", 3, 3),
+    "frame_position": ("nf", 3),
+    "base_rotation": (3, 3),
+    "base_position": (3,),
+    "gravity": (3,),
+}
+"""Shape of each tensor of a robot; one number a joint where not named."""
+MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
+
+
+def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """A system as a JSON object and named tensors (`system.<field>` of the robot).
+
+    Args:
+        system: robot and constraints.
+
+    Returns:
+        The JSON object, and detached copies of the tensors on the CPU.
+    """
+    robot, rule = system.robot, system.baumgarte
+    record = SystemRecord(
+        robot=RobotRecord(**fields_of(robot, RobotRecord)),
+        contacts=tuple(contact_record(contact) for contact in system.contacts),
+        baumgarte=None if rule is None else BaumgarteRecord(**fields_of(rule, BaumgarteRecord)),
+    )
+    tensors = {
+        PREFIX + field.name: value.detach().to("cpu", copy=True).contiguous()
+        for field in dataclasses.fields(robot)
+        if isinstance(value := getattr(robot, field.name), Tensor)
+    }
+    return record.model_dump(mode="json"), tensors
+
+
+def unpack_system(
+    json: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+    source: str,
+    given: ConstrainedSystem | None = None,
+) -> ConstrainedSystem:
+    """The system that `pack_system` wrote.
+
+    Args:
+        json: the JSON object.
+        tensors: at least the tensors named `system.<field>`.
+        source: name of the file, for messages.
+        given: where to take constraints from that cannot be saved.
+
+    Raises:
+        ModelError: a field or tensor is missing, damaged or not valid, or a constraint is to be given.
+    """
+    try:
+        record = SystemRecord.model_validate(dict(json))
+    except ValidationError as cause:
+        first = cause.errors()[0]
+        place = ".".join(str(part) for part in ("system", *first["loc"]))
+        raise ModelError(
+            f"{source}: field {place!r} is not valid", expected=first["msg"], got=first["input"]
+        ) from cause
+    robot = _robot(record.robot, tensors, source)
+    rule = record.baumgarte
+    try:
+        return ConstrainedSystem(
+            robot,
+            tuple(_contact(contact, source, given) for contact in record.contacts),
+            None if rule is None else Baumgarte(rule.natural_frequency, rule.damping_ratio),
+        )
+    except ForceGPError as cause:
+        raise ModelError.at(f"{source}: field 'system'", cause) from cause
+
+
+def _contact(
+    record: SurfaceContactRecord | PointConnectionRecord | UnsavedRecord,
+    source: str,
+    given: ConstrainedSystem | None,
+) -> Constraint:
+    if not isinstance(record, UnsavedRecord):
+        return record.build()
+    if given is None:
+        raise ModelError(
+            f"contact {record.name!r} is described by a {record.described_by} in Python, which is not saved",
+            hint="pass the system that the model was made with: load_model(path, system=…)",
+        )
+    return given.contact(record.name)
+
+
+def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> RobotModel:
+    sizes = {"nq": len(record.joint_names), "nf": len(record.frame_names)}
+    joints = {"joint_types": sizes["nq"], "parents": sizes["nq"], "frame_parents": sizes["nf"]}
+    for name, length in joints.items():
+        if len(getattr(record, name)) != length:
+            raise ModelError(
+                f"{source}: field 'system.robot.{name}' has the wrong length",
+                expected=length,
+                got=len(getattr(record, name)),
+            )
+    _check_parents(record, source)
+    axis = tensors.get(PREFIX + "axis")
+    dtype = axis.dtype if axis is not None and axis.is_floating_point() else torch.float64
+    own = {}
+    for field in dataclasses.fields(RobotModel):
+        if field.name not in type(record).model_fields:
+            shape = tuple(sizes.get(str(n), n) for n in SHAPES.get(field.name, ("nq",)))
+            finite = field.name not in MAY_BE_INFINITE
+            own[field.name] = take(tensors, PREFIX + field.name, shape, dtype, source, finite=finite)
+    return RobotModel(**{name: getattr(record, name) for name in type(record).model_fields}, **own)
+
+
+def _check_parents(record: RobotRecord, source: str) -> None:
+    """Parents come before their children, and frames belong to joints that exist."""
+    for name, parents, limit in (
+        ("parents", record.parents, None),
+        ("frame_parents", record.frame_parents, len(record.parents)),
+    ):
+        for i, parent in enumerate(parents):
+            if not -1 <= parent < (i if limit is None else limit):
+                raise ModelError(f"{source}: field 'system.robot.{name}.{i}' names no joint", got=parent)
+
+
+def take(
+    tensors: Mapping[str, Tensor],
+    name: str,
+    shape: tuple[int | str, ...] | None,
+    dtype: torch.dtype,
+    source: str,
+    *,
+    finite: bool = True,
+) -> Tensor:
+    """A named tensor of a saved model, checked.
+
+    Args:
+        tensors: what the file holds.
+        name: the tensor's name.
+        shape: what its shape must be, or `None` for any.
+        dtype: what its type must be.
+        source: name of the file, for messages.
+        finite: whether its values must be finite.
+
+    Raises:
+        ModelError: it is missing, of another shape or type, or not finite.
+    """
+    if name not in tensors:
+        raise ModelError(f"{source}: tensor {name!r} is missing")
+    value = tensors[name]
+    if (shape is not None and tuple(value.shape) != tuple(shape)) or value.dtype != dtype:
+        raise ModelError(
+            f"{source}: tensor {name!r} does not fit",
+            expected=f"{dtype} of shape {shape if shape is not None else 'any'}",
+            got=f"{value.dtype} of shape {tuple(value.shape)}",
+        )
+    if bool(value.isnan().any()) or (finite and not bool(torch.isfinite(value).all())):
+        raise ModelError(f"{source}: tensor {name!r} holds values that are not finite")
+    return value

@@ -1,0 +1,98 @@
+"""A robot in two contacts, open and closed sample by sample, with every quantity logged."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+import forcegp
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.default import REMAINING
+from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.gp.kernels import Linear
+from forcegp.gp.stationary import SquaredExponential
+
+CONTACTS = ("table", "ball")
+NOISE = 0.1
+
+
+@cache
+def two_contacts(stabilized: bool = True) -> forcegp.ConstrainedSystem:
+    """The KUKA arm with its tip on an inclined table and its elbow on a ball."""
+    robot = forcegp.load_robot("kuka_iiwa", base_position=(0.1, 0.2, 0.05))
+    table = forcegp.SurfaceContact("table", "lbr_iiwa_link_7", (0, 0, 0.1), forcegp.Plane((0, 0.2, 1), 0.055))
+    ball = forcegp.SurfaceContact("ball", "lbr_iiwa_link_5", (0.1, 0, 0.1), forcegp.Sphere((1, 1, 1), 0.3))
+    return forcegp.ConstrainedSystem(robot, [table, ball], forcegp.Baumgarte() if stabilized else None)
+
+
+def draw(n: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """States (q, q̇, τ)."""
+    generator = torch.Generator().manual_seed(seed)
+    q, qd, tau = (torch.randn(n, 7, generator=generator, dtype=torch.float64) for _ in range(3))
+    return q, 0.3 * qd, 20.0 * tau
+
+
+def mixed_contacts(n: int) -> Tensor:
+    """Both contacts, the first, the second, none, and again, `(n, 2)`."""
+    return torch.stack([torch.arange(n) % 4 < 2, torch.arange(n) % 2 == 0], dim=-1)
+
+
+def logged(
+    system: forcegp.ConstrainedSystem, n: int, seed: int = 0, active: Tensor | None = None
+) -> forcegp.Dataset:
+    """Unknown joint force and friction; accelerations that obey the constraint, but for the noise."""
+    q, qd, tau = draw(n, seed)
+    active = mixed_contacts(n) if active is None else active
+    generator = torch.Generator().manual_seed(seed + 1)
+    eom = system.equations(q, qd, active)
+    Q = eom.Q_K + tau + 2.0 * torch.sin(q) - 3.0 * qd
+    Q_z = torch.zeros_like(Q)
+    for i, name in enumerate(CONTACTS):
+        point = eom.contact_points[name]
+        slip = point.velocity - point.normal * (point.normal * point.velocity).sum(-1, keepdim=True)
+        Q_z = Q_z - active[:, i, None] * (point.jacobian.mT @ slip[..., None])[..., 0]
+    multiplier = eom.multiplier(Q + Q_z)
+    noise = NOISE * torch.randn(n, 7, generator=generator, dtype=torch.float64)
+    normals = {name: eom.contact_points[name].normal for name in CONTACTS}
+    return forcegp.Dataset(
+        t=torch.arange(n, dtype=torch.float64) * 0.1,
+        q=q,
+        qd=qd,
+        tau=tau,
+        qdd=eom.acceleration(Q + Q_z) + noise,
+        joint_names=system.robot.joint_names,
+        contact={name: active[:, i] for i, name in enumerate(CONTACTS)},
+        extras={"Q": Q, "Q_z": Q_z, "Q_I": eom.constraint_force(Q + Q_z)},
+        contact_extras={
+            "multiplier": {name: multiplier[:, i] for i, name in enumerate(CONTACTS)},
+            "F_I": {name: normals[name] * multiplier[:, i, None] for i, name in enumerate(CONTACTS)},
+        },
+    )
+
+
+def all_priors() -> list[ForcePrior]:
+    return [
+        JointForcePrior(REMAINING),
+        ContactForcePrior("table", Linear(("velocity",)) + SquaredExponential()),
+        SlidingFrictionPrior("ball"),
+    ]
+
+
+def conditioned(
+    observations: forcegp.Dataset | list[forcegp.Observation], seed: int = 0, **settings: object
+) -> forcegp.StructuredGP:
+    """A model with hyperparameters drawn at random around the start, conditioned, nothing learned."""
+    settings = {"mean": "analytical", "force_priors": all_priors(), **settings}
+    model = forcegp.StructuredGP(two_contacts(), **settings)  # type: ignore[arg-type]
+    model.fit(observations, learn=[]) if not model.learn_noise else model.fit(
+        observations, learn=[], options=forcegp.LearningOptions(max_evaluations=1)
+    )
+    generator = torch.Generator().manual_seed(seed)
+    for key, value in model.hyperparameters.items():
+        step = 0.4 * torch.randn(value.shape, generator=generator, dtype=torch.float64)
+        model.hyperparameters[key] = value.clamp(min=-3.0) + step if "noise" not in key else value
+    model.condition(observations)
+    return model
