@@ -1,4 +1,4 @@
-"""Whitened rows of two processes at random inputs, and the textbook sparse Gaussian process in dense NumPy."""
+"""Whitened rows of two processes at random inputs, and the textbook sparse Gaussian process in NumPy."""
 
 from __future__ import annotations
 

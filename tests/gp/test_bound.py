@@ -56,7 +56,7 @@ def differences(value, tensors: dict, place: object, step: float = 1e-5) -> Tens
 
 
 def test_gradient_in_hyperparameters_is_central_differences() -> None:
-    blocks, Z, params = [rows(18), rows(9, r=2, seed=1)], first(rows(8, seed=5), 8), parameters()
+    blocks, Z, params = [rows(9), rows(5, r=2, seed=1)], first(rows(6, seed=5), 6), parameters()
     leaves = {k: v.clone().requires_grad_() for k, v in params.items()}
     value = negative_bound(PROCESSES, leaves, blocks, Z)
     gradients = torch.autograd.grad(value, list(leaves.values()))
@@ -67,7 +67,7 @@ def test_gradient_in_hyperparameters_is_central_differences() -> None:
 
 
 def test_gradient_in_operators_inputs_and_targets_is_central_differences() -> None:
-    block, Z, params = rows(5), first(rows(6, seed=5), 6), parameters()
+    block, Z, params = rows(2), first(rows(4, seed=5), 4), parameters()
     tensors = {("W", p): W for p, W in enumerate(block.operators)} | {"y": block.target}
     tensors |= {("x", p, name): x for p, f in enumerate(block.features) for name, x in f.items()}
 

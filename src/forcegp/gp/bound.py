@@ -131,7 +131,9 @@ class _BoundGradient:
         self.D = 0.5 * torch.addr(torch.cholesky_inverse(posterior.L), self.m, self.m)
         self.total: Gradient = {}
         # By process, Σ k(Z, x) ∂F/∂V `(components, m, kept)`: the derivative for R.
-        self.roots = [torch.zeros_like(part.roots) if part.spectra else None for part in self.basis.parts]
+        self.roots = [
+            torch.zeros_like(part.roots) if part.spectra else self.m[:0] for part in self.basis.parts
+        ]
 
     def over(self, blocks: Sequence[Block]) -> Gradient:
         """The derivatives over all samples."""
@@ -143,7 +145,7 @@ class _BoundGradient:
                 for place in chunks[0]:
                     self.total[(place[0], g, *place[1:])] = torch.cat([chunk[place] for chunk in chunks])
         for part, prior, dR in zip(self.basis.parts, self.basis.priors, self.roots, strict=True):
-            if dR is not None:
+            if part.spectra:
                 self._through_inducing(part, prior.prefix, dR)
         return self.total
 
@@ -216,7 +218,7 @@ class _BoundGradient:
                 gradients.append(weight[:, self.basis.components[p]].mT)
                 if part.spectra:
                     kernel = rest.kernel.covariance(own, x, part.inducing)
-                    self.roots[p] += kernel.detach().mT @ filled[..., :width]
+                    self.roots[p] = self.roots[p] + kernel.detach().mT @ filled[..., :width]
                     outputs.append(kernel)
                     gradients.append(filled[..., :width] @ part.roots.mT)
             if finite is not None:

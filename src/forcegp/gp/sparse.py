@@ -78,7 +78,7 @@ class SparsePosterior:
         return [self.fold(p, self.weights[:, None]) for p in range(len(self.basis.parts))]
 
     def fold(self, p: int, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights of basis functions `(size, s)` as weights of k(x, Z) `(k, m, s)` and of φ(x) `(k, F, s)`."""
+        """Weights of basis functions `(size, s)` as those of k(x, Z) `(k, m, s)` and of φ(x) `(k, F, s)`."""
         part = self.basis.parts[p]
         filled = weights.new_zeros(part.used.numel(), weights.shape[1])
         filled[part.columns] = weights[self.basis.of_process(p)]
@@ -130,7 +130,7 @@ class SparsePosterior:
         Args:
             block: kernel inputs and operators of each process; the targets are not read.
         """
-        n, d = block.target.shape
+        d = block.target.shape[1]
         parts = [block.target.new_zeros(0, d, d)]
         for own in chunked([block], CHUNK_PREDICTIONS):
             W = torch.cat(own.operators, dim=-1)
@@ -174,7 +174,8 @@ def _extended(L: Tensor, rows: Tensor) -> Tensor:
     Its diagonal may be negative, which solves do not mind.
     """
     upper, below = np.asfortranarray(L.numpy().T), np.asfortranarray(rows.numpy())
-    R, _, _, info = scipy.linalg.lapack.dtpqrt(0, min(PANEL, len(L)), upper, below)
+    (tpqrt,) = scipy.linalg.lapack.get_lapack_funcs(("tpqrt",), (upper,))
+    R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below)
     if info != 0:
         raise NumericalError("a Cholesky factor could not be updated", got=f"LAPACK tpqrt info {info}")
     return torch.from_numpy(R).mT

@@ -1,0 +1,125 @@
+"""Where inducing points are and how many, from the data: greedy conditional variance.
+
+Each step adds the sample of which the points so far miss most, Σ_k S_kk Var(f_k(x) | f(Z)): what the trace
+term of the collapsed bound counts (pivoted partial Cholesky factorisation; Burt, Rasmussen & van der Wilk
+2020). Weights S = WᵀW put it in units of the noise variance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.gp.basis import TRUNCATION, points
+from forcegp.gp.features import Part, split
+from forcegp.gp.kernels import Features, Parameters, sub
+from forcegp.gp.structured_covariance import Block, Process
+
+CANDIDATES = 4000
+"""Samples among which points are chosen."""
+
+LIMIT = 100
+"""Most inducing points of one process."""
+
+TOLERANCE = 0.01
+"""Missed variance of a row, in units of the noise variance, at which no more points are added."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Chosen inducing points of one process.
+
+    Attributes:
+        points: their kernel inputs.
+        missed: by number of points, from none on, the missed prior variance of a row on average over the
+            candidates, in units of the noise variance `(points + 1,)`.
+    """
+
+    points: dict[str, Tensor]
+    missed: Tensor
+
+    @property
+    def relative(self) -> float:
+        """What is missed at the end as a fraction of the prior variance; 0 where there is none."""
+        return float(self.missed[-1] / self.missed[0]) if float(self.missed[0]) > 0.0 else 0.0
+
+
+def candidates(blocks: Iterable[Block], samples: int, count: int = CANDIDATES) -> list[Block]:
+    """About `count` of all samples, evenly spaced; streams over the blocks.
+
+    Args:
+        blocks: whitened rows; may be a generator.
+        samples: number of samples in all blocks.
+        count: how many to keep.
+    """
+    step, kept, seen = max(1, -(-samples // count)), [], 0
+    for block in blocks:
+        own = torch.arange(len(block.target), device=block.target.device)[-seen % step :: step]
+        seen += len(block.target)
+        if len(own):
+            features = tuple({name: x[own] for name, x in f.items()} for f in block.features)
+            kept.append(Block(features, tuple(W[own] for W in block.operators), block.target[own]))
+    return kept
+
+
+@torch.no_grad()
+def select_inducing(
+    priors: Sequence[Process],
+    params: Parameters,
+    blocks: Sequence[Block],
+    limit: int = LIMIT,
+    tolerance: float = TOLERANCE,
+) -> list[Selection]:
+    """Choose inducing points of each process among the samples of blocks.
+
+    A process that no row shows, or whose kernel has a finite number of features, gets none.
+
+    Args:
+        priors: the processes.
+        params: log-hyperparameters.
+        blocks: candidates, as given by `candidates`.
+        limit: most points of one process.
+        tolerance: missed variance of a row, in units of the noise variance, at which to stop.
+    """
+    rows = sum(block.rows for block in blocks)
+    chosen = []
+    for p, prior in enumerate(priors):
+        names = blocks[0].features[p]
+        x = {name: torch.cat([block.features[p][name] for block in blocks]) for name in names}
+        weight = torch.cat([(block.operators[p] ** 2).sum(1) for block in blocks]).mT / rows
+        rest = split(prior.kernel).rest
+        own = sub(params, prior.prefix)
+        chosen.append(_greedy(rest, own, x, weight, limit, tolerance))
+    return chosen
+
+
+def _greedy(
+    rest: Part | None, own: Parameters, x: Features, weight: Tensor, limit: int, tolerance: float
+) -> Selection:
+    """Pivoted partial Cholesky factorisation of every component with common pivots."""
+    none = Selection({name: value[:0] for name, value in x.items()}, weight.new_zeros(1))
+    if rest is None or not bool(weight.any()):
+        return none
+    params = rest.parameters(own)
+    prior = rest.kernel.diagonal(params, x)
+    left = prior.clone()
+    columns = prior.new_zeros(len(prior), min(limit, points(x)), points(x))
+    kept, missed = [], [float((weight * left).sum())]
+    while len(kept) < columns.shape[1] and missed[-1] > tolerance:
+        i = int((weight * left).sum(0).argmax())
+        k = rest.kernel.covariance(params, x, {name: value[i : i + 1] for name, value in x.items()})[..., 0]
+        so_far = columns[:, : len(kept)]
+        k = k - (so_far[..., i, None].mT @ so_far)[:, 0]
+        # A component that the points know here already gains nothing from another one.
+        fresh = left[:, i] > TRUNCATION * prior[:, i]
+        column = torch.where(fresh[:, None], k * left[:, i, None].clamp(min=1e-300).rsqrt(), 0.0)
+        columns[:, len(kept)] = column
+        left = (left - column**2).clamp(min=0.0)
+        left[:, i] = 0.0
+        kept.append(i)
+        missed.append(float((weight * left).sum()))
+    index = torch.tensor(kept, dtype=torch.long, device=weight.device)
+    return Selection({name: value[index] for name, value in x.items()}, weight.new_tensor(missed))
