@@ -118,9 +118,8 @@ def gather_candidates(blocks: Sequence[Block], group: Group = None) -> list[Bloc
         operators = [_gather(W, group) for W in block.operators]
         targets = _gather(block.target, group)
         for rank, own in enumerate(found):
-            own.append(
-                Block(tuple(f[rank] for f in features), tuple(W[rank] for W in operators), targets[rank])
-            )
+            x, W = tuple(f[rank] for f in features), tuple(W[rank] for W in operators)
+            own.append(Block(x, W, targets[rank]))
     return [block for own in found for block in own]
 
 
@@ -130,10 +129,9 @@ def _gather_named(features: Features, group: Group) -> list[dict[str, Tensor]]:
 
 
 def _gather(x: Tensor, group: Group) -> list[Tensor]:
-    found = [
-        torch.empty_like(x, memory_format=torch.contiguous_format) for _ in range(dist.get_world_size(group))
-    ]
-    dist.all_gather(found, x.contiguous(), group=group)
+    own = x.contiguous()
+    found = [torch.empty_like(own) for _ in range(dist.get_world_size(group))]
+    dist.all_gather(found, own, group=group)
     return found
 
 

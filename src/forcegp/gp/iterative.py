@@ -61,9 +61,8 @@ def product(priors: Sequence[Process], params: Parameters, blocks: Sequence[Bloc
             for first in range(0, len(block.target), CHUNK_SAMPLES):
                 part = slice(first, first + CHUNK_SAMPLES)
                 features = {name: f[part] for name, f in block.features[p].items()}
-                f = sum(
-                    (k(features) @ z for k, z in zip(towards, latent, strict=True)), start=torch.zeros(())
-                )
+                terms = [k(features) @ z for k, z in zip(towards, latent, strict=True)]
+                f = sum(terms[1:], start=terms[0])
                 rows = torch.einsum("nrk,knc->nrc", block.operators[p][part], f).flatten(0, 1)
                 at = starts[g] + first * block.target.shape[1]
                 result[at : at + len(rows)] += rows
