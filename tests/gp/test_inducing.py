@@ -31,14 +31,14 @@ def by_hand(block: Block, params: dict[str, Tensor], count: int) -> tuple[list[i
 def test_each_point_is_where_most_is_missed() -> None:
     block, params = rows(60), parameters()
     chosen, missed = by_hand(block, params, 10)
-    selection = select_inducing(PROCESSES, params, [block], limit=10, tolerance=0.0)[1]
+    selection = select_inducing(PROCESSES, params, [block], limit=10, share=0.0)[1]
     assert torch.equal(selection.points["qd"], block.features[1]["qd"][chosen])
     assert selection.missed.tolist() == pytest.approx(missed, rel=1e-8)
 
 
 def test_missed_is_the_trace_term_of_the_bound() -> None:
     block, params = rows(60), parameters()
-    selections = select_inducing(PROCESSES, params, [block], limit=12, tolerance=0.0)
+    selections = select_inducing(PROCESSES, params, [block], limit=12, share=0.0)
     basis = latent_basis(PROCESSES, params, [s.points for s in selections], COMPONENTS)
     sums = accumulate(basis, [block])
     for p, selection in enumerate(selections):
@@ -49,9 +49,12 @@ def test_missed_is_the_trace_term_of_the_bound() -> None:
 
 def test_number_follows_the_criterion() -> None:
     block, params = rows(80), parameters()
-    for tolerance in (0.2, 0.05):
-        for selection in select_inducing(PROCESSES, params, [block], limit=80, tolerance=tolerance):
-            assert float(selection.missed[-1]) <= tolerance < float(selection.missed[-2])
+    for share, rows_in_all in ((0.5, None), (0.5, 400), (2.0, None)):
+        chosen = select_inducing(PROCESSES, params, [block], rows_in_all, limit=80, share=share)
+        for selection, components in zip(chosen, COMPONENTS, strict=True):
+            functions = components * torch.arange(len(selection.missed))
+            enough = selection.missed * (rows_in_all or block.rows) <= share * functions
+            assert enough.tolist() == [False] * (len(enough) - 1) + [True]
     kernel = SquaredExponential(("q",))
     smooth = {f"one.{k}": v + 3.0 for k, v in kernel.initial(2, {"q": 2}).items()}
     smooth["one.log_std"] -= 3.0
@@ -75,7 +78,7 @@ def test_no_points_where_none_are_needed() -> None:
 def test_repeated_samples_are_chosen_once() -> None:
     block, params = rows(6), parameters()
     twice = [block, block]
-    for selection in select_inducing(PROCESSES, params, twice, limit=12, tolerance=0.0):
+    for selection in select_inducing(PROCESSES, params, twice, limit=12, share=0.0):
         x = torch.cat([selection.points["q"], selection.points["qd"]], dim=-1)
         assert len(x.unique(dim=0)) == 6
         assert selection.relative < 1e-9

@@ -24,8 +24,12 @@ CANDIDATES = 4000
 LIMIT = 100
 """Most inducing points of one process."""
 
-TOLERANCE = 0.01
-"""Missed variance of a row, in units of the noise variance, at which no more points are added."""
+SHARE = 0.02
+"""Missed variance of all rows, as a fraction of what the noise leaves of them, at which to stop.
+
+In units of the noise variance, M basis functions learned from noisy rows leave a variance of at most M in
+all rows together; what the points miss should be small beside it.
+"""
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,9 @@ def select_inducing(
     priors: Sequence[Process],
     params: Parameters,
     blocks: Sequence[Block],
+    rows: int | None = None,
     limit: int = LIMIT,
-    tolerance: float = TOLERANCE,
+    share: float = SHARE,
 ) -> list[Selection]:
     """Choose inducing points of each process among the samples of blocks.
 
@@ -81,15 +86,17 @@ def select_inducing(
         priors: the processes.
         params: log-hyperparameters.
         blocks: candidates, as given by `candidates`.
+        rows: number of rows that will be conditioned on, of which these are a part; all by default.
         limit: most points of one process.
-        tolerance: missed variance of a row, in units of the noise variance, at which to stop.
+        share: missed variance of all rows, as a fraction of what the noise leaves of them, at which to stop.
     """
-    rows = sum(block.rows for block in blocks)
+    own_rows = sum(block.rows for block in blocks)
+    tolerance = share / (own_rows if rows is None else rows)
     chosen = []
     for p, prior in enumerate(priors):
         names = blocks[0].features[p]
         x = {name: torch.cat([block.features[p][name] for block in blocks]) for name in names}
-        weight = torch.cat([(block.operators[p] ** 2).sum(1) for block in blocks]).mT / rows
+        weight = torch.cat([(block.operators[p] ** 2).sum(1) for block in blocks]).mT / own_rows
         rest = split(prior.kernel).rest
         own = sub(params, prior.prefix)
         chosen.append(_greedy(rest, own, x, weight, limit, tolerance))
@@ -107,19 +114,22 @@ def _greedy(
     prior = rest.kernel.diagonal(params, x)
     left = prior.clone()
     columns = prior.new_zeros(len(prior), min(limit, points(x)), points(x))
-    kept, missed = [], [float((weight * left).sum())]
-    while len(kept) < columns.shape[1] and missed[-1] > tolerance:
+    kept, functions, missed = [], 0, [float((weight * left).sum())]
+    while len(kept) < columns.shape[1] and missed[-1] > tolerance * functions:
         i = int((weight * left).sum(0).argmax())
         k = rest.kernel.covariance(params, x, {name: value[i : i + 1] for name, value in x.items()})[..., 0]
         so_far = columns[:, : len(kept)]
         k = k - (so_far[..., i, None].mT @ so_far)[:, 0]
         # A component that the points know here already gains nothing from another one.
         fresh = left[:, i] > TRUNCATION * prior[:, i]
+        if not bool(fresh.any()):
+            break
         column = torch.where(fresh[:, None], k * left[:, i, None].clamp(min=1e-300).rsqrt(), 0.0)
         columns[:, len(kept)] = column
         left = (left - column**2).clamp(min=0.0)
         left[:, i] = 0.0
         kept.append(i)
+        functions += int(fresh.sum())
         missed.append(float((weight * left).sum()))
     index = torch.tensor(kept, dtype=torch.long, device=weight.device)
     return Selection({name: value[index] for name, value in x.items()}, weight.new_tensor(missed))

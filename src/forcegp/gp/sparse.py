@@ -33,6 +33,37 @@ PANEL = 16
 """Columns that LAPACK's triangular-pentagonal QR takes at a time."""
 
 
+MISSED = 0.1
+"""Missed variance, as a fraction of what the noise leaves, above which more points would help."""
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What a sparse posterior loses by its inducing points.
+
+    Attributes:
+        size: number of basis functions.
+        rows: number of rows, less what is forgotten.
+        learned: how many basis functions the rows determine, tr A⁻¹G; in units of the noise variance this is
+            the variance that noise leaves in all rows together.
+        missed: the prior variance that the points miss in all rows together, in the same units.
+        relative: missed prior variance of each process as a fraction of all of it.
+        residual: mean square of the rows' residuals, 1 where the model and its noise fit.
+    """
+
+    size: int
+    rows: float
+    learned: float
+    missed: float
+    relative: tuple[float, ...]
+    residual: float
+
+    @property
+    def more_points_would_help(self) -> bool:
+        """Whether the points miss a tenth or more of the variance that the noise leaves."""
+        return self.missed > MISSED * self.learned
+
+
 @dataclass(frozen=True, eq=False)
 class SparsePosterior:
     """Latent components conditioned on any number of samples through a basis.
@@ -137,6 +168,23 @@ class SparsePosterior:
             parts.append(W @ self.latent_covariance(own.features) @ W.mT)
         covariance = torch.cat(parts)
         return 0.5 * (covariance + covariance.mT)
+
+    @cached_property
+    def diagnostics(self) -> Diagnostics:
+        """What the inducing points miss, and how well the samples are fitted."""
+        sums, m = self.sums, self.weights
+        inverse = sum((block**2).sum() for block in self._inverse_factor)
+        learned = float(self.basis.size - inverse)
+        residual = sums.yy - 2.0 * (m @ sums.v) + m @ (sums.G @ m)
+        relative = torch.where(sums.prior > 0.0, sums.missed / sums.prior.where(sums.prior > 0.0, 1.0), 0.0)
+        return Diagnostics(
+            size=self.basis.size,
+            rows=float(sums.rows),
+            learned=learned,
+            missed=float(sums.missed.sum()),
+            relative=tuple(relative.tolist()),
+            residual=float(residual / sums.rows) if float(sums.rows) > 0.0 else 0.0,
+        )
 
     def updated(self, blocks: Sequence[Block]) -> SparsePosterior:
         """Conditioned on further samples too, at a cost that does not depend on those before.
