@@ -80,7 +80,7 @@ def test_few_samples(n: int) -> None:
 
 def test_duplicated_rows() -> None:
     model = fitted(data[torch.tensor([0, 0, 0, 1, 1, 2])])
-    assert model.posterior.conditioned.jitter == 0.0
+    assert model.posterior.latent.conditioned.jitter == 0.0
     is_right(model)
 
 
@@ -556,7 +556,7 @@ def test_contact_data_alone_tell_the_sum_of_two_forces() -> None:
         "shadow",
         7,
         lambda s, at: torch.eye(7, dtype=at.q.dtype).expand(len(at.q), -1, -1),
-        in_contact_only=True,
+        target="contact",
     )
     closed = logged(system, 12, active=torch.ones(12, 2, dtype=torch.bool))
     model = forcegp.StructuredGP(system, force_priors=[forcegp.JointForcePrior(), same])
