@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.quantities import affine_map
-from forcegp.forces.quantities import states
+from forcegp.forces.quantities import affine_map, states
 from forcegp.gp.kernels import Kernel, Linear, Product, Sum, sub
 from forcegp.gp.stationary import SquaredExponential
 from forcegp.models.structured_gp import StructuredGP

@@ -179,7 +179,7 @@ def load_network(
 ) -> NeuralNetwork:
     """The model that `NetworkFit.save` wrote."""
     settings = settings_of(header, NetworkSettings, source)
-    robot = system.robot
+    robot, model = system.robot, NeuralNetwork(system, settings.hidden, settings.seed)
     widths = [3 * robot.nq, *settings.hidden, robot.nq]
     state = {}
     for layer, (before, after) in enumerate(pairwise(widths)):
@@ -187,7 +187,6 @@ def load_network(
         for name, shape in (("weight", (after, before)), ("bias", (after,))):
             key = f"{2 * layer}.{name}"
             state[key] = take(tensors, f"network.{key}", shape, robot.dtype, source)
-    model = NeuralNetwork(system, settings.hidden, settings.seed)
     network = _network(system, settings.hidden)
     network.load_state_dict(state)
     scales = []

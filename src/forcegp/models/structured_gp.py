@@ -79,6 +79,11 @@ class StructuredGP(Model[StructuredFit]):
         """Priors on the unknown forces."""
         return self.specification.priors
 
+    @property
+    def noise_std(self) -> NoiseStd | None:
+        """Noise of measured accelerations as given, `None` for what the log states."""
+        return self.specification.noise_std
+
     # -- learning ---------------------------------------------------------------------------------
 
     def fit(

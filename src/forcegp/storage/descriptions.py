@@ -82,10 +82,12 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0) -> Any:
 
 def _checked(value: Any, hint: Any, place: str) -> Any:
     """The value, of the type that its field declares."""
+    if isinstance(hint, type) and is_dataclass(hint):
+        if not isinstance(value, hint):
+            raise ModelError(f"{place} is not valid", expected=hint.__name__, got=type(value).__name__)
+        return value
     try:
-        own = hint if isinstance(hint, type) and is_dataclass(hint) else None
-        adapter = TypeAdapter(hint) if own else TypeAdapter(hint, config=_CHECK)
-        return adapter.validate_python(value, strict=True)
+        return TypeAdapter(hint, config=_CHECK).validate_python(value, strict=True)
     except ValidationError as cause:
         first = cause.errors()[0]
         raise ModelError(f"{place} is not valid", expected=first["msg"], got=first["input"]) from cause
