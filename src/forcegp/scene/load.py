@@ -13,7 +13,7 @@ from typing import TypeVar
 import torch
 
 from forcegp.constraints import Baumgarte, ConstrainedSystem, PointConnection, SurfaceContact
-from forcegp.control.config import SimulationConfig
+from forcegp.simulate.config import SimulationConfig
 from forcegp.errors import ForceGPError, SceneError
 from forcegp.robot import RobotModel, load_robot
 from forcegp.robot.load import BUNDLED as BUNDLED_ROBOTS

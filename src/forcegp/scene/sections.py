@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic_core import ErrorDetails
 
 from forcegp.constraints import Cylinder, Plane, Sphere
-from forcegp.control.config import SimulationConfig
+from forcegp.simulate.config import SimulationConfig
 from forcegp.errors import SceneError
 from forcegp.scene.toml import Document, Key
 

@@ -1,6 +1,6 @@
 """Simulation of a robot that follows a motion, free or in contact, in a physics engine."""
 
-from forcegp.control.config import SimulationConfig
+from forcegp.simulate.config import SimulationConfig
 from forcegp.control.task_space import Gains
 from forcegp.control.trajectory import Reference
 from forcegp.simulate.check import EngineCheck, check_engine

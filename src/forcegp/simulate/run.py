@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints.gauss import ConstrainedSystem, Equations
-from forcegp.control.config import SimulationConfig
+from forcegp.simulate.config import SimulationConfig
 from forcegp.control.plan import Plan, make_plan
 from forcegp.control.task_space import control_torque, tool_motion
 from forcegp.errors import NumericalError
 from forcegp.simulate.engine import Engine, make_engine
 from forcegp.simulate.result import Log, SimulationResult, make_result
-from forcegp.simulate.touch import any_row, contact_forces, land
+from forcegp.constraints.unilateral import any_row, contact_forces, land
 from forcegp.threads import one_thread
 
 RUNAWAY_SPEED = 50.0
