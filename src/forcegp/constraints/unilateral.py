@@ -1,8 +1,8 @@
 """Contact with a surface, which pushes and never pulls: opening, closing, impact and sliding friction.
 
-The simulator and rollouts share this file. A closed contact opens where its multiplier would turn negative. An
-open contact closes where c ≤ 0 and ċ < 0, with an inelastic impact. Constraints without a surface, such as a
-connection of two points, hold in both directions and never change.
+The simulator and rollouts share this file. A closed contact opens where its multiplier would turn negative.
+An open contact closes where c ≤ 0 and ċ < 0, with an inelastic impact. Constraints without a surface, such as
+a connection of two points, hold in both directions and never change.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from forcegp.types import ConstraintVector, JointVector
 PULL = 1e-9
 """A contact pulls if λ is below minus this [N]; rounding must not open a contact that carries no load."""
 APPROACH = 1e-9
-"""A contact is approached if ċ is below minus this [m/s]; the velocity after an impact is zero up to rounding."""
+"""A contact is approached if ċ is below minus this [m/s]; after an impact ċ is zero up to rounding."""
 
 
 class Landing(NamedTuple):
@@ -95,9 +95,7 @@ def pulling(system: ConstrainedSystem, active: Tensor, multiplier: ConstraintVec
     return any_row(system, multiplier < -PULL) & can_open(system) & active
 
 
-def reached(
-    system: ConstrainedSystem, active: Tensor, c: ConstraintVector, cd: ConstraintVector
-) -> Tensor:
+def reached(system: ConstrainedSystem, active: Tensor, c: ConstraintVector, cd: ConstraintVector) -> Tensor:
     """Open contacts that the robot has reached, c ≤ 0 while ċ < 0, and that therefore close.
 
     Args:
@@ -114,7 +112,7 @@ def reached(
 def impact_velocity(
     system: ConstrainedSystem, q: JointVector, qd: JointVector, active: Tensor
 ) -> JointVector:
-    """Velocity after an inelastic impact without friction on the active contacts, `(*batch, nq)` [rad/s, m/s].
+    """Velocity `(*batch, nq)` after an inelastic impact without friction on the active contacts.
 
     M (q̇⁺ − q̇⁻) = Aᵀ Λ with A q̇⁺ = 0, so q̇⁺ = T q̇⁻ = q̇⁻ − L A q̇⁻.
     """
@@ -146,9 +144,7 @@ def sliding_friction(
     return Q_z
 
 
-def land(
-    system: ConstrainedSystem, q: JointVector, qd: JointVector, closed: Tensor
-) -> Landing:
+def land(system: ConstrainedSystem, q: JointVector, qd: JointVector, closed: Tensor) -> Landing:
     """Close the contacts that one state `(nq,)` has reached, with their impact."""
     eom = system.equations(q, qd, active=closed)
     new = reached(system, closed, eom.c, eom.cd)

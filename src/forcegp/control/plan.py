@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp import kinematics
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.constraints.gauss import ConstrainedSystem, Equations
 from forcegp.control.motion import MotionConfig
 from forcegp.control.placement import inverse_kinematics, tool_rotation
 from forcegp.control.task_space import Target
@@ -27,13 +27,13 @@ STARTS = 64
 
 @dataclass(frozen=True)
 class Plan:
-    """All that the controller is to follow.
+    """What the controller follows.
 
     Attributes:
-        contact: name of the contact that the tool has, `None` in free space.
+        contact: name of the tool's contact, `None` in free space.
         frame, point: the tool point.
         reference: the motion of the tool point.
-        targets: the controller's targets, `(n, …)`, one a sample.
+        targets: the controller's targets, `(n, …)`, one per sample.
         start: `(nq,)` joint positions at the first waypoint.
     """
 
@@ -47,6 +47,12 @@ class Plan:
     def target(self, k: int) -> Target:
         """The target of sample k."""
         return Target(*(values[k] for values in self.targets))
+
+    def normal(self, eom: Equations) -> Tensor:
+        """Unit normal of the surface under the tool `(*batch, 3)`; zero in free space."""
+        if self.contact is None:
+            return eom.Q_C.new_zeros(*eom.Q_C.shape[:-1], 3)
+        return torch.nn.functional.normalize(eom.contact_points[self.contact].normal, dim=-1)
 
 
 def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.Generator) -> Plan:
@@ -129,7 +135,7 @@ def _draw_postures(
 
 
 def _draw_push(reference: Reference, config: MotionConfig, generator: torch.Generator) -> Tensor:
-    """`(n,)` force into the surface, one draw a line, none on lines off the surface."""
+    """`(n,)` force into the surface, one draw per line, zero on lines off the surface."""
     low, high = config.pressing_force
     draws = torch.rand(len(reference.travel_time), dtype=torch.float64, generator=generator)
     return (low + (high - low) * draws).to(reference.t.dtype)[reference.segment] * reference.on_surface
