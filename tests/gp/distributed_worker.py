@@ -8,7 +8,8 @@ import torch
 import torch.distributed as dist
 from safetensors.torch import save_file
 
-from forcegp.gp.basis import latent_basis, rows_of
+from forcegp.gp.basis import latent_basis
+from forcegp.gp.blocks import rows_of
 from forcegp.gp.distributed import accumulate_shards, gather_candidates, shard, share_basis
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, NumericalError
-from forcegp.gp.basis import latent_basis, rows_of
+from forcegp.gp.basis import latent_basis
+from forcegp.gp.blocks import rows_of
 from forcegp.gp.kernels import sub
 from forcegp.gp.likelihood import condition
 from forcegp.gp.sparse import SparsePosterior, condition_sparse

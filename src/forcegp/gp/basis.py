@@ -7,7 +7,7 @@ largest are dropped. Linear parts of a kernel add their own features, which are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -15,44 +15,13 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from forcegp.gp.blocks import points
+from forcegp.gp.decomposition import Split, split
 from forcegp.gp.draws import FunctionDraw
-from forcegp.gp.features import Split, split
-from forcegp.gp.kernels import Features, Parameters, sub
-from forcegp.gp.structured_covariance import Block, Process
-
-TRUNCATION = 1e-12
-"""Eigenvalues of the inducing points' covariance below this fraction of the largest are dropped.
-
-Kernels are accurate to about 10⁻¹⁵ of their scale, so an eigenvalue at the threshold is to 10⁻³. Where the
-prior is a million times as strong as the noise, a threshold of 10⁻¹⁰ loses what the data could tell.
-"""
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Eigendecomposition of one component's K_zz, U Λ Uᵀ.
-
-    Attributes:
-        values: all eigenvalues, in ascending order `(m,)`.
-        vectors: U `(m, m)`.
-        dropped: how many of the smallest are dropped.
-    """
-
-    values: Tensor
-    vectors: Tensor
-    dropped: int
-
-    @classmethod
-    def of(cls, K: Tensor) -> Spectrum:
-        """Of a symmetric matrix `(m, m)`."""
-        values, vectors = torch.linalg.eigh(K)
-        kept = values > TRUNCATION * values[-1] if len(values) else values > 0.0
-        return cls(values, vectors, int((~kept).sum()))
-
-    @property
-    def root(self) -> Tensor:
-        """R = U Λ^{−1/2} of the kept eigenvalues `(m, kept)`; R Rᵀ is the pseudo-inverse of K_zz."""
-        return self.vectors[:, self.dropped :] * self.values[self.dropped :].rsqrt()
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters, sub
+from forcegp.gp.spectrum import Spectrum
+from forcegp.gp.structured_covariance import Process
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +100,22 @@ class ProcessBasis:
             return parts[0], explained
         return torch.cat([explained[..., None][..., :0], *parts], dim=-1), explained
 
+    def fold(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights of basis functions as those of k(x, Z) and of the exact features.
+
+        Args:
+            weights: of the process's basis functions `(Σ sizes, s)`.
+
+        Returns:
+            `(components, m, s)` and `(components, features, s)`.
+        """
+        filled = weights.new_zeros(self.used.numel(), weights.shape[1])
+        filled[self.columns] = weights
+        filled = filled.unflatten(0, self.used.shape)
+        width = filled.shape[1] - self.finite_size
+        on_kernel = self.roots @ filled[:, :width] if self.spectra else filled[:, :0]
+        return on_kernel, filled[:, width:]
+
     def rest_variance(self, features: Features) -> Tensor:
         """Prior variance of the part that inducing points approximate, `(components, n)`."""
         rest = self.split.rest
@@ -139,22 +124,17 @@ class ProcessBasis:
         return rest.kernel.diagonal(rest.parameters(self.params), features)
 
 
-def points(features: Features) -> int:
-    """Number of inputs in a dictionary of features."""
-    return len(next(iter(features.values())))
-
-
 @dataclass(frozen=True, eq=False)
 class LatentBasis:
     """Basis functions of every component of every process, side by side.
 
     Attributes:
-        priors: the processes.
+        processes: the processes.
         params: all log-hyperparameters.
         parts: basis of each process.
     """
 
-    priors: tuple[Process, ...]
+    processes: tuple[Process, ...]
     params: dict[str, Tensor]
     parts: tuple[ProcessBasis, ...]
 
@@ -208,7 +188,7 @@ class LatentBasis:
 
 
 def latent_basis(
-    priors: Sequence[Process],
+    processes: Sequence[Process],
     params: Parameters,
     inducing: Sequence[Features],
     components: Sequence[int],
@@ -216,38 +196,17 @@ def latent_basis(
     """Basis functions of processes with given inducing points.
 
     Args:
-        priors: the processes.
+        processes: the processes.
         params: log-hyperparameters, `<process>.<name>`.
         inducing: kernel inputs of the inducing points of each process, of any number, none included.
         components: number of components of each process.
     """
     parts = []
-    for prior, Z, count in zip(priors, inducing, components, strict=True):
-        own, kernel = sub(params, prior.prefix), split(prior.kernel)
+    for process, Z, count in zip(processes, inducing, components, strict=True):
+        own, kernel = sub(params, process.prefix), split(process.kernel)
         spectra: tuple[Spectrum, ...] = ()
         if kernel.rest is not None and points(Z):
             K = kernel.rest.kernel.covariance(kernel.rest.parameters(own), Z, Z)
             spectra = tuple(Spectrum.of(0.5 * (k + k.mT)) for k in K)
         parts.append(ProcessBasis(kernel, own, count, Z, spectra))
-    return LatentBasis(tuple(priors), dict(params), tuple(parts))
-
-
-def components_of(block: Block) -> list[int]:
-    """Number of components of each process."""
-    return [W.shape[-1] for W in block.operators]
-
-
-def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
-    """The samples of blocks in blocks of at most so many."""
-    for block in blocks:
-        for first in range(0, len(block.target), samples):
-            yield rows_of(block, slice(first, first + samples))
-
-
-def rows_of(block: Block, own: slice | Tensor) -> Block:
-    """Some of the samples of a block."""
-    return Block(
-        tuple({name: x[own] for name, x in f.items()} for f in block.features),
-        tuple(W[own] for W in block.operators),
-        block.target[own],
-    )
+    return LatentBasis(tuple(processes), dict(params), tuple(parts))

@@ -13,8 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from forcegp.gp.basis import ProcessBasis, Spectrum, components_of, latent_basis, rows_of
-from forcegp.gp.kernels import Features, Parameters
+from forcegp.gp.basis import ProcessBasis, latent_basis
+from forcegp.gp.blocks import components_of, rows_of
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block, Process
 from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
@@ -31,7 +33,7 @@ def bound_of(sums: Sums, posterior: SparsePosterior) -> Tensor:
 
 
 def negative_bound(
-    priors: Sequence[Process], params: Parameters, blocks: Sequence[Block], inducing: Sequence[Features]
+    processes: Sequence[Process], params: Parameters, blocks: Sequence[Block], inducing: Sequence[Features]
 ) -> Tensor:
     """Negative collapsed bound, differentiable in hyperparameters, kernel inputs, operators and targets.
 
@@ -39,7 +41,7 @@ def negative_bound(
     The inducing points are constants.
 
     Args:
-        priors: the processes.
+        processes: the processes.
         params: log-hyperparameters, `<process>.<name>`.
         blocks: whitened rows.
         inducing: kernel inputs of the inducing points of each process.
@@ -51,7 +53,7 @@ def negative_bound(
         NumericalError: the sums are not finite.
     """
     named = dict(_named(params, blocks))
-    value = _NegativeBound.apply(priors, inducing, list(named), *named.values())
+    value = _NegativeBound.apply(processes, inducing, list(named), *named.values())
     return value  # pyright: ignore[reportReturnType]
 
 
@@ -90,14 +92,14 @@ class _NegativeBound(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        priors: Sequence[Process],
+        processes: Sequence[Process],
         inducing: Sequence[Features],
         places: list[tuple[Any, ...]],
         *tensors: Tensor,
     ) -> Tensor:
         named = dict(zip(places, (t.detach() for t in tensors), strict=True))
         params, blocks = _unnamed(named)
-        basis = latent_basis(priors, params, inducing, components_of(blocks[0]))
+        basis = latent_basis(processes, params, inducing, components_of(blocks[0]))
         sums = accumulate(basis, blocks)
         posterior = SparsePosterior.of(basis, sums)
         needs = ctx.needs_input_grad[3:]
@@ -144,7 +146,7 @@ class _BoundGradient:
             if self.deep and chunks:
                 for place in chunks[0]:
                     self.total[(place[0], g, *place[1:])] = torch.cat([chunk[place] for chunk in chunks])
-        for part, prior, dR in zip(self.basis.parts, self.basis.priors, self.roots, strict=True):
+        for part, prior, dR in zip(self.basis.parts, self.basis.processes, self.roots, strict=True):
             if part.spectra:
                 self._through_inducing(part, prior.prefix, dR)
         return self.total
@@ -200,7 +202,7 @@ class _BoundGradient:
 
     def _through_kernel(self, p: int, features: Features, dV: Tensor, weight: Tensor) -> Gradient:
         """Derivatives of one chunk through k(x, Z), φ(x) and k(x, x)."""
-        part, prefix = self.basis.parts[p], self.basis.priors[p].prefix
+        part, prefix = self.basis.parts[p], self.basis.processes[p].prefix
         filled = dV.new_zeros(part.used.numel(), len(dV))
         filled[part.columns] = dV[:, self.basis.of_process(p)].mT
         filled = filled.unflatten(0, part.used.shape).mT
@@ -255,25 +257,9 @@ class _BoundGradient:
         params = {key: value.requires_grad_() for key, value in _detached(part.params).items()}
         with torch.enable_grad():
             K = rest.kernel.covariance(rest.parameters(params), part.inducing, part.inducing)
-        dK = torch.stack([_through_root(s, d) for s, d in zip(part.spectra, dR, strict=True)])
+        dK = torch.stack([s.pull_back(d) for s, d in zip(part.spectra, dR, strict=True)])
         self._add(prefix, params, {}, [K], [dK])
 
 
 def _detached(tensors: Parameters) -> dict[str, Tensor]:
     return {key: value.detach() for key, value in tensors.items()}
-
-
-def _through_root(spectrum: Spectrum, dR: Tensor) -> Tensor:
-    """Derivative for K_zz from that for R, of a function of the truncated pseudo-inverse R Rᵀ alone.
-
-    Exact where no eigenvalue crosses the truncation: with E = UᵀdK U, dR = U X with
-    X_jk = −½ E_jk λ_j⁻¹ λ_k^{−½} among kept ones and X_dk = E_dk λ_k^{−½} / (λ_k − λ_d) for dropped ones d.
-    """
-    values, first = spectrum.values, spectrum.dropped
-    kept = values[first:]
-    B = spectrum.vectors.mT @ dR[:, : len(kept)]
-    G = torch.zeros_like(spectrum.vectors)
-    G[first:, first:] = -0.5 * B[first:] * kept.rsqrt() / kept[:, None]
-    G[:first, first:] = B[:first] * kept.rsqrt() / (kept - values[:first, None])
-    dK = spectrum.vectors @ G @ spectrum.vectors.mT
-    return 0.5 * (dK + dK.mT)

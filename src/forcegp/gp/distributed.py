@@ -16,7 +16,8 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.kernels import Features, Parameters
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters
 from forcegp.gp.structured_covariance import Block
 from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
 
@@ -74,7 +75,7 @@ def share_basis(basis: LatentBasis, source: int = 0, group: Group = None) -> Lat
     """The basis of one process in all of them, which must hold one of the same shapes.
 
     Args:
-        basis: with the same priors and number of inducing points in every process.
+        basis: with the same processes and number of inducing points in every process.
         source: whose hyperparameters, inducing points and eigenvectors are taken.
         group: the processes that take part.
 
@@ -97,7 +98,7 @@ def share_basis(basis: LatentBasis, source: int = 0, group: Group = None) -> Lat
         )
         params, Z = (share_tensors(given, source, group) for given in (part.params, part.inducing))
         parts.append(dataclasses.replace(part, params=params, inducing=Z, spectra=spectra))
-    return LatentBasis(basis.priors, share_tensors(basis.params, source, group), tuple(parts))
+    return LatentBasis(basis.processes, share_tensors(basis.params, source, group), tuple(parts))
 
 
 def share_tensors(tensors: Parameters | Features, source: int = 0, group: Group = None) -> dict[str, Tensor]:

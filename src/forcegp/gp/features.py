@@ -1,92 +1,60 @@
-"""Which part of a kernel is a finite number of features, and which part needs inducing points.
-
-A sum of linear kernels and of products of linear kernels is k(x, x′) = φ(x)ᵀφ(x′) exactly, with a few
-features φ. The rest, whatever contains a stationary factor, is approximated with inducing points.
-"""
+"""Kernel inputs: named features, side by side and standardized."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import reduce
 
 import torch
+from torch import Tensor
 
-from forcegp.gp.draws import FunctionDraw
-from forcegp.gp.kernels import Kernel, Linear, Parameters, Product, Sum, sub
+from forcegp.errors import UnknownNameError
 
-EXACT: tuple[type[Kernel], ...] = (Linear,)
-"""Kernels without factors whose `draw` holds all their features, whatever number it is asked for."""
+Features = Mapping[str, Tensor]
+"""Named kernel inputs: `(n, w)`, shared by all components, or `(n, k, w)`, one row for each component."""
+
+
+def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
+    """The named features side by side, `(n, w)`, or `(k, n, w)` where components have inputs of their own.
+
+    Raises:
+        UnknownNameError: a feature is not given.
+    """
+    names = tuple(x) if inputs is None else inputs
+    for name in names:
+        if name not in x:
+            raise UnknownNameError("kernel input", name, x)
+    parts = [x[name] for name in names]
+    if all(part.ndim == 2 for part in parts):
+        return torch.cat(parts, dim=-1)
+    k = next(part.shape[1] for part in parts if part.ndim == 3)
+    wide = [part if part.ndim == 3 else part[:, None].expand(-1, k, -1) for part in parts]
+    return torch.cat(wide, dim=-1).transpose(0, 1)
 
 
 @dataclass(frozen=True)
-class Part:
-    """A kernel made of factors of another one.
+class Standardization:
+    """Shift and scale of each named input, x ↦ (x − mean)/std, from training data.
 
-    Attributes:
-        kernel: the sum of products of the factors.
-        names: the prefix of each factor's hyperparameters here, and in the whole kernel.
+    Inputs that are constant to rounding keep the scale 1, and are listed in `constant`.
     """
 
-    kernel: Kernel
-    names: Mapping[str, str]
+    mean: Mapping[str, Tensor]
+    std: Mapping[str, Tensor]
+    constant: tuple[str, ...] = ()
 
-    def parameters(self, whole: Parameters) -> dict[str, torch.Tensor]:
-        """The part's hyperparameters among those of the whole kernel."""
-        found = {}
-        for here, there in self.names.items():
-            factor = sub(whole, there) if there else whole
-            found |= {f"{here}.{key}" if here else key: value for key, value in factor.items()}
-        return found
+    @classmethod
+    def of(cls, features: Mapping[str, Tensor]) -> Standardization:
+        """Mean and standard deviation of each column."""
+        mean = {name: x.mean(0) for name, x in features.items()}
+        std, constant = {}, []
+        for name, x in features.items():
+            spread = x.std(0, correction=0)
+            fixed = spread <= 1e-12 * (1.0 + mean[name].abs())
+            constant += [f"{name}[{i}]" for i in fixed.nonzero()[:, 0].tolist()]
+            std[name] = torch.where(fixed, 1.0, spread)
+        return cls(mean, std, tuple(constant))
 
-    def features(self, whole: Parameters) -> FunctionDraw:
-        """φ of a finite part: features whose products are the kernel exactly."""
-        # Such a draw takes no random number, so any generator does.
-        return self.kernel.draw(self.parameters(whole), 1, torch.Generator())
-
-
-@dataclass(frozen=True)
-class Split:
-    """A kernel as the sum of a finite part and the rest.
-
-    Attributes:
-        finite: sums and products of linear kernels.
-        rest: everything else.
-    """
-
-    finite: Part | None
-    rest: Part | None
-
-
-def split(kernel: Kernel) -> Split:
-    """The finite part of a kernel and the rest; products of sums are multiplied out where needed."""
-    finite, rest = _terms(kernel, "")
-    return Split(_sum(finite), _sum(rest))
-
-
-def _terms(kernel: Kernel, path: str) -> tuple[list[Part], list[Part]]:
-    """Terms with and without a finite number of features."""
-    if isinstance(kernel, EXACT):
-        return [Part(kernel, {"": path})], []
-    if not isinstance(kernel, Sum):
-        return [], [Part(kernel, {"": path})]
-    sides = [_terms(getattr(kernel, side), f"{path}.{side}".lstrip(".")) for side in ("left", "right")]
-    (finite_left, rest_left), (finite_right, rest_right) = sides
-    if not isinstance(kernel, Product):
-        return finite_left + finite_right, rest_left + rest_right
-    if not finite_left or not finite_right:
-        return [], [Part(kernel, {"": path})]
-    finite = [_join(Product, a, b) for a in finite_left for b in finite_right]
-    rest = [_join(Product, a, b) for a in finite_left for b in rest_right]
-    rest += [_join(Product, a, b) for a in rest_left for b in finite_right + rest_right]
-    return finite, rest
-
-
-def _join(kind: type[Sum], left: Part, right: Part) -> Part:
-    names = {f"left.{key}".rstrip("."): path for key, path in left.names.items()}
-    names |= {f"right.{key}".rstrip("."): path for key, path in right.names.items()}
-    return Part(kind(left.kernel, right.kernel), names)
-
-
-def _sum(terms: list[Part]) -> Part | None:
-    return reduce(lambda a, b: _join(Sum, a, b), terms) if terms else None
+    def apply(self, features: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The standardized features."""
+        return {name: (x - self.mean[name]) / self.std[name] for name, x in features.items()}

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forcegp.gp.basis import TRUNCATION, points
-from forcegp.gp.features import Part, split
-from forcegp.gp.kernels import Features, Parameters, sub
+from forcegp.gp.blocks import points, rows_of
+from forcegp.gp.decomposition import Part, split
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters, sub
+from forcegp.gp.spectrum import TRUNCATION
 from forcegp.gp.structured_covariance import Block, Process
 
 CANDIDATES = 4000
@@ -64,14 +66,13 @@ def candidates(blocks: Iterable[Block], samples: int, count: int = CANDIDATES) -
         own = torch.arange(len(block.target), device=block.target.device)[-seen % step :: step]
         seen += len(block.target)
         if len(own):
-            features = tuple({name: x[own] for name, x in f.items()} for f in block.features)
-            kept.append(Block(features, tuple(W[own] for W in block.operators), block.target[own]))
+            kept.append(rows_of(block, own))
     return kept
 
 
 @torch.no_grad()
 def select_inducing(
-    priors: Sequence[Process],
+    processes: Sequence[Process],
     params: Parameters,
     blocks: Sequence[Block],
     rows: int | None = None,
@@ -83,7 +84,7 @@ def select_inducing(
     A process that no row shows, or whose kernel has a finite number of features, gets none.
 
     Args:
-        priors: the processes.
+        processes: the processes.
         params: log-hyperparameters.
         blocks: candidates, as given by `candidates`.
         rows: number of rows that will be conditioned on, of which these are a part; all by default.
@@ -93,7 +94,7 @@ def select_inducing(
     own_rows = sum(block.rows for block in blocks)
     tolerance = share / (own_rows if rows is None else rows)
     chosen = []
-    for p, prior in enumerate(priors):
+    for p, prior in enumerate(processes):
         names = blocks[0].features[p]
         x = {name: torch.cat([block.features[p][name] for block in blocks]) for name in names}
         weight = torch.cat([(block.operators[p] ** 2).sum(1) for block in blocks]).mT / own_rows

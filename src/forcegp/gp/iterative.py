@@ -41,16 +41,16 @@ class Solution:
     history: list[float]
 
 
-def product(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block], x: Tensor) -> Tensor:
+def product(processes: Sequence[Process], params: Parameters, blocks: Sequence[Block], x: Tensor) -> Tensor:
     """(K + I) x for the covariance K of all rows, which is never held.
 
     Args:
-        priors, params, blocks: as given to `gram`.
+        processes, params, blocks: as given to `gram`.
         x: `(rows, columns)`.
     """
     starts = offsets(blocks)
     result = x.clone()
-    for p, prior in enumerate(priors):
+    for p, prior in enumerate(processes):
         own = sub(params, prior.prefix)
         latent = []
         for g, block in enumerate(blocks):
@@ -106,7 +106,7 @@ class SparsePreconditioner:
 
 @torch.no_grad()
 def solve(
-    priors: Sequence[Process],
+    processes: Sequence[Process],
     params: Parameters,
     blocks: Sequence[Block],
     basis: LatentBasis,
@@ -117,7 +117,7 @@ def solve(
     """Solve (K + I) x = y by conjugate gradients with the sparse model as preconditioner.
 
     Args:
-        priors, params, blocks: as given to `gram`.
+        processes, params, blocks: as given to `gram`.
         basis: of the sparse model.
         right: y `(rows, columns)`; the blocks' targets by default.
         tolerance: largest ‖residual‖/‖y‖ at which to stop.
@@ -137,12 +137,12 @@ def solve(
     direction, rho = z, (residual * z).sum(0)
     history: list[float] = []
     while len(history) < limit:
-        Kd = product(priors, params, blocks, direction)
+        Kd = product(processes, params, blocks, direction)
         step = rho / (direction * Kd).sum(0).clamp(min=torch.finfo(y.dtype).tiny)
         x, residual = x + step * direction, residual - step * Kd
         history.append(float((residual.norm(dim=0) / scale).max()))
         if history[-1] <= tolerance:
-            return Solution(x, y - product(priors, params, blocks, x), len(history) + 1, history)
+            return Solution(x, y - product(processes, params, blocks, x), len(history) + 1, history)
         z = precondition(residual)
         rho, before = (residual * z).sum(0), rho
         direction = z + (rho / before.clamp(min=torch.finfo(y.dtype).tiny)) * direction
@@ -171,7 +171,7 @@ class ExactPrediction:
 
 @torch.no_grad()
 def predict(
-    priors: Sequence[Process],
+    processes: Sequence[Process],
     params: Parameters,
     blocks: Sequence[Block],
     basis: LatentBasis,
@@ -187,16 +187,16 @@ def predict(
     Raises:
         NumericalError: the limit of iterations is reached first.
     """
-    cross = cross_gram(priors, params, blocks, [test])
+    cross = cross_gram(processes, params, blocks, [test])
     right = torch.cat([target_of(blocks)[:, None], cross], dim=1)
-    solution = solve(priors, params, blocks, basis, right, tolerance, limit)
+    solution = solve(processes, params, blocks, basis, right, tolerance, limit)
     alpha, X, R = solution.x[:, 0], solution.x[:, 1:], solution.residual[:, 1:]
     n, d = test.target.shape
     explained = (X.mT @ (cross + R)).unflatten(0, (n, d)).unflatten(2, (n, d))
     own = torch.arange(n, device=X.device)
     prior = sum(
         torch.einsum("nak,kn,nbk->nab", W, prior.kernel.diagonal(sub(params, prior.prefix), f), W)
-        for prior, f, W in zip(priors, test.features, test.operators, strict=True)
+        for prior, f, W in zip(processes, test.features, test.operators, strict=True)
     )
     covariance = prior - explained[own, :, own]
     mean = (cross.mT @ alpha).unflatten(0, (n, d))

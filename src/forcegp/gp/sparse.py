@@ -17,8 +17,13 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, NumericalError
-from forcegp.gp.basis import LatentBasis, chunked, components_of, latent_basis
-from forcegp.gp.kernels import Features, Parameters
+from forcegp.gp.basis import LatentBasis, latent_basis
+from forcegp.gp.blocks import chunked, components_of
+from forcegp.gp.diagnostics import Diagnostics
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters
+from forcegp.gp.pathwise import FEATURES, FunctionSamples
+from forcegp.gp.sparse_draws import draw_functions
 from forcegp.gp.structured_covariance import Block, Process
 from forcegp.gp.sums import Sums, accumulate, add_rows
 from forcegp.linalg import cholesky
@@ -31,37 +36,6 @@ UPDATE_FRACTION = 0.25
 
 PANEL = 16
 """Columns that LAPACK's triangular-pentagonal QR takes at a time."""
-
-
-MISSED = 0.1
-"""Missed variance, as a fraction of what the noise leaves, above which more points would help."""
-
-
-@dataclass(frozen=True)
-class Diagnostics:
-    """What a sparse posterior loses by its inducing points.
-
-    Attributes:
-        size: number of basis functions.
-        rows: number of rows, less what is forgotten.
-        learned: how many basis functions the rows determine, tr A⁻¹G; in units of the noise variance this is
-            the variance that noise leaves in all rows together.
-        missed: the prior variance that the points miss in all rows together, in the same units.
-        relative: missed prior variance of each process as a fraction of all of it.
-        residual: mean square of the rows' residuals, 1 where the model and its noise fit.
-    """
-
-    size: int
-    rows: float
-    learned: float
-    missed: float
-    relative: tuple[float, ...]
-    residual: float
-
-    @property
-    def more_points_would_help(self) -> bool:
-        """Whether the points miss a tenth or more of the variance that the noise leaves."""
-        return self.missed > MISSED * self.learned
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,20 +77,15 @@ class SparsePosterior:
         own = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
         return tuple(bool((diagonal[columns] > 0.0).any()) for columns in own)
 
+    def is_measured(self, p: int) -> bool:
+        """Whether any row depends on process p; where none does, its posterior is its prior."""
+        return self.measured[p]
+
     @cached_property
     def folded(self) -> list[tuple[Tensor, Tensor]]:
         """Posterior mean of each process as weights of k(x, Z) and of the exact features."""
-        return [self.fold(p, self.weights[:, None]) for p in range(len(self.basis.parts))]
-
-    def fold(self, p: int, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights of basis functions `(size, s)` as those of k(x, Z) `(k, m, s)` and of φ(x) `(k, F, s)`."""
-        part = self.basis.parts[p]
-        filled = weights.new_zeros(part.used.numel(), weights.shape[1])
-        filled[part.columns] = weights[self.basis.of_process(p)]
-        filled = filled.unflatten(0, part.used.shape)
-        width = filled.shape[1] - part.finite_size
-        on_kernel = part.roots @ filled[:, :width] if part.spectra else filled[:, :0]
-        return on_kernel, filled[:, width:]
+        basis, weights = self.basis, self.weights[:, None]
+        return [part.fold(weights[basis.of_process(p)]) for p, part in enumerate(basis.parts)]
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
         """Posterior mean of process p, `(n, components)`."""
@@ -186,6 +155,19 @@ class SparsePosterior:
             residual=float(residual / sums.rows) if float(sums.rows) > 0.0 else 0.0,
         )
 
+    def draw(self, count: int, generator: torch.Generator, features: int = FEATURES) -> FunctionSamples:
+        """Functions from the posterior.
+
+        Args:
+            count: number of functions.
+            generator: source of randomness, on the CPU.
+            features: random features per component.
+        """
+        m = self.weights[:, None]
+        normal = torch.randn(len(m), count, dtype=torch.float64, generator=generator).to(m)
+        weights = m + torch.linalg.solve_triangular(self.L.mT, normal, upper=True)
+        return draw_functions(self.basis, weights, generator, features)
+
     def updated(self, blocks: Sequence[Block]) -> SparsePosterior:
         """Conditioned on further samples too, at a cost that does not depend on those before.
 
@@ -230,7 +212,7 @@ def _extended(L: Tensor, rows: Tensor) -> Tensor:
 
 
 def condition_sparse(
-    priors: Sequence[Process],
+    processes: Sequence[Process],
     params: Parameters,
     blocks: Sequence[Block],
     inducing: Sequence[Features],
@@ -238,7 +220,7 @@ def condition_sparse(
     """Condition processes on whitened rows through given inducing points.
 
     Args:
-        priors: the processes.
+        processes: the processes.
         params: log-hyperparameters.
         blocks: whitened rows, of one block at least.
         inducing: kernel inputs of the inducing points of each process.
@@ -251,5 +233,5 @@ def condition_sparse(
         raise ModelError(
             "there is nothing to condition on", expected="at least one block of rows", got="none"
         )
-    basis = latent_basis(priors, params, inducing, components_of(blocks[0]))
+    basis = latent_basis(processes, params, inducing, components_of(blocks[0]))
     return SparsePosterior.of(basis, accumulate(basis, blocks))

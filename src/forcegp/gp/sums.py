@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.gp.basis import LatentBasis, chunked
+from forcegp.gp.basis import LatentBasis
+from forcegp.gp.blocks import chunked
 from forcegp.gp.structured_covariance import Block
 
 CHUNK_SAMPLES = 1024

@@ -13,12 +13,12 @@ from typing import TypeVar
 import torch
 
 from forcegp.constraints import Baumgarte, ConstrainedSystem, PointConnection, SurfaceContact
-from forcegp.control.config import SimulationConfig
 from forcegp.errors import ForceGPError, SceneError
 from forcegp.robot import RobotModel, load_robot
 from forcegp.robot.load import BUNDLED as BUNDLED_ROBOTS
 from forcegp.scene.sections import SceneSections, config_of, validate
 from forcegp.scene.toml import Document, Key
+from forcegp.simulate.config import SimulationConfig
 
 BUNDLED = ("kuka_plane",)
 """Scenes that come with the library: the paper's task."""

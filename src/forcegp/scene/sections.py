@@ -12,9 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic_core import ErrorDetails
 
 from forcegp.constraints import Cylinder, Plane, Sphere
-from forcegp.control.config import SimulationConfig
 from forcegp.errors import SceneError
 from forcegp.scene.toml import Document, Key
+from forcegp.simulate.config import SimulationConfig
 
 Vector = tuple[float, float, float]
 T = TypeVar("T")

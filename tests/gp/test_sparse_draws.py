@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from forcegp.gp.sparse import condition_sparse
-from forcegp.gp.sparse_samples import draw_sparse_samples
 from gp.sparse_cases import PROCESSES, first, parameters, rows
 
 COUNT, FEATURES = 4000, 2000
@@ -18,7 +17,7 @@ COVARIANCE = 0.12
 def test_mean_and_covariance_are_those_of_the_posterior() -> None:
     block, test = rows(30), rows(5, seed=2)
     posterior = condition_sparse(PROCESSES, parameters(), [block], first(block, 10))
-    samples = draw_sparse_samples(posterior, COUNT, torch.Generator().manual_seed(0), FEATURES)
+    samples = posterior.draw(COUNT, torch.Generator().manual_seed(0), FEATURES)
     assert samples.count == COUNT
     drawn = torch.cat([samples.latent(p, f) for p, f in enumerate(test.features)], dim=-1)
     mean = torch.cat([posterior.latent_mean(p, f) for p, f in enumerate(test.features)], dim=-1)
@@ -34,7 +33,7 @@ def test_mean_and_covariance_are_those_of_the_posterior() -> None:
 def test_one_sample_per_state_is_that_sample() -> None:
     block, test = rows(30), rows(5, seed=2)
     posterior = condition_sparse(PROCESSES, parameters(), [block], first(block, 10))
-    samples = draw_sparse_samples(posterior, 7, torch.Generator().manual_seed(0), 64)
+    samples = posterior.draw(7, torch.Generator().manual_seed(0), 64)
     which = torch.tensor([6, 0, 3, 3, 1])
     for p, features in enumerate(test.features):
         every = samples.latent(p, features)
