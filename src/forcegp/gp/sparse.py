@@ -203,9 +203,9 @@ def _extended(L: Tensor, rows: Tensor) -> Tensor:
 
     Its diagonal may be negative, which solves do not mind.
     """
-    upper, below = np.asfortranarray(L.numpy().T), np.asfortranarray(rows.numpy())
+    upper, below = np.array(L.numpy().T, order="F"), np.array(rows.numpy(), order="F")
     (tpqrt,) = scipy.linalg.lapack.get_lapack_funcs(("tpqrt",), (upper,))
-    R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below)
+    R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below, overwrite_a=1, overwrite_b=1)
     if info != 0:
         raise NumericalError("a Cholesky factor could not be updated", got=f"LAPACK tpqrt info {info}")
     return torch.from_numpy(R).mT
