@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from forcegp.control.task_space import Gains
-from forcegp.errors import ForceGPError
+from forcegp.errors import ParameterError
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class SimulationConfig:
         frame, point: the tool where there is no contact; by default the last frame of the robot.
 
     Raises:
-        ForceGPError: a value is out of range; the message names it.
+        ParameterError: a value is out of range; the message names it.
     """
 
     duration: float = 60.0
@@ -73,6 +73,6 @@ class SimulationConfig:
 
     def _check(self, name: str, valid: bool, expected: str) -> None:
         if not valid:
-            raise ForceGPError(
+            raise ParameterError(
                 f"the simulation's {name} is out of range", expected=expected, got=getattr(self, name)
             )

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.constraints.gauss import ConstrainedSystem, Equations
 from forcegp.types import JointVector
 
 
