@@ -65,6 +65,10 @@ class UnknownNameError(ForceGPError, LookupError):
         )
 
 
+class ParameterError(ForceGPError, ValueError):
+    """A parameter that is out of range, such as a radius or a time step (the message names it)."""
+
+
 class ShapeError(ForceGPError, ValueError):
     """A tensor whose shape, dtype or device does not fit."""
 
