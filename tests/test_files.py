@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import pytest
 
-from forcegp.errors import DataError
+from forcegp.errors import DataError, DestinationError
 from forcegp.files import MAX_HEADER_BYTES, Header, atomic_directory, atomic_file, write_json, write_text
 
 
@@ -64,7 +64,7 @@ def test_a_crash_leaves_the_old_folder_and_success_replaces_it_whole(tmp_path: P
 
 def test_a_folder_does_not_replace_a_file(tmp_path: Path) -> None:
     (tmp_path / "model").write_text("precious")
-    with pytest.raises(NotADirectoryError, match="is a file"), atomic_directory(tmp_path / "model"):
+    with pytest.raises(DestinationError, match="is a file"), atomic_directory(tmp_path / "model"):
         pass
     assert (tmp_path / "model").read_text() == "precious"
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
-from typing import TypeVar
+from itertools import islice
+from typing import Any, TypeVar
+
+from forcegp.limits import NAME_COMPARED, NAMES_COMPARED
 
 E = TypeVar("E", bound="ForceGPError")
 
@@ -33,7 +36,35 @@ class ForceGPError(Exception):
     def at(cls: type[E], place: str, cause: ForceGPError) -> E:
         """An error of this class that adds to another one where it arose (a file, a line)."""
         message = f"{place}: {cause.message}"
-        return cls(message, expected=cause.expected, got=cause.got, hint=cause.hint)
+        error = cls.__new__(cls)
+        ForceGPError.__init__(error, message, expected=cause.expected, got=cause.got, hint=cause.hint)
+        return error
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How to copy the error, or to send it to another process: its text and plain values."""
+        state = {name: _plain(value) for name, value in self.__dict__.items()}
+        return _rebuilt, (type(self), tuple(map(_plain, self.args)), state)
+
+
+def _plain(value: object) -> object:
+    """The value itself where every process can hold it, else the text that the message shows."""
+    return value if isinstance(value, str | int | float | None) else str(value)
+
+
+def _rebuilt(kind: type[E], args: tuple[object, ...], state: dict[str, object]) -> E:
+    """The error that `ForceGPError.__reduce__` took apart; no constructor runs a second time."""
+    error = kind.__new__(kind, *args)
+    error.args = args
+    error.__dict__.update(state)
+    return error
+
+
+def near_names(name: object, valid: Iterable[str]) -> list[str]:
+    """The valid name nearest to a misspelt one, or none; long names and long lists are not compared."""
+    text = str(name)
+    if len(text) > NAME_COMPARED:
+        return []
+    return get_close_matches(text, list(islice(valid, NAMES_COMPARED)), n=1)
 
 
 class RobotFileError(ForceGPError, ValueError):
@@ -57,12 +88,21 @@ class UnknownNameError(ForceGPError, LookupError):
 
     def __init__(self, kind: str, name: object, valid: Iterable[str]) -> None:
         names = list(valid)
-        near = get_close_matches(str(name), names, n=1)
+        near = near_names(name, names)
         super().__init__(
-            f"unknown {kind} {name!r}",
-            expected="one of " + ", ".join(names) if names else "none are defined",
+            f"unknown {kind} {_shortened(repr(name))}",
+            expected="one of " + _listed(names) if names else "none are defined",
             hint=f"did you mean {near[0]!r}?" if near else None,
         )
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= NAME_COMPARED else text[:NAME_COMPARED] + "…"
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - NAMES_COMPARED
+    return ", ".join(names[:NAMES_COMPARED]) + (f" and {more} more" if more > 0 else "")
 
 
 class ShapeError(ForceGPError, ValueError):
@@ -87,3 +127,11 @@ class NumericalError(ForceGPError, ArithmeticError):
 
 class MissingDependencyError(ForceGPError, ImportError):
     """An optional package that the request needs and that is not installed."""
+
+
+class DestinationError(ForceGPError, OSError):
+    """A place where results are to be written and cannot be; names where they were kept, if they exist."""
+
+
+class MemoryLimitError(ForceGPError, RuntimeError):
+    """Work that needs more memory than is free, refused before it starts."""
