@@ -59,12 +59,13 @@ def _rebuilt(kind: type[E], args: tuple[object, ...], state: dict[str, object]) 
     return error
 
 
-def near_names(name: object, valid: Iterable[str]) -> list[str]:
+def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[str]:
     """The valid name nearest to a misspelt one, or none; long names and long lists are not compared."""
     text = str(name)
     if len(text) > NAME_COMPARED:
         return []
-    return get_close_matches(text, list(islice(valid, NAMES_COMPARED)), n=1)
+    compared = (other for other in islice(valid, NAMES_COMPARED) if len(other) <= NAME_COMPARED)
+    return get_close_matches(text, list(compared), n=1, cutoff=cutoff)
 
 
 class RobotFileError(ForceGPError, ValueError):

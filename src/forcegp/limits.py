@@ -47,6 +47,7 @@ CHECKPOINT_VALUE = 1e12
 LOGGED_VALUE = 1e100
 """A number in a log or a state: its square, and the square of that, are finite."""
 
-NAMES_COMPARED = 1000
-"""Names that a misspelt one is compared with, and the length in characters up to which it is."""
-NAME_COMPARED = 200
+NAMES_COMPARED = 500
+"""Names that a misspelt one is compared with."""
+NAME_COMPARED = 100
+"""Characters of a name up to which it is compared."""
