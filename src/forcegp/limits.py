@@ -32,8 +32,8 @@ KEY_PARTS = 16
 """Parts of a dotted key of a scene."""
 SCENE_DEPTH = 32
 """Tables and lists inside each other in a scene."""
-SCENE_KEYS = 10_000
-"""Keys of a scene."""
+SCENE_KEYS = 2000
+"""Keys and tables of a scene."""
 
 MODEL_BYTES = 16 * GIB
 """The tensors of a saved model."""

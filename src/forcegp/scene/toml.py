@@ -7,14 +7,12 @@ import sys
 from typing import Any
 
 from forcegp.errors import SceneError
+from forcegp.limits import KEY_PARTS, SCENE_BYTES, SCENE_DEPTH, SCENE_KEYS
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
-
-MAX_BYTES = 1 << 20
-"""A scene is a page of text; anything larger is not one."""
 
 Key = tuple[str | int, ...]
 
@@ -23,6 +21,8 @@ _DOTTED = rf"{_NAME}(?:\s*\.\s*{_NAME})*"
 _ARRAY = re.compile(rf"^\s*\[\[\s*({_DOTTED})\s*\]\]")
 _TABLE = re.compile(rf"^\s*\[\s*({_DOTTED})\s*\]")
 _KEY = re.compile(rf"^\s*({_DOTTED})\s*=")
+_BRACKET = re.compile(r"^[ \t]*\[", re.MULTILINE)
+_TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
 
 
 class Document:
@@ -38,21 +38,25 @@ class Document:
 
     def __init__(self, content: bytes, source: str) -> None:
         self.source = source
-        if len(content) > MAX_BYTES:
-            raise SceneError(f"{source}: too large", expected=f"at most {MAX_BYTES} bytes", got=len(content))
+        if len(content) > SCENE_BYTES:
+            raise SceneError(
+                f"{source}: too large", expected=f"at most {SCENE_BYTES} bytes", got=len(content)
+            )
         try:
             text = content.decode("utf-8")
         except UnicodeDecodeError as cause:
             line = content[: cause.start].count(b"\n") + 1
             raise SceneError(f"{source}:{line}: not UTF-8 text", got=str(cause)) from cause
+        _check_keys(text, source)
         try:
             self.data: dict[str, Any] = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, RecursionError) as cause:
+        except (ValueError, RecursionError) as cause:
             found = re.search(r"line (\d+)", str(cause))
             line = int(found[1]) if found else text.count("\n") + 1
             raise SceneError(
                 f"{source}:{line}: not valid TOML", got=str(cause) or "brackets nested too deeply"
             ) from cause
+        _check_depth(self.data, source)
         self._lines = _lines_of_keys(text)
 
     def place(self, key: Key) -> str:
@@ -73,6 +77,36 @@ class Document:
 def dotted(key: Key) -> str:
     """A key as people write it: `contact[0].surface`."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
+
+
+def _check_keys(text: str, source: str) -> None:
+    """Check the number of keys and of the parts of each: a parser takes quadratic time for either."""
+    keys = text.count("=") + len(_BRACKET.findall(text))
+    if keys > SCENE_KEYS:
+        raise SceneError(f"{source}: too many keys and tables", expected=f"at most {SCENE_KEYS}", got=keys)
+    parts, joined = 0, False
+    for token in _TOKEN.finditer(text):
+        name, dot, other = token.groups()
+        if name:
+            parts, joined = (parts + 1 if joined else 1), False
+        elif dot:
+            joined = True
+        elif other:
+            parts, joined = 0, False
+        if parts > KEY_PARTS:
+            line = text.count("\n", 0, token.start()) + 1
+            raise SceneError(f"{source}:{line}: a key of too many parts", expected=f"at most {KEY_PARTS}")
+
+
+def _check_depth(data: object, source: str) -> None:
+    """Check how deeply tables and lists lie inside each other, which validation follows by recursion."""
+    level = [data]
+    for _ in range(SCENE_DEPTH):
+        inner = [list(value.values()) if isinstance(value, dict) else value for value in level]
+        level = [part for values in inner for part in values if isinstance(part, dict | list)]
+        if not level:
+            return
+    raise SceneError(f"{source}: nested too deeply", expected=f"at most {SCENE_DEPTH} levels")
 
 
 def _split(name: str) -> Key:
