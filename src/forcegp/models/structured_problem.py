@@ -109,7 +109,8 @@ class Problem:
         """What tells the learning of some tensors on these data, with these options, from any other."""
         data = [value for m in self.training.measurements for value in m.tensors]
         priors = [(type(prior).__name__, prior.name, prior.kernel) for prior in self.priors]
-        return Checkpoint.key_of(self.mean, priors, options, names, *data, *self.training.noise_std)
+        noise = self.training.noise_std
+        return Checkpoint.key_of(self.system, self.mean, priors, options, names, *data, *noise)
 
     def objective(
         self, tensors: dict[str, Tensor], held: dict[str, Tensor], center: dict[str, Tensor]
