@@ -9,7 +9,8 @@ from typing import ClassVar
 import pytest
 
 from forcegp.errors import DataError, DestinationError
-from forcegp.files import MAX_HEADER_BYTES, Header, atomic_directory, atomic_file, write_json, write_text
+from forcegp.files import Header, atomic_directory, atomic_file, write_json, write_text
+from forcegp.limits import HEADER_BYTES
 
 
 class Card(Header):
@@ -93,7 +94,8 @@ def test_header_round_trip() -> None:
         ('{"format": "card"}', "version None"),
         ('{"format": "card", "version": 3, "size": "big"}', "header field 'size'"),
         ('{"format": "card", "version": 3, "colour": 1}', "header field 'colour'"),
-        (" " * (MAX_HEADER_BYTES + 1), "too large"),
+        ('{"format": "card", "version": 3, "size": ' + "[" * 80 + "]" * 80 + "}", "nested too deeply"),
+        (" " * (HEADER_BYTES + 1), "too large"),
     ],
 )
 def test_bad_headers_say_what_is_wrong(text: str, message: str) -> None:

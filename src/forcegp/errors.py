@@ -9,6 +9,9 @@ from typing import Any, TypeVar
 
 from forcegp.limits import NAME_COMPARED, NAMES_COMPARED
 
+LONGEST_VALUE = 2000
+"""Characters of a wrong value that a message shows."""
+
 E = TypeVar("E", bound="ForceGPError")
 
 
@@ -28,7 +31,7 @@ class ForceGPError(Exception):
         self.message, self.expected, self.got, self.hint = message, expected, got, hint
         parts = [message]
         parts += [f"expected: {expected}"] if expected is not None else []
-        parts += [f"got: {got}"] if got is not None else []
+        parts += [f"got: {_shortened(str(got), LONGEST_VALUE)}"] if got is not None else []
         parts += [f"hint: {hint}"] if hint else []
         super().__init__("\n  ".join(parts))
 
@@ -91,14 +94,14 @@ class UnknownNameError(ForceGPError, LookupError):
         names = list(valid)
         near = near_names(name, names)
         super().__init__(
-            f"unknown {kind} {_shortened(repr(name))}",
+            f"unknown {kind} {_shortened(repr(name), NAME_COMPARED)}",
             expected="one of " + _listed(names) if names else "none are defined",
             hint=f"did you mean {near[0]!r}?" if near else None,
         )
 
 
-def _shortened(text: str) -> str:
-    return text if len(text) <= NAME_COMPARED else text[:NAME_COMPARED] + "…"
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else text[:length] + "…"
 
 
 def _listed(names: Sequence[str]) -> str:

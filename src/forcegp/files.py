@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from forcegp.errors import DestinationError, ForceGPError
 from forcegp.exchange import place, recover
-from forcegp.limits import HEADER_BYTES as MAX_HEADER_BYTES
+from forcegp.limits import HEADER_BYTES, HEADER_DEPTH
 from forcegp.temporary import Temporary, sweep
 
 H = TypeVar("H", bound="Header")
@@ -162,7 +162,7 @@ class Header(BaseModel):
 
     FORMAT: ClassVar[str]
     VERSION: ClassVar[int]
-    MAX_BYTES: ClassVar[int] = MAX_HEADER_BYTES
+    MAX_BYTES: ClassVar[int] = HEADER_BYTES
 
     def to_json(self) -> str:
         """The header as JSON text, format and version first."""
@@ -211,4 +211,15 @@ def _json_object(text: str | bytes, source: str, error: type[ForceGPError], most
         raise error(f"{source}: the header is not JSON", got=str(cause)) from cause
     if not isinstance(value, dict):
         raise error(f"{source}: the header is not a JSON object", got=type(value).__name__)
+    if depth(value) > HEADER_DEPTH:
+        raise error(f"{source}: the header is nested too deeply", expected=f"at most {HEADER_DEPTH} levels")
     return value
+
+
+def depth(value: object) -> int:
+    """How many mappings and lists lie inside each other at most, found without recursion."""
+    level, found = [value], 0
+    while level := [part for part in level if isinstance(part, dict | list)]:
+        found += 1
+        level = [inner for part in level for inner in (part.values() if isinstance(part, dict) else part)]
+    return found

@@ -10,6 +10,8 @@ KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
 
 HEADER_BYTES = MIB
 """A JSON header."""
+HEADER_DEPTH = 64
+"""Objects and lists inside each other in a header."""
 
 TABLE_BYTES = 8 * GIB
 """A table in memory, in bytes of float64."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 
 from pydantic import PositiveFloat
@@ -111,6 +112,10 @@ def load_network(
 ) -> NeuralNetwork:
     """The neural network that `save_network` wrote."""
     settings = settings_of(header, NetworkSettings, source)
+    # The shapes are those of the file before a network of these widths is allocated.
+    widths = (3 * system.robot.nq, *settings.hidden, system.robot.nq)
+    for i, (width, following) in enumerate(pairwise(widths)):
+        take(tensors, f"network.{2 * i}.weight", (following, width), system.robot.dtype, source)
     model = NeuralNetwork(system, settings.hidden, settings.seed)
     state = {
         name: take(tensors, f"network.{name}", tuple(old.shape), old.dtype, source)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import ForcePrior
@@ -126,7 +126,7 @@ class StructuredSettings(Settings):
     """What is kept of a structured Gaussian process beside its tensors."""
 
     mean: tuple[str, ...]
-    noise_std: float | tuple[float, ...]
+    noise_std: PositiveFloat | tuple[PositiveFloat, ...]
     learn_noise: bool
     priors: tuple[Annotated[PriorSettings, Field(discriminator="type")], ...]
     measured: tuple[str, ...]

@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from forcegp.errors import SceneError
+from forcegp.files import depth
 from forcegp.limits import KEY_PARTS, SCENE_BYTES, SCENE_DEPTH, SCENE_KEYS
 
 if sys.version_info >= (3, 11):
@@ -56,7 +57,8 @@ class Document:
             raise SceneError(
                 f"{source}:{line}: not valid TOML", got=str(cause) or "brackets nested too deeply"
             ) from cause
-        _check_depth(self.data, source)
+        if depth(self.data) > SCENE_DEPTH:
+            raise SceneError(f"{source}: nested too deeply", expected=f"at most {SCENE_DEPTH} levels")
         self._lines = _lines_of_keys(text)
 
     def place(self, key: Key) -> str:
@@ -96,17 +98,6 @@ def _check_keys(text: str, source: str) -> None:
         if parts > KEY_PARTS:
             line = text.count("\n", 0, token.start()) + 1
             raise SceneError(f"{source}:{line}: a key of too many parts", expected=f"at most {KEY_PARTS}")
-
-
-def _check_depth(data: object, source: str) -> None:
-    """Check how deeply tables and lists lie inside each other, which validation follows by recursion."""
-    level = [data]
-    for _ in range(SCENE_DEPTH):
-        inner = [list(value.values()) if isinstance(value, dict) else value for value in level]
-        level = [part for values in inner for part in values if isinstance(part, dict | list)]
-        if not level:
-            return
-    raise SceneError(f"{source}: nested too deeply", expected=f"at most {SCENE_DEPTH} levels")
 
 
 def _split(name: str) -> Key:
