@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.states import States
+from forcegp.forces.quantities import States
 from forcegp.models.base import ForceField, Model
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.forces.states import States
+from forcegp.forces.quantities import States
 from forcegp.rollout.inputs import Inputs, Reached
 from forcegp.rollout.law import Law
 
