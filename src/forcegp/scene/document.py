@@ -14,19 +14,13 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from forcegp.errors import ForceGPError, SceneError
+from forcegp.files import depth
+from forcegp.limits import KEY_PARTS, SCENE_BYTES, SCENE_DEPTH, SCENE_KEYS
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
-
-MAX_BYTES = 1 << 20
-"""A scene is a page of text; a larger file is something else."""
-
-MAX_LINE = 4000
-"""Longest line [characters]; parsing a dotted key takes time that is quadratic in its length."""
-MAX_DEPTH = 32
-"""Deepest nesting of tables and arrays."""
 
 Key = tuple[str | int, ...]
 Schema = TypeVar("Schema", bound=BaseModel)
@@ -38,6 +32,8 @@ _DOTTED = rf"{_NAME}(?:\s*\.\s*{_NAME})*"
 _ARRAY = re.compile(rf"^\s*\[\[\s*({_DOTTED})\s*\]\]")
 _TABLE = re.compile(rf"^\s*\[\s*({_DOTTED})\s*\]")
 _KEY = re.compile(rf"^\s*({_DOTTED})\s*=")
+_BRACKET = re.compile(r"^[ \t]*\[", re.MULTILINE)
+_TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
 
 
 class Document:
@@ -53,26 +49,26 @@ class Document:
 
     def __init__(self, content: bytes, source: str) -> None:
         self.source = source
-        if len(content) > MAX_BYTES:
-            raise SceneError(f"{source}: too large", expected=f"at most {MAX_BYTES} bytes", got=len(content))
+        if len(content) > SCENE_BYTES:
+            raise SceneError(
+                f"{source}: too large", expected=f"at most {SCENE_BYTES} bytes", got=len(content)
+            )
         try:
             text = content.decode("utf-8")
         except UnicodeDecodeError as cause:
             line = content[: cause.start].count(b"\n") + 1
             raise SceneError(f"{source}:{line}: not UTF-8 text", got=str(cause)) from cause
-        for number, row in enumerate(text.splitlines(), start=1):
-            if len(row) > MAX_LINE:
-                where = f"{source}:{number}: the line is too long"
-                raise SceneError(where, expected=f"at most {MAX_LINE} characters", got=len(row))
+        _check_keys(text, source)
         try:
             self.data: dict[str, Any] = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, RecursionError) as cause:
+        except (ValueError, RecursionError) as cause:
             found = re.search(r"line (\d+)", str(cause))
             line = int(found[1]) if found else text.count("\n") + 1
             raise SceneError(
                 f"{source}:{line}: not valid TOML", got=str(cause) or "brackets nested too deeply"
             ) from cause
-        _check_depth(self.data, source)
+        if depth(self.data) > SCENE_DEPTH:
+            raise SceneError(f"{source}: nested too deeply", expected=f"at most {SCENE_DEPTH} levels")
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
@@ -151,17 +147,23 @@ class Document:
         return key if name is None else (*key, name)
 
 
-def _check_depth(data: dict[str, Any], source: str) -> None:
-    level: list[Any] = [data]
-    for _ in range(MAX_DEPTH):
-        level = [
-            value
-            for table in level
-            for value in (table.values() if isinstance(table, dict) else table)
-            if isinstance(value, dict | list)
-        ]
-    if level:
-        raise SceneError(f"{source}: nested too deeply", expected=f"at most {MAX_DEPTH} levels", got="more")
+def _check_keys(text: str, source: str) -> None:
+    """Check the number of keys and of the parts of each: a parser takes quadratic time for either."""
+    keys = text.count("=") + len(_BRACKET.findall(text))
+    if keys > SCENE_KEYS:
+        raise SceneError(f"{source}: too many keys and tables", expected=f"at most {SCENE_KEYS}", got=keys)
+    parts, joined = 0, False
+    for token in _TOKEN.finditer(text):
+        name, dot, other = token.groups()
+        if name:
+            parts, joined = (parts + 1 if joined else 1), False
+        elif dot:
+            joined = True
+        elif other:
+            parts, joined = 0, False
+        if parts > KEY_PARTS:
+            line = text.count("\n", 0, token.start()) + 1
+            raise SceneError(f"{source}:{line}: a key of too many parts", expected=f"at most {KEY_PARTS}")
 
 
 def _one_of(names: list[str]) -> str:
