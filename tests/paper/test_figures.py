@@ -1,4 +1,4 @@
-"""Figures hold the data they are given, and leave the plotting library's settings alone."""
+"""Plots show the data they are given and leave the plotting library's settings alone."""
 
 from __future__ import annotations
 
@@ -8,40 +8,38 @@ from xml.etree import ElementTree
 import matplotlib
 import pytest
 
-from forcegp.report.covariance import draw_force_prior, draw_operators, draw_structured
-from forcegp.report.curves import draw_identification, draw_learning_curve, draw_residual
-from forcegp.report.data import SPLITS, paper_numbers
-from forcegp.report.motion import draw_constraint, draw_multiplier, draw_path, draw_task_space
-from forcegp.report.predictions import common_limit, draw_errors, draw_predictions
+from forcegp.paper.covariance import covariance_block
+from forcegp.paper.identification import identification_block
+from forcegp.paper.learning import learning_block
+from forcegp.paper.multiplier import multiplier_block
+from forcegp.paper.results import paper_numbers
+from forcegp.paper.task_space import task_space_block
 from forcegp.report.rollouts import rollout_pictures
-from forcegp.report.style import COLOURS, LABELS, Picture, colour
+from forcegp.report.style import COLOURS, INK, KINDS, LABELS, OTHER, Picture, colour, label
+from forcegp.report.window import common_limit, draw_errors, draw_predictions
 from report_samples import MODELS, figures, identification, multiplier, results, rollouts, window
-
-KINDS = ("noisy", "clean")
 
 
 def all_pictures() -> list[Picture]:
-    """Every figure there is."""
+    """Every plot there is."""
     data, paper = figures(), paper_numbers()
+    blocks = (
+        covariance_block(data.covariance),
+        multiplier_block(multiplier()),
+        task_space_block(data.task_space),
+        learning_block(results(), paper),
+        identification_block(identification()),
+    )
     return [
-        draw_operators(data.covariance),
-        draw_force_prior(data.covariance),
-        draw_structured(data.covariance),
-        draw_constraint(multiplier()),
-        draw_multiplier(multiplier(), multiplier().bands[0]),
-        draw_task_space(data.task_space),
-        draw_path(data.task_space),
+        *(picture for block in blocks for picture in block.pictures),
         draw_predictions(window()),
         draw_errors(window(), limit=0.5),
         draw_errors(window("nn", std=False, clean=False)),
-        *(draw_learning_curve(results(), paper, split, kind) for split in SPLITS for kind in KINDS),
-        draw_residual(results(), paper, "stretches"),
-        *draw_identification(identification()),
         *rollout_pictures(rollouts()),
-    ]  # fmt: skip
+    ]
 
 
-def test_every_figure_is_well_formed_and_described_and_refers_to_nothing_outside() -> None:
+def test_every_plot_is_well_formed_and_described_and_refers_to_nothing_outside() -> None:
     for picture in all_pictures():
         root = ElementTree.fromstring(picture.svg)
         assert root.tag.endswith("svg")
@@ -56,7 +54,7 @@ def test_drawing_changes_no_settings_and_needs_no_display() -> None:
     assert dict(matplotlib.rcParams) == before
 
 
-def test_the_same_data_give_the_same_figure() -> None:
+def test_the_same_data_give_the_same_plot() -> None:
     assert draw_errors(window()).svg == draw_errors(window()).svg
     assert draw_errors(window()).svg != draw_errors(window("gp")).svg
 
@@ -84,3 +82,9 @@ def test_every_model_has_a_name_and_a_colour_that_stands_out_from_white(model: s
     assert model in LABELS and colour(model) == COLOURS[model]
     # Graphical objects need a contrast of 3 to 1 (WCAG 2.1, 1.4.11); the network's ochre is the faintest.
     assert 1.05 / (luminance(COLOURS[model]) + 0.05) >= 2.7
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_models_from_files_are_drawn_in_a_colour_other_than_that_of_measurements(kind: str) -> None:
+    assert (colour(kind) != INK and label(kind) == KINDS[kind]) or kind in COLOURS
+    assert luminance(OTHER) > 2.0 * luminance(INK)
