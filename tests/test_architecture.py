@@ -26,6 +26,7 @@ LAYERS = (
     ("control",),
     ("simulate",),
     ("scene",),
+    ("logs",),
     ("rollout", "models"),
     ("evaluation",),
     ("report",),
