@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,8 @@ import torch
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import DataHeader, Dataset
 from forcegp.errors import DataError
-from forcegp.logs import clock, smoothing
+from forcegp.logs import clock, smoothing, wrench
+from forcegp.logs.contact import Evidence, detect
 from forcegp.logs.defaults import default_mapping
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, load_mapping
@@ -29,10 +30,12 @@ class Imported:
     Attributes:
         data: the data set.
         report: what was found and done.
+        contacts: the evidence for each contact that was detected.
     """
 
     data: Dataset
     report: Report
+    contacts: tuple[Evidence, ...] = ()
 
 
 def read_log(
@@ -95,17 +98,18 @@ def import_log(
     robot = system.robot
     known = mapping if isinstance(mapping, Mapping) else None
     if known is None:
-        known = load_mapping(mapping) if mapping is not None else default_mapping(path, robot)
+        known = load_mapping(mapping) if mapping is not None else default_mapping(path, system)
     report = Report(str(path))
     report.did(f"read {Path(path).name} by mapping {Path(known.source).name}")
     try:
         signals = gather(path, known, robot.joint_names, report, progress)
         smoothing.even_clock(signals, known.sections.time.period, report)
+        found = _contacts(signals, system, known, report)
         std = smoothing.complete(signals, known.sections.derivatives, report)
-        data = _dataset(signals, std, known, robot, report)
+        data = _dataset(signals, std, known, system, report)
     except DataError as error:
         raise error if str(path) in error.message else DataError.at(str(path), error) from None
-    return Imported(data, report)
+    return Imported(data, report, tuple(found))
 
 
 def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> ConstrainedSystem:
@@ -117,15 +121,45 @@ def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> Con
     return (scene if isinstance(scene, Scene) else load_scene(scene)).system()
 
 
+def _contacts(
+    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: Report
+) -> list[Evidence]:
+    """Find the state of each contact; λ needs accelerations, which are first computed across the switches."""
+    if not any(section.source == "multiplier" for section in mapping.sections.contact.values()):
+        return detect(signals, system, mapping, report)
+    trial = replace(
+        signals, vectors={name: value.copy() for name, value in signals.vectors.items()}, contact={}
+    )
+    smoothing.complete(trial, mapping.sections.derivatives, Report(report.source))
+    if len(trial) != len(signals):
+        signals.keep(np.isin(signals.row, trial.row))
+        signals.segment = trial.segment
+    trial.contact = signals.contact
+    found = detect(trial, system, mapping, report)
+    signals.contact = trial.contact
+    return found
+
+
 def _dataset(
-    signals: Signals, std: np.ndarray | None, mapping: Mapping, robot: RobotModel, report: Report
+    signals: Signals, std: np.ndarray | None, mapping: Mapping, system: ConstrainedSystem, report: Report
 ) -> Dataset:
     """The data set of finished signals."""
+    robot = system.robot
     settings = mapping.sections.derivatives
     dt = clock.usual_step(signals.t)
     margin = settings.impact_margin if settings.impact_margin is not None else 0.5 * settings.window * dt
     extras = {} if std is None else {"qdd_std": _tensor(std)}
     masks = smoothing.impact_mask(signals, margin)
+    contact = {name: torch.from_numpy(value) for name, value in signals.contact.items()}
+    impact = {name: torch.from_numpy(value.astype(np.float64)) for name, value in masks.items()}
+    contact_extras = {"impact": impact} if impact else {}
+    if "wrench" in signals.vectors and contact:
+        sensed = wrench.per_contact(signals, system, mapping)
+        contact_extras |= {
+            name: {key: _tensor(value) for key, value in group.items()} for name, group in sensed.items()
+        }
+        report.did("took the tool's weight off the wrench and carried it to the contact")
+    vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
     header = DataHeader(
         dt=dt,
         noise_std=None if std is None else float(np.sqrt(np.mean(std**2))),
@@ -135,16 +169,13 @@ def _dataset(
         joint_names=robot.joint_names,
         contact_names=tuple(signals.contact),
     )
-    contact = {name: torch.from_numpy(value) for name, value in signals.contact.items()}
-    impact = {name: torch.from_numpy(value.astype(np.float64)) for name, value in masks.items()}
-    vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
     return Dataset(
         t=_tensor(signals.t),
         **vectors,
         joint_names=robot.joint_names,
         contact=contact,
         extras=extras,
-        contact_extras={"impact": impact} if impact else {},
+        contact_extras=contact_extras,
         segment=torch.from_numpy(signals.segment),
         header=header,
     )

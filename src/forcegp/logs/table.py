@@ -81,6 +81,34 @@ class LogTable:
         return holding[0]
 
 
+class Growing:
+    """A column that is read piece by piece, in one place, so that memory holds it once.
+
+    Args:
+        expected: how many numbers are expected; more are possible.
+    """
+
+    def __init__(self, expected: int) -> None:
+        self._values = np.empty(max(1024, min(expected, limits.MAX_VALUES)))
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, values: Column) -> None:
+        """Add numbers at the end."""
+        end = self._count + len(values)
+        if end > len(self._values):
+            self._values.resize(end + end // 4, refcheck=False)
+        self._values[self._count : end] = values
+        self._count = end
+
+    def array(self, most: int | None = None) -> Column:
+        """The column, cut to `most` numbers; nothing can be added afterwards."""
+        self._values.resize(self._count if most is None else min(most, self._count), refcheck=False)
+        return self._values
+
+
 def missing(source: str, kind: str, name: str, known: list[str]) -> DataError:
     """The error for a stream or column that a log does not hold."""
     near = get_close_matches(name, known, n=1, cutoff=0.5)

@@ -11,7 +11,7 @@ import numpy as np
 
 from forcegp.logs import limits
 from forcegp.logs.readers.sniff import MISSING, Dialect, sniff
-from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, foreign
+from forcegp.logs.table import Column, Growing, LogTable, Progress, Stream, Wanted, foreign
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -36,24 +36,27 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
         f"column {name!r} holds {kinds[name]} and was left out" for name in chosen if kinds[name] == "text"
     ]
     chosen = [name for name in chosen if kinds[name] not in ("text", "empty")]
-    chunks: dict[str, list[Column]] = {name: [] for name in chosen}
-    read_rows = 0
+    columns = {name: Growing(_rows_expected(path)) for name in chosen}
     with foreign(str(path), "a table of text"), path.open("rb") as file:
         for batch in _batches(path, file, dialect, chosen, kinds, progress) if chosen else ():
-            limits.check_values(str(path), read_rows + len(batch), len(chosen))
+            read_rows = len(columns[chosen[0]]) + len(batch)
+            limits.check_values(str(path), read_rows, len(chosen))
             for name in chosen:
-                chunks[name].append(_numbers(batch.column(name), kinds[name]))
-            read_rows += len(batch)
+                columns[name].append(_numbers(batch.column(name), kinds[name]))
             if rows is not None and read_rows >= rows:
                 break
-    columns: dict[str, Column] = {}
-    for name in chosen:
-        joined = np.concatenate(chunks.pop(name))
-        columns[name] = joined[:rows] if rows is not None else joined
+    values = {name: columns.pop(name).array(rows) for name in chosen}
     if dialect.encoding == "cp1252":
         remarks.append("the file is not UTF-8 and was read as Windows-1252")
-    units = {name: unit for name, unit in dialect.units.items() if name in columns}
-    return LogTable(str(path), "text", (Stream("", columns, units),), tuple(remarks))
+    units = {name: unit for name, unit in dialect.units.items() if name in values}
+    return LogTable(str(path), "text", (Stream("", values, units),), tuple(remarks))
+
+
+def _rows_expected(path: Path) -> int:
+    """A guess from the length of the first lines."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    return int(path.stat().st_size / max(len(head), 1) * (head.count(b"\n") + 1) * 1.05)
 
 
 def _batches(
