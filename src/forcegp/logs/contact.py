@@ -18,7 +18,7 @@ from forcegp.logs.signals import Array, Signals, runs
 MAD_TO_STD = 1.4826
 """Standard deviation over median absolute deviation of a normal distribution."""
 SEPARATION = 6.0
-"""Least distance of the two levels of force, in standard deviations of the open one, that tells them apart."""
+"""Least distance between the two levels of force, in standard deviations of the open one."""
 RELEASE_STD = 4.0
 """A contact counts as closed from where the force leaves the open level by so many of its deviations."""
 TOUCHING = 1e-3

@@ -35,7 +35,7 @@ def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
         f"{path}: the names of the columns do not say what they are",
         expected=f"t, q.{robot.joint_names[0]}, tau.{robot.joint_names[0]}, …, or a mapping",
         got=shown,
-        hint="write a mapping with `forcegp import … --guess mapping.toml`, check it, and pass it by --mapping",
+        hint="write a mapping by --guess mapping.toml, check it, and pass it by --mapping",
     )
 
 

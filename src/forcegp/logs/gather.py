@@ -25,6 +25,7 @@ def gather(
     joints: Sequence[str],
     report: Report,
     progress: Progress | None = None,
+    rows: int | None = None,
 ) -> Signals:
     """Read the mapped columns of a log onto one clock.
 
@@ -34,13 +35,14 @@ def gather(
         joints: the robot's joints.
         report: gets what was found.
         progress: called while the log is read.
+        rows: read no more rows than this, where the format allows to stop early.
 
     Raises:
         DataError: the log cannot be read, or a value or a time stamp is not usable; names the rows.
         MappingError: the mapping does not fit the robot.
     """
     needed = _needed(mapping, joints)
-    table = read(path, wanted=needed.__contains__, progress=progress)
+    table = read(path, wanted=needed.__contains__, rows=rows, progress=progress)
     report.format = table.format
     for remark in table.remarks:
         report.find("reader", remark)

@@ -127,14 +127,13 @@ def _contacts(
     """Find the state of each contact; λ needs accelerations, which are first computed across the switches."""
     if not any(section.source == "multiplier" for section in mapping.sections.contact.values()):
         return detect(signals, system, mapping, report)
-    trial = replace(
-        signals, vectors={name: value.copy() for name, value in signals.vectors.items()}, contact={}
-    )
+    copies = {name: value.copy() for name, value in signals.vectors.items()}
+    trial = replace(signals, vectors=copies, contact={}, row=np.arange(len(signals)))
     smoothing.complete(trial, mapping.sections.derivatives, Report(report.source))
-    if len(trial) != len(signals):
-        signals.keep(np.isin(signals.row, trial.row))
-        signals.segment = trial.segment
-    trial.contact = signals.contact
+    kept = np.zeros(len(signals), dtype=bool)
+    kept[trial.row] = True
+    signals.keep(kept)
+    signals.segment, trial.row, trial.contact = trial.segment, signals.row, signals.contact
     found = detect(trial, system, mapping, report)
     signals.contact = trial.contact
     return found

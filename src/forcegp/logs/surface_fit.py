@@ -166,7 +166,7 @@ def _least_squares(residual: object, start: Array) -> tuple[Array, Array, Array,
 
 
 def correlation_time(values: Array) -> float:
-    """1 + 2 Σ ρ_k over lags up to the first negative one: how many rows make one independent one (Sokal 1997).
+    """1 + 2 Σ ρ_k up to the first negative ρ_k: the rows that count as one independent row (Sokal 1997).
 
     >>> 0.8 < correlation_time(np.random.default_rng(0).standard_normal(4000)) < 1.2
     True

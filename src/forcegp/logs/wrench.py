@@ -90,7 +90,7 @@ def at_contact(
 
 
 def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
-    """The sensor's force and moment at each contact with a surface, as `F_sensor` and `M_sensor` of a data set.
+    """The sensor's force and moment at each contact with a surface, `F_sensor` and `M_sensor` of a data set.
 
     Raises:
         MappingError: the sensor's frame is none of the robot.
