@@ -6,7 +6,7 @@ torque with the inverse dynamics of the scene's robot, gravity included. What is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from forcegp.logs.mapping import Mapping, parse_mapping
 from forcegp.logs.readers import read
 from forcegp.logs.report import Report
 from forcegp.logs.signals import Array, Signals
-from forcegp.logs.table import LogTable, Progress
+from forcegp.logs.table import LogTable, Progress, Stream
 from forcegp.robot import RobotModel
 
 ROWS = 100_000
@@ -30,6 +30,10 @@ TRIED_ROWS = 3000
 """Rows on which the inverse dynamics are evaluated."""
 DEFAULT = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s2", "torque": "Nm"}
 """Units that are assumed before any is tried."""
+MOST_RADIANS, LEAST_DEGREES = 60.0, 0.02
+"""Beyond the first, positions are in degrees; below the second, a log in degrees would not move at all."""
+CLEARER = 1.5
+"""A unit is certain if the torque fits so much better than in the other one."""
 NEAR = 1.3
 """A ratio is that of a unit if it is within this factor."""
 
@@ -68,39 +72,49 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
     stream = headings.find_time(table, draft)
     headings.find_families(stream, system.robot, draft)
     headings.find_wrench(table, system.robot, draft)
-    _position_unit(draft, stream.columns, system.robot)
-    _try(path, draft, system)
+    _try(path, draft, system, _possible_units(draft, stream))
     _contacts(table, draft, system)
     return Guess(draft.toml(), tuple(draft.doubts))
 
 
-def _position_unit(draft: Draft, columns: object, robot: RobotModel) -> None:
-    """Radians or degrees, from the range of the positions and the joint limits."""
+def _possible_units(draft: Draft, stream: Stream) -> list[str]:
+    """Units that the range of the positions allows."""
     family = draft.families["position"]
-    if family.declared:
-        return
-    reach = max(float(np.nanmax(np.abs(columns[c]))) for c in family.columns.values())  # pyright: ignore[reportIndexIssue]
-    most = float(torch.maximum(robot.upper.abs(), robot.lower.abs()).max())
-    widest = max(2.0 * np.pi, most) if np.isfinite(most) else 4.0 * np.pi
-    family.unit = "rad" if reach <= 1.05 * widest else "deg"
-    sure = reach > 1.05 * widest or reach > 0.5
-    draft.say("position", f"values up to {reach:.4g} were taken for {family.unit}", doubt=not sure)
+    if family.declared and family.unit is not None:
+        return [family.unit]
+    reach = max(float(np.nanmax(np.abs(stream.columns[c]))) for c in family.columns.values())
+    draft.say("position", f"values up to {reach:.4g}")
+    return ["deg"] if reach > MOST_RADIANS else ["rad"] if reach < LEAST_DEGREES else ["rad", "deg"]
 
 
-def _try(path: str | Path, draft: Draft, system: ConstrainedSystem) -> None:
-    """Read the log by the draft, and settle what the values can: units of velocity, sign of torque."""
+def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:
+    """Read the log by the draft, and settle what its values can: units, and the sign of the torque."""
     for quantity, family in draft.families.items():
         family.unit = family.unit or DEFAULT[quantity]
-    trial = _signals(path, draft, system)
+    fits = {}
+    for unit in possible:
+        draft.families["position"].unit = unit
+        _, correlation = torque_slopes(_signals(path, draft, system, without="velocity"), system.robot)
+        fits[unit] = float((correlation**2).mean())
+    best = max(fits, key=fits.__getitem__)
+    draft.families["position"].unit = best
+    if len(fits) > 1:
+        listing = ", ".join(f"{fit:.2f} in {unit}" for unit, fit in fits.items())
+        doubt = fits[best] < CLEARER * min(fits.values())
+        draft.say("position", f"mean squared correlation of the torque with the model: {listing}", doubt)
     if "velocity" in draft.families:
-        _velocity_unit(draft, trial)
-        trial = _signals(path, draft, system)
-    _torque(draft, trial, system.robot)
+        _velocity_unit(draft, _signals(path, draft, system))
+    _torque(draft, _signals(path, draft, system), system.robot)
 
 
-def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem) -> Signals:
-    """The log by the draft, with accelerations; incomplete rows left out."""
-    toml = draft.toml().replace("[time]\n", '[time]\nmissing = "drop"\n', 1)
+def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
+    """The log by the draft, `without` one quantity, with accelerations; incomplete rows left out."""
+    families = {name: family for name, family in draft.families.items() if name != without}
+    toml = (
+        replace(draft, families=families, contacts={})
+        .toml()
+        .replace("[time]\n", '[time]\nmissing = "drop"\n', 1)
+    )
     mapping = parse_mapping(toml.encode(), "proposed mapping")
     signals = gather(path, mapping, system.robot.joint_names, Report(str(path)), rows=ROWS)
     smoothing.even_clock(signals, None, Report(str(path)))

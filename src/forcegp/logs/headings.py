@@ -193,6 +193,8 @@ def _match_joints(robot: RobotModel, draft: Draft) -> None:
         draft.joints = dict(zip(robot.joint_names, ordered, strict=True))
     else:
         likeness = np.array([[_likeness(j, name) for name in names] for j in robot.joint_names])
+        # Among names that are equally alike, the order of the log decides; the user confirms it.
+        likeness += 0.3 * np.eye(len(names))
         rows, columns = linear_sum_assignment(-likeness)
         draft.joints = {robot.joint_names[i]: names[k] for i, k in zip(rows, columns, strict=True)}
         draft.say("joints", "the names were matched by their likeness", doubt=True)

@@ -70,6 +70,7 @@ class Collector:
     source: str
     _rows: dict[tuple[str, str, tuple[str, ...]], list[list[float]]] = field(default_factory=dict)
     _stamps: dict[tuple[str, str, tuple[str, ...]], list[tuple[int, int]]] = field(default_factory=dict)
+    _orders: dict[tuple[str, tuple[str, ...]], tuple[str, ...]] = field(default_factory=dict)
     _numbers: int = 0
     _messages: int = 0
 
@@ -82,7 +83,12 @@ class Collector:
         limits.check_count(self.source, "bytes in one message", len(raw), limits.MAX_MESSAGE_BYTES)
         message = decode(raw)
         names, values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
-        key = (topic, kind, names)
+        # One stream for a set of joints, in the order of its first message, whatever the order of the others.
+        self._orders.setdefault((topic, tuple(sorted(names))), names)
+        order = self._orders[topic, tuple(sorted(names))]
+        if order != names:
+            values = _reordered(values, names, order)
+        key = (topic, kind, order)
         stamp = message.header.stamp
         self._rows.setdefault(key, []).append(values)
         self._stamps.setdefault(key, []).append((stamp.sec * 10**9 + stamp.nanosec, receive_ns))
@@ -156,9 +162,8 @@ def _units(kind: str, count: int) -> list[str]:
 
 
 def _joint_state(source: str, topic: str, message: Any) -> tuple[tuple[str, ...], list[float]]:
-    """Joint names in alphabetical order, and position, velocity and effort in that order; NaN where empty."""
+    """Joint names, and position, velocity and effort in their order; NaN where a quantity is empty."""
     names = tuple(str(name)[: limits.MAX_NAME] for name in message.name)
-    order = sorted(range(len(names)), key=names.__getitem__)
     if not names or len(set(names)) < len(names):
         raise DataError(f"{source}: a joint state on {topic} has no joint names, or one twice", got=names[:8])
     values: list[float] = []
@@ -169,8 +174,14 @@ def _joint_state(source: str, topic: str, message: Any) -> tuple[tuple[str, ...]
                 f"{source}: a joint state on {topic} has {len(numbers)} values of {quantity}",
                 expected=f"one for each of its {len(names)} joints, or none",
             )
-        values += [float(numbers[i]) for i in order] if len(numbers) else [np.nan] * len(names)
-    return tuple(names[i] for i in order), values
+        values += [float(x) for x in numbers] if len(numbers) else [np.nan] * len(names)
+    return names, values
+
+
+def _reordered(values: list[float], names: tuple[str, ...], order: tuple[str, ...]) -> list[float]:
+    """Values of a joint state whose message names the joints in another order."""
+    index = [names.index(name) for name in order]
+    return [values[block * len(names) + i] for block in range(len(QUANTITIES)) for i in index]
 
 
 def _wrench(message: Any) -> tuple[tuple[str, ...], list[float]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
     return LogTable(str(path), "numpy", streams, tuple(remarks))
 
 
-def _array(source: str, name: str, file: IO[bytes], size: int) -> dict[str, NDArray[np.generic]]:
+def _array(source: str, name: str, file: Any, size: int) -> dict[str, NDArray[np.generic]]:
     """An array by name, the fields of a structured one each; what its header claims is checked first."""
     version = np.lib.format.read_magic(file)  # pyright: ignore[reportArgumentType]
     read_header = {
