@@ -96,9 +96,10 @@ def import_log(
     """
     system = system_of(scene)
     robot = system.robot
-    known = mapping if isinstance(mapping, Mapping) else None
-    if known is None:
-        known = load_mapping(mapping) if mapping is not None else default_mapping(path, system)
+    if mapping is None:
+        known = default_mapping(path, system)
+    else:
+        known = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
     report = Report(str(path))
     report.did(f"read {Path(path).name} by mapping {Path(known.source).name}")
     try:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, Plane, Sphere, SurfaceContact
@@ -20,6 +21,8 @@ MOST_POINTS = 20_000
 """Points that are fitted; of a longer path, every k-th."""
 LEAST_POINTS = 20
 """Points that a fit needs."""
+ROUNDING = 1e-9
+"""Smallest scale of the residuals [m], so that an exact path has one."""
 LARGEST_TILT = 0.2
 """Standard deviation of the tilt [rad] beyond which the path does not determine a plane."""
 
@@ -152,16 +155,19 @@ def _sphere(contact: str, points: Array, towards: Array) -> SurfaceFit:
     return SurfaceFit(contact, sphere, std, _spread(residuals), len(points), effective)
 
 
-def _least_squares(residual: object, start: Array) -> tuple[Array, Array, Array, float]:
+def _least_squares(residual: Callable[[Array], Array], start: Array) -> tuple[Array, Array, Array, float]:
     """Solution, covariance, residuals and number of independent ones."""
-    function = residual
-    scale = max(_spread(function(start)), 1e-9)  # pyright: ignore[reportCallIssue]
-    for _ in range(2):  # the scale of the residuals is known only once the outliers are
-        found = least_squares(function, start, loss="soft_l1", f_scale=3.0 * scale, x_scale="jac")  # pyright: ignore[reportArgumentType,reportCallIssue]
-        residuals = function(found.x)  # pyright: ignore[reportCallIssue]
-        scale, start = max(_spread(residuals), 1e-9), found.x
+
+    def solve(x: Array) -> OptimizeResult:
+        scale = max(_spread(residual(x)), ROUNDING)
+        return least_squares(residual, x, loss="soft_l1", f_scale=3.0 * scale, x_scale="jac")
+
+    # The scale of the residuals is known only once the first fit has told the outliers from the rest.
+    found = solve(solve(start).x)
+    residuals = residual(found.x)
     effective = len(residuals) / correlation_time(residuals)
     information = found.jac.T @ found.jac * (effective / len(residuals))
+    scale = max(_spread(residuals), ROUNDING)
     return found.x, scale**2 * np.linalg.pinv(information, hermitian=True), residuals, effective
 
 

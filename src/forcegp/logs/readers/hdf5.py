@@ -37,7 +37,7 @@ def _read(path: Path, format_: str, separator: str) -> LogTable:
     remarks: list[str] = []
     arrays: Arrays = {}
     with foreign(str(path), "HDF5"), h5py.File(path, "r") as file:
-        seen: set[Any] = set()
+        seen: set[Any] = {h5py.h5o.get_info(file.id).addr}
         _walk(h5py, file, "", separator, arrays, remarks, seen)
     if format_ == "matlab":
         arrays = {name: array.T for name, array in arrays.items()}

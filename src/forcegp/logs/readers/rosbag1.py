@@ -41,7 +41,7 @@ def read_bag(
         used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
         decoders = {c.msgtype: decoder(canonical(c.msgtype), encoding) for c in used}
         total = sum(c.msgcount for c in used)
-        for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else ()):
+        for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else []):
             kind = canonical(connection.msgtype)
             collector.add(connection.topic, kind, stamp, raw, decoders[connection.msgtype])
             if progress is not None and done % 1024 == 0:
