@@ -28,6 +28,9 @@ HEADER_KEY = b"forcegp"
 COPIES = 4
 """A table is in memory as the reader's columns, as arrays, side by side, and as tensors."""
 
+GROUP_ROWS = 1 << 18
+"""Rows that are written at a time, so that memory holds one copy of a long log and not two."""
+
 
 class IgnoredColumnsWarning(UserWarning):
     """Columns of a log that are not of a name this library knows were left out."""
@@ -42,10 +45,13 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = pa.table({name: pa.array(values) for name, values in columns.items()})
-    table = table.replace_schema_metadata({HEADER_KEY: header.to_json().encode()})
-    with atomic_file(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd")
+    schema = pa.schema({name: pa.from_numpy_dtype(values.dtype) for name, values in columns.items()})
+    schema = schema.with_metadata({HEADER_KEY: header.to_json().encode()})
+    rows = max(map(len, columns.values()), default=0)
+    with atomic_file(path) as temporary, pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+        for start in range(0, rows, GROUP_ROWS):
+            group = {name: pa.array(values[start : start + GROUP_ROWS]) for name, values in columns.items()}
+            writer.write_table(pa.table(group, schema=schema))
 
 
 def read_table(path: str | Path) -> tuple[Columns, DataHeader]:
