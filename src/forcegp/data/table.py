@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +45,14 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
         pq.write_table(table, temporary, compression="zstd")
 
 
-def read_table(path: str | Path) -> tuple[Columns, DataHeader]:
+def read_table(
+    path: str | Path, *, missing: Literal["refuse", "nan"] = "refuse"
+) -> tuple[Columns, DataHeader]:
     """Read the numeric columns of a Parquet or CSV file, and its header (defaults where it has none).
+
+    Args:
+        path: the file.
+        missing: whether an empty value is an error or becomes a NaN.
 
     Raises:
         DataError: no such file, a kind of file that is not read, or one that is damaged or too large.
@@ -60,7 +66,7 @@ def read_table(path: str | Path) -> tuple[Columns, DataHeader]:
             f"{file}: not a kind of data file that is read", expected=" or ".join(readers), got=file.suffix
         )
     table, header = readers[file.suffix.lower()](file)
-    return {name: _numeric(file, name, table.column(name)) for name in _usable(file, table)}, header
+    return {name: _numeric(file, name, table.column(name), missing) for name in _usable(file, table)}, header
 
 
 def _files_beside(file: Path) -> str | None:
@@ -150,8 +156,8 @@ def _usable(file: Path, table: pa.Table) -> list[str]:
     return numeric
 
 
-def _numeric(file: Path, name: str, column: pa.ChunkedArray) -> NDArray[np.generic]:
-    if column.null_count:
+def _numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
+    if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(
             f"{file}: column {name!r} has {column.null_count} missing values, the first in row {row}",
