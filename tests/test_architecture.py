@@ -38,7 +38,7 @@ LAYERS = (
     ("control",),
     ("simulate",),
     ("scene",),
-    ("logs",),
+    ("logs", "checks"),
     ("rollout",),
     ("models",),
     ("evaluation",),

@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +54,14 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
             writer.write_table(pa.table(group, schema=schema))
 
 
-def read_table(path: str | Path) -> tuple[Columns, DataHeader]:
+def read_table(
+    path: str | Path, *, missing: Literal["refuse", "nan"] = "refuse"
+) -> tuple[Columns, DataHeader]:
     """Read the numeric columns of a Parquet or CSV file, and its header (defaults where it has none).
+
+    Args:
+        path: the file.
+        missing: whether an empty value is an error or becomes a NaN.
 
     Raises:
         DataError: no such file, a kind of file that is not read, or one that is damaged or too large.
@@ -70,7 +76,7 @@ def read_table(path: str | Path) -> tuple[Columns, DataHeader]:
         )
     table, header = readers[file.suffix.lower()](file)
     pairs = zip(table.column_names, table.columns, strict=True)
-    return {name: _numeric(file, name, column) for name, column in pairs}, header
+    return {name: _numeric(file, name, column, missing) for name, column in pairs}, header
 
 
 def _files_beside(file: Path) -> str | None:
@@ -201,8 +207,8 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
     return numeric
 
 
-def _numeric(file: Path, name: str, column: pa.ChunkedArray) -> NDArray[np.generic]:
-    if column.null_count:
+def _numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
+    if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(
             f"{file}: column {name!r} has {column.null_count} missing values, the first in row {row}",
