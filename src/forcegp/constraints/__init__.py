@@ -3,6 +3,7 @@
 from forcegp.constraints.baumgarte import Baumgarte
 from forcegp.constraints.contact import Constraint, PointConnection, SurfaceContact
 from forcegp.constraints.gauss import Equations
+from forcegp.constraints.linearization import Linearization
 from forcegp.constraints.surface import Cylinder, ImplicitSurface, Plane, Sphere, Surface, SurfaceSchema
 from forcegp.constraints.system import ConstrainedSystem
 
@@ -13,6 +14,7 @@ __all__ = [
     "Cylinder",
     "Equations",
     "ImplicitSurface",
+    "Linearization",
     "Plane",
     "PointConnection",
     "Sphere",

@@ -1,24 +1,25 @@
-"""What makes a data set valid, and the messages for what does not."""
+"""Whether a data set is valid, and what to say if it is not."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
-from dataclasses import fields
 from difflib import get_close_matches
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from forcegp.data.columns import JOINT_VECTORS, component_names
+from forcegp.data.fields import JOINT_VECTORS, Fields, component_names
 from forcegp.data.header import DataHeader
 from forcegp.errors import DataError
-
-if TYPE_CHECKING:
-    from forcegp.data.dataset import Dataset
+from forcegp.robot.model import RobotModel
 
 
-def _named_columns(data: Dataset) -> list[tuple[str, Tensor]]:
+class RobotMismatchWarning(UserWarning):
+    """The data were logged on a robot whose parameters differ from those of the robot they are used with."""
+
+
+def _named_columns(data: Fields) -> list[tuple[str, Tensor]]:
     """Every floating-point column of the data set but time, by its name on disk, vectors whole."""
     pairs = [(name, getattr(data, name)) for name in JOINT_VECTORS] + list(data.extras.items())
     for name, group in data.contact_extras.items():
@@ -26,7 +27,7 @@ def _named_columns(data: Dataset) -> list[tuple[str, Tensor]]:
     return pairs
 
 
-def check_layout(data: Dataset) -> None:
+def check_layout(data: Fields) -> None:
     """Check shapes, types and device of the columns, and the names of joints and contacts."""
     n, nq = len(data.t) if data.t.ndim == 1 else -1, len(data.joint_names)
     if n < 0:
@@ -61,9 +62,9 @@ def check_layout(data: Dataset) -> None:
         raise DataError("column 'segment' has the wrong type", expected="int64", got=data.segment.dtype)
 
 
-def _check_names(data: Dataset) -> None:
+def _check_names(data: Fields) -> None:
     """Extras must not hide a field, nor each other, and a dot in their name would cut it on disk."""
-    taken = {field.name for field in fields(data)}
+    taken = set(vars(data))
     for name in (*data.extras, *data.contact_extras):
         if name in taken or "." in name or not name:
             raise DataError(
@@ -92,7 +93,7 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
         )
 
 
-def check_values(data: Dataset) -> None:
+def check_values(data: Fields) -> None:
     """Check that every number is finite, and that time increases within each segment."""
     for name, value in (("t", data.t), *_named_columns(data)):
         if not bool(torch.isfinite(value).all()):
@@ -101,7 +102,7 @@ def check_values(data: Dataset) -> None:
         check_time(data)
 
 
-def _report_not_finite(data: Dataset, name: str, value: Tensor) -> None:
+def _report_not_finite(data: Fields, name: str, value: Tensor) -> None:
     place = torch.nonzero(~torch.isfinite(value))[0].tolist()
     count = int((~torch.isfinite(value)).sum())
     column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]
@@ -113,7 +114,7 @@ def _report_not_finite(data: Dataset, name: str, value: Tensor) -> None:
     )
 
 
-def check_time(data: Dataset) -> None:
+def check_time(data: Fields) -> None:
     """Check that rows of a segment are together, and that time increases strictly within each.
 
     Raises:
@@ -128,7 +129,8 @@ def check_time(data: Dataset) -> None:
             f"column 't' does not increase in row {row}",
             expected=f"more than {t[row - 1].item():.9g} s",
             got=f"{t[row].item():.9g} s",
-            hint="sort the log by time, or number its trajectories in a column 'segment'",
+            hint="sort the log by time, or number its trajectories in a column 'segment'; select points with "
+            "data[rows], or pass header=DataHeader(ordered=False) if the rows are points in any order",
         )
     runs = segment[torch.cat([same.new_ones(min(len(segment), 1)), ~same])]
     if len(runs.unique()) < len(runs):
@@ -146,11 +148,16 @@ def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
         DataError: a mask of another length, or an index that does not exist.
     """
     if isinstance(rows, slice):
-        return torch.arange(n, device=device)[rows]
-    index = torch.as_tensor(rows, device=device)
+        return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
+    try:
+        index = torch.as_tensor(rows, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DataError(
+            "rows are selected by a slice, a mask or a list of row numbers", got=repr(rows)[:80]
+        ) from error
     if index.ndim != 1 or (index.is_floating_point() and len(index)):
         raise DataError(
-            "rows are chosen by a slice, a mask or a list of row numbers",
+            "rows are selected by a slice, a mask or a list of row numbers",
             got=f"a tensor of shape {tuple(index.shape)} and type {index.dtype}",
         )
     if index.dtype == torch.bool:
@@ -184,12 +191,25 @@ def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
     )
 
 
-def check_alike(parts: Sequence[Dataset]) -> None:
+def check_robot(data: Fields, robot: RobotModel) -> None:
+    """Check that a log is of a robot's joints, in its order; other parameters of the robot are a warning."""
+    check_joints(data.joint_names, robot.joint_names, robot.name)
+    logged = data.header.robot_fingerprint
+    if logged is not None and logged != robot.fingerprint:
+        warnings.warn(
+            f"the data were logged on robot {data.header.robot!r} (fingerprint {logged}) and are used with "
+            f"{robot.name!r} ({robot.fingerprint}): inertia, kinematics, base or gravity differ",
+            RobotMismatchWarning,
+            stacklevel=3,
+        )
+
+
+def check_alike(parts: Sequence[Fields]) -> None:
     """Check that data sets hold the same columns, so that they can be put one after another."""
     if not parts:
-        raise DataError("there is nothing to concatenate", expected="one or more data sets")
+        raise DataError("no data sets to concatenate", expected="one or more data sets")
 
-    def layout(data: Dataset) -> dict[str, object]:
+    def layout(data: Fields) -> dict[str, object]:
         return {
             "joints": data.joint_names,
             "contacts": tuple(data.contact),
@@ -210,7 +230,7 @@ def check_alike(parts: Sequence[Dataset]) -> None:
 
 
 def common_header(headers: Sequence[DataHeader]) -> DataHeader:
-    """What headers agree on; a field on which they differ says nothing."""
+    """The fields on which headers agree; the others get their default."""
     first = headers[0].model_dump()
     agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
     steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))
