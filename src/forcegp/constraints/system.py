@@ -11,10 +11,11 @@ from torch import Tensor
 
 from forcegp import dynamics, kinematics
 from forcegp.constraints.baumgarte import Baumgarte
-from forcegp.constraints.contact import Constraint
+from forcegp.constraints.contact import Constraint, ConstraintTerms
 from forcegp.constraints.gauss import Equations
 from forcegp.constraints.linearization import Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
+from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointVector
 
