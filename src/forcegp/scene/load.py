@@ -10,12 +10,12 @@ from pathlib import Path
 import torch
 
 from forcegp.constraints import ConstrainedSystem, Constraint, PointConnection, SurfaceContact
-from forcegp.control.config import SimulationConfig
 from forcegp.errors import SceneError
 from forcegp.robot import RobotModel, load_robot
 from forcegp.robot.load import BUNDLED as BUNDLED_ROBOTS
 from forcegp.scene.document import Document
 from forcegp.scene.sections import SceneSections
+from forcegp.simulate.config import SimulationConfig
 
 BUNDLED = ("kuka_plane",)
 """Scenes that come with the library: the paper's task."""

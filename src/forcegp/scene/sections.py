@@ -9,7 +9,7 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict, Field
 
 from forcegp.constraints import Baumgarte, SurfaceSchema
-from forcegp.control.config import SimulationConfig
+from forcegp.simulate.config import SimulationConfig
 
 Vector = tuple[float, float, float]
 

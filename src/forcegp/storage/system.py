@@ -191,3 +191,29 @@ def take(
     if bool(value.isnan().any()) or (finite and not bool(torch.isfinite(value).all())):
         raise ModelError(f"{source}: tensor {name!r} holds values that are not finite")
     return value
+
+
+def robot_tensors(robot: RobotModel) -> list[str]:
+    """Names of the fields of a robot that are tensors."""
+    names = [field.name for field in dataclasses.fields(robot)]
+    return [name for name in names if isinstance(getattr(robot, name), Tensor)]
+
+
+def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
+    """A robot with tensors named `<prefix><field>`, and everything else as in another one.
+
+    Raises:
+        ModelError: a tensor is missing, of another shape or type, or not finite.
+    """
+    fields = {
+        name: take(
+            tensors,
+            prefix + name,
+            tuple(getattr(like, name).shape),
+            getattr(like, name).dtype,
+            source,
+            finite=name not in MAY_BE_INFINITE,
+        )
+        for name in robot_tensors(like)
+    }
+    return like.replace(**fields)

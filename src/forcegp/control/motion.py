@@ -1,4 +1,4 @@
-"""The settings of a simulation."""
+"""The settings of a motion: where the tool goes, how fast, how hard it presses, and how it is controlled."""
 
 from __future__ import annotations
 
@@ -9,26 +9,22 @@ from forcegp.errors import ParameterError
 
 
 @dataclass(frozen=True)
-class SimulationConfig:
-    """What is simulated; the defaults are the paper's task on the bundled arm.
+class MotionConfig:
+    """A random motion of the tool over a surface, or in free space; the defaults are the paper's task.
 
     Args:
-        duration: simulated time [s].
-        dt: step, and sampling period [s].
-        seed: of the waypoints, the postures and the noise.
-        engine: `"pybullet"`, `"mujoco"` or `"auto"`.
-        center: middle of the rectangle, laid onto the surface if there is a contact [m].
-        size: sides of the rectangle, ahead and across [m].
+        duration: length of the motion [s].
+        dt: sampling period of the motion and of the controller [s].
+        center: centre of the rectangle, moved onto the surface if there is a contact [m].
+        size: side lengths of the rectangle, ahead and across [m].
         travel_time: time between two waypoints [s].
         max_acceleration: of the end-effector along a line [m/s²].
-        lift_probability: chance of a waypoint to lie above the surface; 0 stays in contact.
+        lift_probability: probability that a waypoint lies above the surface; 0 stays in contact.
         lift_height: range of heights of such a waypoint [m].
-        pressing_force: range of the force that presses on the surface, drawn anew for each line [N].
+        pressing_force: range of the force that presses on the surface, drawn for each line [N].
         elbow_swing: how far the posture in the null space varies from line to line [rad].
-        viscous_friction: θ_v of F_z = −θ_v ṗ_E, tangential to the surface [N s/m].
-        noise_std: standard deviation of the noise on q̈ [rad/s²].
-        gains: of the controller.
-        torque_limit: one a joint, or `None` for the robot's own [N m].
+        gains: gains of the controller.
+        torque_limit: one per joint, or `None` for the robot's own limits [N m].
         frame, point: the tool where there is no contact; by default the last frame of the robot.
 
     Raises:
@@ -37,8 +33,6 @@ class SimulationConfig:
 
     duration: float = 60.0
     dt: float = 1.0 / 240.0
-    seed: int = 0
-    engine: str = "auto"
     center: tuple[float, float, float] = (0.5, 0.0, 0.055)
     size: tuple[float, float] = (0.36, 0.6)
     travel_time: float = 1.0
@@ -47,8 +41,6 @@ class SimulationConfig:
     lift_height: tuple[float, float] = (0.02, 0.1)
     pressing_force: tuple[float, float] = (10.0, 15.0)
     elbow_swing: float = 0.15
-    viscous_friction: float = 1.0
-    noise_std: float = 0.1
     gains: Gains = field(default_factory=Gains)
     torque_limit: tuple[float, ...] | None = None
     frame: str | None = None
@@ -57,8 +49,7 @@ class SimulationConfig:
     def __post_init__(self) -> None:
         for name in ("duration", "dt", "travel_time", "max_acceleration"):
             self._check(name, 0.0 < getattr(self, name) < float("inf"), "a positive finite number")
-        for name in ("elbow_swing", "viscous_friction", "noise_std"):
-            self._check(name, 0.0 <= getattr(self, name) < float("inf"), "a finite number, 0 or above")
+        self._check_not_negative("elbow_swing")
         for name in ("lift_height", "pressing_force"):
             low, high = getattr(self, name)
             self._check(name, 0.0 <= low <= high < float("inf"), "two finite numbers, 0 <= low <= high")
@@ -71,8 +62,10 @@ class SimulationConfig:
         """Number of samples."""
         return round(self.duration / self.dt)
 
+    def _check_not_negative(self, *names: str) -> None:
+        for name in names:
+            self._check(name, 0.0 <= getattr(self, name) < float("inf"), "a finite number, 0 or above")
+
     def _check(self, name: str, valid: bool, expected: str) -> None:
         if not valid:
-            raise ParameterError(
-                f"the simulation's {name} is out of range", expected=expected, got=getattr(self, name)
-            )
+            raise ParameterError(f"{name} is out of range", expected=expected, got=getattr(self, name))

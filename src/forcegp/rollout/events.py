@@ -1,7 +1,7 @@
-"""Unilateral contact: it opens when it would have to pull, and closes with an inelastic impact.
+"""The instants at which contacts open and close, located within a step.
 
-Both instants are located within the step: a closed contact opens where λ falls to zero, an open one
-closes where c does. An impact takes the velocity into the contact, q̇⁺ = T q̇⁻ in the metric of M.
+A closed contact opens where λ falls to zero, an open one closes where c does; the mechanics are those of
+`constraints/unilateral.py`.
 """
 
 from __future__ import annotations
@@ -11,19 +11,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forcegp.constraints.projection import project_velocity
-from forcegp.errors import ModelError
-from forcegp.rollout.integrate import Step
-from forcegp.rollout.problem import Evaluation, Problem, State
+from forcegp.constraints.unilateral import impact_velocity, pulling, reached, rows_of
+from forcegp.rollout.law import Evaluation, Problem, State, Step
 
-PULL = 1e-9
-"""A contact pulls where λ is below minus this [N]; rounding must not open one that carries no load."""
-APPROACH = 1e-9
-"""A contact is approached where ċ is below minus this [m/s]; the velocity after an impact is not zero."""
 MAX_EVENTS = 8
-"""Events within one step; a bouncing that comes to rest within it has infinitely many."""
+"""Events within one step; a contact that bounces to rest within a step has infinitely many."""
 LOCATION = 1e-9
-"""An event is located where λ [N] or c [m] is this small in units of its value at the begin of the step."""
+"""An event is located where λ [N] or c [m] is this small relative to its value at the start of the step."""
 MAX_TRIALS = 40
 """Trials to locate an event; regula falsi with halving (Illinois) needs about eight."""
 
@@ -44,29 +38,12 @@ class ContactEvent(NamedTuple):
     closed: bool
 
 
-def check_unilateral(problem: Problem) -> None:
-    """Raise where contacts are to open but the law knows no multiplier.
-
-    Raises:
-        ModelError: the law gives accelerations alone.
-    """
-    if problem.unilateral and not problem.law.has_multiplier:
-        raise ModelError(
-            "a model of accelerations alone has no multiplier that could tell when contact is lost",
-            hint="pass unilateral=False, or use a model with forces",
-        )
-
-
 def _signal(problem: Problem, state: State, now: Evaluation) -> tuple[Tensor, Tensor]:
     """`(n, n_contacts)`: what crosses zero at the next event, and whether it has."""
-    rows = torch.repeat_interleave(
-        state.active, torch.tensor([k.rows for k in problem.system.contacts], device=state.q.device), dim=-1
-    )
-    pulls = rows & (now.multiplier < -PULL)
-    reaches = ~rows & (now.c <= 0.0) & (now.cd < -APPROACH)
-    crossed = problem.by_contact(pulls | reaches) & problem.can_open
-    signal = torch.where(rows, now.multiplier, now.c)
-    first = torch.cumsum(torch.tensor([0] + [k.rows for k in problem.system.contacts]), 0)[:-1]
+    system, active = problem.system, state.active
+    crossed = pulling(system, active, now.multiplier) | reached(system, active, now.c, now.cd)
+    signal = torch.where(rows_of(system, active), now.multiplier, now.c)
+    first = torch.cumsum(torch.tensor([0] + [contact.rows for contact in system.contacts]), 0)[:-1]
     return signal[:, first.to(signal.device)], crossed
 
 
@@ -76,20 +53,18 @@ def switch(problem: Problem, state: State, crossed: Tensor) -> State:
     landing = (crossed & active).any(-1)
     if not bool(landing.any()):
         return State(state.t, state.q, state.qd, active)
-    eom = problem.system.equations(state.q, state.qd, active)
-    qd = torch.where(landing[:, None], project_velocity(eom, state.qd), state.qd)
+    after = impact_velocity(problem.system, state.q, state.qd, active)
+    qd = torch.where(landing[:, None], after, state.qd)
     return State(state.t, state.q, qd, active)
 
 
 def settle(problem: Problem, state: State, end: Tensor) -> tuple[State, Evaluation, list[ContactEvent]]:
-    """The state at the begin of a step, once every contact that pulls is open and every one reached closed.
+    """The state at the start of a step, after contacts that pull have opened and those reached have closed.
 
-    The torque may have jumped, so λ may have.
+    The torque may jump there, and λ with it.
     """
     now = problem.evaluate(state, end)
     events: list[ContactEvent] = []
-    if not problem.unilateral:
-        return state, now, events
     for _ in range(MAX_EVENTS):
         _, crossed = _signal(problem, state, now)
         if not bool(crossed.any()):
@@ -113,8 +88,6 @@ def advance(
     """
     trial = step(problem, state, first, h)
     events: list[ContactEvent] = []
-    if not problem.unilateral:
-        return trial, events
     for _ in range(MAX_EVENTS):
         signal, crossed = _signal(problem, trial, problem.evaluate(trial, trial.t))
         rows = crossed.any(-1)
@@ -150,20 +123,20 @@ def _locate(
         return torch.where(crossed, values, torch.inf).amin(-1, keepdim=True)
 
     rows = crossed.any(-1, keepdim=True)
-    begin = smallest(_signal(problem, state, first)[0])
+    start = smallest(_signal(problem, state, first)[0])
     low, high = torch.zeros_like(h), torch.ones_like(h)
-    g_low, g_high = begin.clamp(min=0.0), smallest(signal)
+    g_low, g_high = start.clamp(min=0.0), smallest(signal)
     moved = torch.zeros_like(low)
     fraction = high
     for _ in range(MAX_TRIALS):
         fraction = torch.where(rows, low + (high - low) * g_low / (g_low - g_high), 1.0)
         at = step(problem, state, first, fraction * h)
         g = smallest(_signal(problem, at, problem.evaluate(at, state.t + h))[0])
-        done = ~rows | (g.abs() <= LOCATION * g_low.clamp(min=1e-3)) | (begin <= 0.0)
+        done = ~rows | (g.abs() <= LOCATION * g_low.clamp(min=1e-3)) | (start <= 0.0)
         if bool(done.all()):
             break
         below = g < 0.0
-        # Illinois: an end that stays twice in a row has its value halved, lest it stay for ever.
+        # Illinois: halve the value at an end that stays twice in a row, or it would stay for ever.
         g_low = torch.where(below, torch.where(moved == 1.0, 0.5 * g_low, g_low), g)
         g_high = torch.where(below, g, torch.where(moved == -1.0, 0.5 * g_high, g_high))
         low, high = torch.where(below, low, fraction), torch.where(below, fraction, high)

@@ -7,7 +7,7 @@ import torch
 
 import forcegp
 from forcegp import Baumgarte, ConstrainedSystem, Plane, PointConnection, SurfaceContact, dynamics, kinematics
-from forcegp.simulate.touch import contact_forces, friction_force, land
+from forcegp.constraints.unilateral import contact_forces, land, sliding_friction
 
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
 SOLVED = 1e-10
@@ -89,10 +89,10 @@ def test_friction_is_tangential_and_takes_power() -> None:
     system = _system(0.0)
     eom = system.equations(Q, QD)
     velocity = kinematics.point_velocity(ROBOT, Q, QD, FRAME, POINT)
-    Q_z = friction_force(system, eom, CLOSED, 2.0)
+    Q_z = sliding_friction(system, eom, CLOSED, 2.0)
     sliding = velocity[:2].square().sum()
     torch.testing.assert_close(QD @ Q_z, -2.0 * sliding, atol=SOLVED, rtol=0.0)
     J = kinematics.point_jacobian(ROBOT, Q, FRAME, POINT)
     expected = -2.0 * J[:2].mT @ velocity[:2]
     torch.testing.assert_close(Q_z, expected, atol=SOLVED, rtol=0.0)
-    assert float(friction_force(system, eom, OPEN, 2.0).abs().max()) == 0.0
+    assert float(sliding_friction(system, eom, OPEN, 2.0).abs().max()) == 0.0
