@@ -15,7 +15,20 @@ import forcegp
 ROOT = Path(forcegp.__file__).parent
 
 LAYERS = (
-    ("errors", "types", "files", "linalg", "batchlast", "threads", "optional"),
+    (
+        "limits",
+        "errors",
+        "types",
+        "temporary",
+        "exchange",
+        "files",
+        "destination",
+        "memory",
+        "linalg",
+        "batchlast",
+        "threads",
+        "optional",
+    ),
     ("robot",),
     ("kinematics", "friction", "dynamics"),
     ("compiled", "derivatives", "identification"),
@@ -27,6 +40,7 @@ LAYERS = (
     ("control",),
     ("simulate",),
     ("scene",),
+    ("logs", "checks"),
     ("rollout",),
     ("models",),
     ("evaluation",),

@@ -1,6 +1,6 @@
 """Logged motion: the data set and its files, derivatives, noise, selection and splits."""
 
-from forcegp.data.check import RobotMismatchWarning
+from forcegp.data.compatible import RobotMismatchWarning
 from forcegp.data.dataset import Dataset, NotLoggedError
 from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.header import DataHeader

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
-from difflib import get_close_matches
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from forcegp.data.fields import JOINT_VECTORS, Fields, component_names
-from forcegp.data.header import DataHeader
 from forcegp.errors import DataError
-from forcegp.robot.model import RobotModel
-
-
-class RobotMismatchWarning(UserWarning):
-    """The data were logged on a robot whose parameters differ from those of the robot they are used with."""
+from forcegp.limits import LOGGED_VALUE
 
 
 def _named_columns(data: Fields) -> list[tuple[str, Tensor]]:
@@ -25,6 +18,31 @@ def _named_columns(data: Fields) -> list[tuple[str, Tensor]]:
     for name, group in data.contact_extras.items():
         pairs += [(f"{name}.{contact}", value) for contact, value in group.items()]
     return pairs
+
+
+def check_tensors(data: Fields) -> None:
+    """Check that every column is a tensor, and every group of columns a mapping, before they are used."""
+    for name in ("contact", "extras", "contact_extras"):
+        _check_kind(name, getattr(data, name), Mapping, "a mapping of names to tensors")
+    named = {"t": data.t, **{name: getattr(data, name) for name in JOINT_VECTORS}, **data.extras}
+    named |= {f"contact.{name}": value for name, value in data.contact.items()}
+    if data.segment is not None:
+        named["segment"] = data.segment
+    for name, group in data.contact_extras.items():
+        _check_kind(name, group, Mapping, "a mapping of contacts to tensors")
+        named |= {f"{name}.{contact}": value for contact, value in group.items()}
+    for name, value in named.items():
+        _check_kind(name, value, Tensor, "a tensor", f"call torch.tensor({name}, dtype=torch.float64)")
+
+
+def _check_kind(name: str, value: object, kind: type, expected: str, hint: str | None = None) -> None:
+    if not isinstance(value, kind):
+        raise DataError(
+            f"column {name!r} is not a tensor" if kind is Tensor else f"{name!r} is not a mapping",
+            expected=expected,
+            got=type(value).__name__,
+            hint=hint,
+        )
 
 
 def check_layout(data: Fields) -> None:
@@ -96,19 +114,19 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 def check_values(data: Fields) -> None:
     """Check that every number is finite, and that time increases within each segment."""
     for name, value in (("t", data.t), *_named_columns(data)):
-        if not bool(torch.isfinite(value).all()):
+        if not bool((value.abs() <= LOGGED_VALUE).all()):
             _report_not_finite(data, name, value)
     if data.header.ordered:
         check_time(data)
 
 
 def _report_not_finite(data: Fields, name: str, value: Tensor) -> None:
-    place = torch.nonzero(~torch.isfinite(value))[0].tolist()
-    count = int((~torch.isfinite(value)).sum())
+    wrong = ~(value.abs() <= LOGGED_VALUE)
+    place, count = torch.nonzero(wrong)[0].tolist(), int(wrong.sum())
     column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]
     raise DataError(
         f"column {column!r} holds {value[tuple(place)].item()} in row {place[0]}",
-        expected="a finite number in every row",
+        expected=f"a finite number in every row, up to ±{LOGGED_VALUE:g}",
         got=f"{count} values in {name!r} that are not",
         hint="drop or repair these rows before using the log",
     )
@@ -168,72 +186,3 @@ def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
     if bool(outside.any()):
         raise DataError("there is no such row", expected=f"0 to {n - 1}", got=int(index[outside][0]))
     return torch.where(index < 0, index + n, index).to(torch.int64)
-
-
-def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
-    """Check that the joints of a log are those of a robot, in its order."""
-    if tuple(have) == tuple(want):
-        return
-    missing = [joint for joint in want if joint not in have]
-    if not missing:
-        raise DataError(
-            f"the joints of the data are not those of robot {robot!r} in its order",
-            expected=", ".join(want),
-            got=", ".join(have),
-            hint="call data.select(robot.joint_names)",
-        )
-    near = get_close_matches(missing[0], [joint for joint in have if joint not in want], n=1)
-    raise DataError(
-        f"joint {missing[0]!r} of robot {robot!r} is not in the data",
-        expected=", ".join(want),
-        got=", ".join(have),
-        hint=f"is {near[0]!r} in the data the same joint? Rename its columns" if near else None,
-    )
-
-
-def check_robot(data: Fields, robot: RobotModel) -> None:
-    """Check that a log is of a robot's joints, in its order; other parameters of the robot are a warning."""
-    check_joints(data.joint_names, robot.joint_names, robot.name)
-    logged = data.header.robot_fingerprint
-    if logged is not None and logged != robot.fingerprint:
-        warnings.warn(
-            f"the data were logged on robot {data.header.robot!r} (fingerprint {logged}) and are used with "
-            f"{robot.name!r} ({robot.fingerprint}): inertia, kinematics, base or gravity differ",
-            RobotMismatchWarning,
-            stacklevel=3,
-        )
-
-
-def check_alike(parts: Sequence[Fields]) -> None:
-    """Check that data sets hold the same columns, so that they can be put one after another."""
-    if not parts:
-        raise DataError("no data sets to concatenate", expected="one or more data sets")
-
-    def layout(data: Fields) -> dict[str, object]:
-        return {
-            "joints": data.joint_names,
-            "contacts": tuple(data.contact),
-            "extras": sorted(data.extras),
-            "contact extras": sorted((name, *sorted(group)) for name, group in data.contact_extras.items()),
-            "types": (data.dtype, data.device),
-        }
-
-    first = layout(parts[0])
-    for number, part in enumerate(parts[1:], start=1):
-        for what, value in layout(part).items():
-            if value != first[what]:
-                raise DataError(
-                    f"the {what} of data set {number} differ from those of data set 0",
-                    expected=first[what],
-                    got=value,
-                )
-
-
-def common_header(headers: Sequence[DataHeader]) -> DataHeader:
-    """The fields on which headers agree; the others get their default."""
-    first = headers[0].model_dump()
-    agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
-    steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))
-    agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
-    agreed["ordered"] = all(header.ordered for header in headers)
-    return DataHeader(**agreed)

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from forcegp.data import check, columns, table
+from forcegp.data import check, columns, compatible, table
 from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.fields import JOINT_VECTORS, contact_table
 from forcegp.data.header import DataHeader
@@ -59,6 +59,7 @@ class Dataset:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
+        check.check_tensors(self)
         if self.segment is None:
             zero = torch.zeros(self.t.shape, dtype=torch.int64, device=self.t.device)
             object.__setattr__(self, "segment", zero)
@@ -169,7 +170,7 @@ class Dataset:
         Raises:
             DataError: joints are missing, unknown or in another order; the hint says what to call.
         """
-        check.check_robot(self, robot)
+        compatible.check_robot(self, robot)
 
     def _map(self, change: Callable[[Tensor], Tensor], **fields: object) -> Dataset:
         """The data set with every column changed alike."""
@@ -192,14 +193,14 @@ class Dataset:
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
         """
-        check.check_alike(parts)
+        compatible.check_alike(parts)
         first = parts[0]
         segments, start = [], 0
         for part in parts:
             _, own = torch.unique_consecutive(part.segment, return_inverse=True)
             segments.append(own + start)
             start += int(own.max()) + 1 if len(part) else 0
-        header = check.common_header([part.header for part in parts])
+        header = compatible.common_header([part.header for part in parts])
         return Dataset(
             **{name: torch.cat([getattr(p, name) for p in parts]) for name in ("t", *JOINT_VECTORS)},
             joint_names=first.joint_names,

@@ -15,8 +15,8 @@ def summary(data: Fields) -> str:
         parts += [_time(data), *_contacts(data)]
     also = [*data.extras, *data.contact_extras]
     parts += [f"also logged: {', '.join(also)}"] if also else []
-    kind = str(data.dtype).removeprefix("torch.")
-    return f"<Dataset{robot}: {'; '.join(parts)}; {kind} on {data.device}>"
+    kind = str(data.q.dtype).removeprefix("torch.")
+    return f"<Dataset{robot}: {'; '.join(parts)}; {kind} on {data.q.device}>"
 
 
 def _time(data: Fields) -> str:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ModelError
+from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.optimise import Learned
 from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Torque
@@ -40,6 +40,20 @@ class Prediction:
     mean: Tensor
     covariance: Tensor | None = None
     parts: dict[str, slice] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are not finite.
+
+        Raises:
+            NumericalError: the mean or the covariance holds one.
+        """
+        for name, value in (("mean", self.mean), ("covariance", self.covariance)):
+            if value is not None and not bool(torch.isfinite(value).all()):
+                raise NumericalError(
+                    f"the {name} of a prediction is not finite",
+                    got=f"{int((~torch.isfinite(value)).sum())} of {value.numel()} numbers",
+                    hint="states beyond what a robot can do overflow; check q, qd and tau",
+                )
 
     @property
     def variance(self) -> Tensor | None:
