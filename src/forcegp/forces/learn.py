@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,7 +24,7 @@ from forcegp.forces.start import (
     warm_start_sizes,
 )
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
+from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
 
 Tensors = dict[str, Tensor]
 
@@ -142,11 +142,13 @@ class Search:
         start: default initial values of what is learned, and centre of the weak priors.
         held: values that are not learned.
         options: optimiser and its limits.
+        recorded: wraps the objective, such as `Checkpoint.recorded`.
     """
 
     start: Tensors
     held: Tensors
     options: LearningOptions
+    recorded: Callable[[Objective], Objective] = lambda objective: objective
 
     def solve(
         self,
@@ -201,6 +203,6 @@ class Search:
             if progress is not None:
                 progress(evaluations, value + constant, best)
 
-        learned = minimise(objective, begin, self.options, analytical, bounds, whole)
+        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, whole)
         history = [value + constant for value in learned.history]
         return dataclasses.replace(learned, value=learned.value + constant, history=history)
