@@ -100,6 +100,10 @@ class UnknownNameError(ForceGPError, LookupError):
         )
 
 
+class ParameterError(ForceGPError, ValueError):
+    """A parameter that is out of range, such as a radius or a time step (the message names it)."""
+
+
 def _shortened(text: str, length: int) -> str:
     return text if len(text) <= length else text[:length] + "…"
 
@@ -119,6 +123,10 @@ class DataError(ForceGPError, ValueError):
 
 class SceneError(ForceGPError, ValueError):
     """A scene file that is not valid (the message names file, line and key)."""
+
+
+class MappingError(ForceGPError, ValueError):
+    """A mapping of log columns that is not valid, or does not fit the log (names file, line and key)."""
 
 
 class ModelError(ForceGPError, ValueError):

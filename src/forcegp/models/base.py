@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,16 +15,12 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, NumericalError
-from forcegp.forces.quantities import States
 from forcegp.gp.optimise import Learned
+from forcegp.rollout.forward import rollout_model
+from forcegp.rollout.inputs import Torque
+from forcegp.rollout.law import ForceField
+from forcegp.rollout.trajectory import Rollout
 from forcegp.storage.folder import Settings, write_model
-
-if TYPE_CHECKING:
-    from forcegp.rollout.forward import Torque
-    from forcegp.rollout.trajectory import Rollout
-
-ForceField = Callable[[ConstrainedSystem, States], Tensor]
-"""The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""
 
 FitProgress = Callable[[int, int, float], None]
 """Called with the number of evaluations, their maximum, and the objective."""
@@ -185,13 +181,12 @@ class Predictor(ABC):
 
         Args:
             q0, qd0: `(*batch, nq)` initial states.
-            tau: motor torque over time `(samples, nq)` or `(*batch, samples, nq)`, or a law of (t, q, q̇).
+            tau: motor torque over time: a log, or an array `(samples, nq)` or `(*batch, samples, nq)` with
+                its period in `options`; or a law of (t, q, q̇).
             duration: simulated time [s].
             samples: number of function samples to integrate besides the mean.
             **settings: `options`, `seed`, `active`, `system` and `progress` of `rollout_model`.
         """
-        from forcegp.rollout.forward import rollout_model
-
         return rollout_model(self, q0, qd0, tau, duration, samples, **settings)
 
     @abstractmethod
