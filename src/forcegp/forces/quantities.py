@@ -205,7 +205,7 @@ def affine_maps(system: ConstrainedSystem, at: States, quantity: str | Sequence[
     if not names:
         raise ModelError("no quantity is named", expected="one of " + ", ".join(QUANTITIES))
     for name in names:
-        if name not in QUANTITIES:
+        if not isinstance(name, str) or name not in QUANTITIES:
             raise UnknownNameError("quantity", name, QUANTITIES)
     return {name: QUANTITIES[name](system, at) for name in names}
 
