@@ -16,7 +16,7 @@ if __name__ == "__main__":
     folder, record = Path(sys.argv[1]) / "model", Path(sys.argv[1]) / "fit.ckpt"
     check_model_destination(folder)
     model = forcegp.StructuredGP(table_system(), noise_std=0.1)
-    options = forcegp.LearningOptions(max_evaluations=40, warm_start=6, restarts=1)
+    options = forcegp.LearningOptions(max_evaluations=12, warm_start=6)
     print("begin", flush=True)
     model.fit(random_data(table_system(), 20), options=options, checkpoint=record, keep_checkpoint=True)
     write_or_keep(model.save, folder)

@@ -20,7 +20,7 @@ from safetensors.torch import load_file
 from forcegp.data import Dataset
 
 ATTACK = bool(os.environ.get("FORCEGP_ATTACK"))
-KILLS = 50 if ATTACK else 3
+KILLS = 50 if ATTACK else 2
 HERE = Path(__file__).parent
 SCENE = """
 [robot]
@@ -31,7 +31,7 @@ frame = "lbr_iiwa_link_7"
 point = [0.0, 0.0, 0.1]
 surface = { type = "plane", normal = [0.0, 0.0, 1.0], offset = 0.055 }
 [simulation]
-duration = 1.0
+duration = 0.2
 """
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="SIGKILL")

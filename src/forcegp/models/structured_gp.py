@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
+from forcegp.forces.inference import check_method
 from forcegp.forces.learn import Problem, Search
 from forcegp.forces.mean import AnalyticalMean, mean_of
 from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
@@ -23,7 +24,8 @@ from forcegp.forces.priors.default import default_priors
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_spec import Specification
+from forcegp.models.structured_learning import in_motion, prepared, solve
+from forcegp.models.structured_spec import Specification, torque_noise_of
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
@@ -61,14 +63,30 @@ class StructuredGP(Model[StructuredFit]):
         noise_std: NoiseStd | None = None,
         learn_noise: bool = False,
         analytical_parameters: nn.Module | None = None,
+        torque_noise: NoiseStd | str | None = "auto",
+        inference: str = "auto",
     ) -> None:
         form = mean_of(mean)
         priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
         check_priors(priors, system)
         self.specified = system
         self.specification = Specification(
-            system, form, priors, noise_std, learn_noise, analytical_parameters
+            system,
+            form,
+            priors,
+            noise_std,
+            learn_noise,
+            analytical_parameters,
+            torque_noise_of(torque_noise, priors),
+            check_method(inference),
         )
+
+    @classmethod
+    def of(cls, specification: Specification) -> StructuredGP:
+        """A model with a given specification."""
+        model = cls.__new__(cls)
+        model.specified, model.specification = specification.system, specification
+        return model
 
     @property
     def mean(self) -> AnalyticalMean:
@@ -123,14 +141,15 @@ class StructuredGP(Model[StructuredFit]):
         spec = self.specification
         options = options or (LearningOptions() if spec.parameters is None else WITH_PARAMETERS)
         chosen = self._chosen(learn)
-        problem = spec.problem(self._training(data, chosen))
-        start = problem.initial(spec.learn_noise)
+        training, doubts = in_motion(spec, self._training(data, chosen))
+        problem = spec.problem(training)
+        start = problem.initial(spec.learn_noise, spec.learns_torque_noise)
         before = {} if self._fitted is None else self._fitted.hyperparameters
         current = {key: before.get(key, value) for key, value in start.items()}
         held = {key: value for key, value in current.items() if key.split(".")[0] not in chosen}
         free = {key: value for key, value in start.items() if key not in held}
         if not free:
-            return self.adopt(conditioned(spec, problem.training, held))
+            return self.adopt(conditioned(spec, prepared(spec, problem, held), held, warnings=doubts))
 
         def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
             if progress is not None:
@@ -138,13 +157,14 @@ class StructuredGP(Model[StructuredFit]):
 
         search, saved = Search(free, held, options), None
         if checkpoint is not None:
-            saved = Checkpoint(Path(checkpoint), _key(problem, search, begin))
+            saved = Checkpoint(Path(checkpoint), _key(spec, problem, search, begin))
             saved.read(free)
             search = dataclasses.replace(search, recorded=saved.recorded)
-        learned = search.solve(problem, report, begin)
+        lesson = solve(spec, problem, search, report, begin)
         if saved is not None:
             saved.write()
-        fitted = self.adopt(conditioned(spec, problem.training, {**held, **learned.tensors}, learned))
+        doubts = (*doubts, *lesson.warnings)
+        fitted = self.adopt(conditioned(spec, lesson.problem, lesson.hyperparameters, lesson.learned, doubts))
         if saved is not None and not keep_checkpoint:
             saved.remove()
         return fitted
@@ -173,7 +193,9 @@ class StructuredGP(Model[StructuredFit]):
                 hint='call fit(data, learn=["noise"]), which learns the noise alone',
             )
         values = fitted.hyperparameters if hyperparameters is None else hyperparameters
-        return self.adopt(conditioned(self.specification, training, values))
+        spec, (moving, doubts) = self.specification, in_motion(self.specification, training)
+        problem = prepared(spec, dataclasses.replace(fitted.problem, training=moving), values)
+        return self.adopt(conditioned(spec, problem, values, warnings=doubts))
 
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""
@@ -229,14 +251,16 @@ class StructuredGP(Model[StructuredFit]):
         return self.fitted.training
 
 
-def _key(problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:
+def _key(
+    spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None
+) -> str:
     """Identifies the learning of some tensors, on these data and this system, with these options."""
     training = problem.training
     data = [value for m in training.measurements for value in m.tensors]
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
     record, robot = pack_system(problem.system)
-    named = [part for group in (search.start, search.held, begin or {}) for part in group.items()]
+    named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
     return Checkpoint.key_of(
-        problem.mean, priors, search.options, training.quantities, *data, *training.noise_std,
+        problem.mean, priors, spec.inference, search.options, training.quantities, *data, *training.noise_std,
         record, *robot.values(), *(part for pair in named for part in pair),
     )  # fmt: skip
