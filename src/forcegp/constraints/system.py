@@ -116,6 +116,8 @@ class ConstrainedSystem:
         n, device = len(self.contacts), self.robot.device
         if active is None:
             return torch.ones(*batch, self.m, dtype=torch.bool, device=device)
+        if not isinstance(active, Tensor):
+            raise ShapeError("active is no tensor", expected="a bool tensor", got=type(active).__name__)
         sizes = zip(reversed(active.shape), reversed((*batch, n)), strict=False)
         fits = (
             0 < active.ndim <= len(batch) + 1 and active.shape[-1] == n and all(a in (1, b) for a, b in sizes)

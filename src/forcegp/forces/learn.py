@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -26,7 +26,7 @@ from forcegp.forces.start import (
 from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
+from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
 from forcegp.gp.structured_covariance import Block
 
 Tensors = dict[str, Tensor]
@@ -197,11 +197,13 @@ class Search:
         start: default initial values of what is learned, and centre of the weak priors.
         held: values that are not learned.
         options: optimiser and its limits.
+        recorded: wraps the objective, such as `Checkpoint.recorded`.
     """
 
     start: Tensors
     held: Tensors
     options: LearningOptions
+    recorded: Callable[[Objective], Objective] = lambda objective: objective
 
     def solve(
         self,
@@ -256,6 +258,6 @@ class Search:
             if progress is not None:
                 progress(evaluations, value + constant, best)
 
-        learned = minimise(objective, begin, self.options, analytical, bounds, whole)
+        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, whole)
         history = [value + constant for value in learned.history]
         return dataclasses.replace(learned, value=learned.value + constant, history=history)
