@@ -20,8 +20,8 @@ from forcegp.scene.sections import SceneSections, config_of, validate
 from forcegp.scene.toml import Document, Key
 from forcegp.simulate.config import SimulationConfig
 
-BUNDLED = ("kuka_plane",)
-"""Scenes that come with the library: the paper's task."""
+BUNDLED = ("kuka_plane", "ur5_wiping")
+"""Scenes that come with the library: the paper's task, and a UR5 with undeclared friction."""
 
 T = TypeVar("T")
 
@@ -103,7 +103,7 @@ def load_scene(source: str | Path) -> Scene:
     """Read a scene file.
 
     Args:
-        source: a path, or the name of a scene that comes with the library (`kuka_plane`).
+        source: a path, or the name of a scene that comes with the library (`kuka_plane`, `ur5_wiping`).
 
     Raises:
         SceneError: no such scene, or it is not valid; the message names file, line and key.

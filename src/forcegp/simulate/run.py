@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import closing
 
 import torch
@@ -12,22 +11,16 @@ from forcegp.constraints.gauss import ConstrainedSystem
 from forcegp.constraints.unilateral import any_row, contact_forces, land
 from forcegp.control.plan import Plan, make_plan
 from forcegp.control.task_space import control_torque, tool_motion
-from forcegp.errors import NumericalError
 from forcegp.simulate.config import SimulationConfig
+from forcegp.simulate.contact_solver import ContactSolverEngine
 from forcegp.simulate.engine import Engine, make_engine
+from forcegp.simulate.guard import Progress, check_speed, report, torque_limit
 from forcegp.simulate.result import Log, SimulationResult, make_result
+from forcegp.simulate.solver_run import follow_with_solver
 from forcegp.threads import one_thread
-
-RUNAWAY_SPEED = 50.0
-"""A joint faster than this [rad/s] is no motion that anybody planned."""
-PROGRESS_STRIDE = 24
-"""Steps between two calls of the progress function, a tenth of a second at 240 Hz."""
 
 ON_SURFACE = 1e-8
 """A contact is closed at the start where the error is below this [m]; placement leaves less."""
-
-Progress = Callable[[int, int], None]
-"""Called with the number of steps done and the number in all."""
 
 
 def simulate(
@@ -59,6 +52,10 @@ def simulate(
     generator = torch.Generator().manual_seed(config.seed)
     with torch.no_grad(), one_thread():
         plan = make_plan(system, config, generator)
+        if config.contact == "solver":
+            engine = ContactSolverEngine(system, config.dt, config.solver)
+            log = follow_with_solver(system, config, plan, engine, generator, progress)
+            return make_result(system, config, plan, log, engine.name, generator)
         with closing(make_engine(system.robot, config.dt, config.engine)) as engine:
             log = _follow(system, config, plan, engine, progress)
             return make_result(system, config, plan, log, engine.name, generator)
@@ -73,12 +70,12 @@ def _follow(
 ) -> Log:
     """Step the engine through the plan."""
     log = Log.empty(config.steps, system)
-    limit = _torque_limit(system, config)
+    limit = torque_limit(system, config)
     closed = _closed_at_start(system, plan.start)
     engine.reset(plan.start, torch.zeros_like(plan.start))
     q, qd = engine.state()
     for k in range(config.steps):
-        _check_speed(k * config.dt, q, qd)
+        check_speed(k * config.dt, q, qd)
         landing = land(system, q, qd, closed)
         if landing.impact:
             qd = landing.qd
@@ -93,31 +90,11 @@ def _follow(
         closed, (q, qd_next) = touch.closed, engine.state()
         log.qdd[k] = (qd_next - qd) / config.dt
         qd = qd_next
-        if progress is not None and ((k + 1) % PROGRESS_STRIDE == 0 or k + 1 == config.steps):
-            progress(k + 1, config.steps)
+        report(progress, k + 1, config.steps)
     return log
-
-
-def _torque_limit(system: ConstrainedSystem, config: SimulationConfig) -> Tensor:
-    robot = system.robot
-    if config.torque_limit is None:
-        return robot.effort_limit
-    limit = torch.tensor(config.torque_limit, dtype=robot.dtype)
-    robot.check_state(torque_limit=limit)
-    return limit
 
 
 def _closed_at_start(system: ConstrainedSystem, q: Tensor) -> Tensor:
     """Constraints that hold at the start; inverse kinematics puts the tool on the surface, up to rounding."""
     c = system.equations(q, torch.zeros_like(q)).c
     return ~any_row(system, c.abs() > ON_SURFACE)
-
-
-def _check_speed(t: float, q: Tensor, qd: Tensor) -> None:
-    if not (bool(torch.isfinite(q).all()) and float(qd.abs().max()) < RUNAWAY_SPEED):
-        raise NumericalError(
-            f"the simulation diverges at t = {t:.4f} s",
-            expected=f"joint speeds below {RUNAWAY_SPEED:g} rad/s",
-            got=f"q = {q.tolist()}, qd = {qd.tolist()}",
-            hint="smaller gains, a longer travel time, or a rectangle further from the edge of the workspace",
-        )
