@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.constraints.gauss import ConstrainedSystem, Equations
+from forcegp.constraints.gauss import Equations
 from forcegp.constraints.projection import project_velocity
+from forcegp.constraints.system import ConstrainedSystem
 from forcegp.types import ConstraintVector, JointVector
 
 PULL = 1e-9

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from forcegp.control.task_space import Gains
-from forcegp.errors import ForceGPError
+from forcegp.errors import ParameterError
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class MotionConfig:
         frame, point: the tool where there is no contact; by default the last frame of the robot.
 
     Raises:
-        ForceGPError: a value is out of range; the message names it.
+        ParameterError: a value is out of range; the message names it.
     """
 
     duration: float = 60.0
@@ -68,4 +68,4 @@ class MotionConfig:
 
     def _check(self, name: str, valid: bool, expected: str) -> None:
         if not valid:
-            raise ForceGPError(f"{name} is out of range", expected=expected, got=getattr(self, name))
+            raise ParameterError(f"{name} is out of range", expected=expected, got=getattr(self, name))

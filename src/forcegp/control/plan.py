@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from forcegp import kinematics
+from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.constraints.gauss import ConstrainedSystem, Equations
+from forcegp.constraints.gauss import Equations
 from forcegp.control.motion import MotionConfig
 from forcegp.control.placement import inverse_kinematics, tool_rotation
 from forcegp.control.task_space import Target

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 
 from forcegp.data import Dataset
-from forcegp.forces.states import states
+from forcegp.forces.priors.base import CONSTRAINT
+from forcegp.forces.quantities import states
 from forcegp.gp.structured_covariance import Block, cross_gram
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.data import CovarianceData, matrix, series
@@ -26,13 +27,15 @@ def covariance_blocks(model: StructuredGP, data: Dataset, name: str) -> Covarian
     system, fitted = model.system, model.posterior
     at = states(system, data.q, data.qd, data.tau, data.active(system.contact_names))
     # What no acceleration shows, a force along the constraint, is left out of the picture.
-    pairs = [pair for pair in zip(fitted.priors, fitted.scales, strict=True) if pair[0].measurable]
+    pairs = [pair for pair in zip(fitted.priors, fitted.scales, strict=True) if pair[0].target != CONSTRAINT]
     priors = [prior for prior, _ in pairs]
     features = tuple(scale.apply(prior.features(system, at)) for prior, scale in pairs)
     E = tuple(prior.operator(system, at) for prior in priors)
     force = Block(features, E, torch.zeros_like(at.q))
     acceleration = Block(features, tuple(at.eom.H @ operator for operator in E), torch.zeros_like(at.q))
-    k_Q, k_qdd = (cross_gram(priors, fitted.params, [block], [block]) for block in (force, acceleration))
+    k_Q, k_qdd = (
+        cross_gram(priors, model.hyperparameters, [block], [block]) for block in (force, acceleration)
+    )
     eigenvalues = torch.linalg.eigvalsh(k_qdd)
     return CovarianceData(
         model=name,

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.states import States
+from forcegp.forces.quantities import States
 from forcegp.rollout.inputs import Inputs, Reached
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]

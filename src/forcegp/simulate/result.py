@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from forcegp import dynamics, kinematics
-from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.unilateral import ContactForces
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import tool_motion

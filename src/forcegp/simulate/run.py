@@ -7,7 +7,7 @@ from contextlib import closing
 import torch
 from torch import Tensor
 
-from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.unilateral import any_row, contact_forces, land
 from forcegp.control.plan import Plan, make_plan
 from forcegp.control.task_space import control_torque, tool_motion

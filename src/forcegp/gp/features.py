@@ -1,4 +1,4 @@
-"""Kernel inputs with zero mean and unit variance."""
+"""Kernel inputs: named features, side by side and standardized."""
 
 from __future__ import annotations
 
@@ -7,6 +7,29 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from forcegp.errors import UnknownNameError
+
+Features = Mapping[str, Tensor]
+"""Named kernel inputs: `(n, w)`, shared by all components, or `(n, k, w)`, one row for each component."""
+
+
+def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
+    """The named features side by side, `(n, w)`, or `(k, n, w)` where components have inputs of their own.
+
+    Raises:
+        UnknownNameError: a feature is not given.
+    """
+    names = tuple(x) if inputs is None else inputs
+    for name in names:
+        if name not in x:
+            raise UnknownNameError("kernel input", name, x)
+    parts = [x[name] for name in names]
+    if all(part.ndim == 2 for part in parts):
+        return torch.cat(parts, dim=-1)
+    k = next(part.shape[1] for part in parts if part.ndim == 3)
+    wide = [part if part.ndim == 3 else part[:, None].expand(-1, k, -1) for part in parts]
+    return torch.cat(wide, dim=-1).transpose(0, 1)
 
 
 @dataclass(frozen=True)
