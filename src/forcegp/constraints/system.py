@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from forcegp import dynamics, kinematics
 from forcegp.constraints.baumgarte import Baumgarte
-from forcegp.constraints.contact import Constraint
+from forcegp.constraints.contact import Constraint, ConstraintTerms
 from forcegp.constraints.gauss import Equations
 from forcegp.errors import ForceGPError, ShapeError, UnknownNameError
 from forcegp.robot.model import RobotModel
@@ -109,23 +110,40 @@ class ConstrainedSystem:
         motion = kinematics.link_motion(robot, poses, qd)
         links = dynamics.link_inertia(robot, poses)
         terms = {contact.name: contact.terms(robot, poses, motion, qd) for contact in self.contacts}
+        return self._assembled(
+            q,
+            qd,
+            active,
+            terms,
+            M=dynamics.mass_matrix_of_poses(robot, poses, links),
+            Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
+            Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
+            poses=poses,
+            motion=motion,
+        )
+
+    def _assembled(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        active: Tensor | None,
+        terms: Mapping[str, ConstraintTerms],
+        **mechanics: Any,
+    ) -> Equations:
+        """The equations of motion from the constraints' terms and the mechanics of the robot."""
         c, A, b = self._stack(q, list(terms.values()))
         cd = (A @ qd[..., None])[..., 0]
         if self.baumgarte is not None:
             b = self.baumgarte.stabilized(b, c, cd)
         rows = self.active_rows(active, q.shape[:-1])
         return Equations(
-            M=dynamics.mass_matrix_of_poses(robot, poses, links),
             A=torch.where(rows[..., None], A, 0.0),
             b=torch.where(rows, b, 0.0),
             c=c,
             cd=cd,
-            Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
-            Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
-            Q_D=dynamics.damping_force(robot, qd),
+            Q_D=dynamics.damping_force(self.robot, qd),
             contact_points={name: term.point for name, term in terms.items() if term.point is not None},
-            poses=poses,
-            motion=motion,
+            **mechanics,
         )
 
     def _stack(self, q: Tensor, terms: list) -> tuple[Tensor, Tensor, Tensor]:

@@ -106,10 +106,10 @@ class ContactSolverEngine:
         q, qd = self._data.qpos[self._dof], self._data.qvel[self._dof]
         return torch.tensor(q, dtype=dtype), torch.tensor(qd, dtype=dtype)
 
-    def forces(self, torque: JointVector) -> SolvedForces:
+    def forces(self, torque: np.ndarray) -> SolvedForces:
         """Acceleration and forces at the present state under a motor torque `(nq,)` [N m]."""
         data, dof = self._data, self._dof
-        data.qfrc_applied[dof] = torque.numpy()
+        data.qfrc_applied[dof] = torque
         self._mujoco.mj_forward(self._model, data)
         contacts = [self._contact_force(pair) for pair in self._pairs]
         Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else self._no_contact

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem
 from forcegp.control.motion import MotionConfig
 from forcegp.errors import NumericalError
 
@@ -30,13 +31,13 @@ def torque_limit(system: ConstrainedSystem, config: MotionConfig) -> Tensor:
     return limit
 
 
-def check_speed(t: float, q: Tensor, qd: Tensor) -> None:
+def check_speed(t: float, q: np.ndarray, qd: np.ndarray) -> None:
     """Stop a run that diverges.
 
     Raises:
         NumericalError: a joint is too fast, or the state is not finite; names time and state.
     """
-    if not (bool(torch.isfinite(q).all()) and float(qd.abs().max()) < RUNAWAY_SPEED):
+    if not (np.isfinite(q).all() and np.abs(qd).max() < RUNAWAY_SPEED):
         raise NumericalError(
             f"the simulation diverges at t = {t:.4f} s",
             expected=f"joint speeds below {RUNAWAY_SPEED:g} rad/s",

@@ -90,6 +90,11 @@ class MuJoCoEngine:
 
 
 def import_mujoco() -> Any:
+    """The package `mujoco`.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
     # MuJoCo's classes live in a compiled module that has no stubs.
     try:
         import mujoco

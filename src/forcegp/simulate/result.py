@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from forcegp import dynamics, kinematics
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.unilateral import ContactForces
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import tool_motion
 from forcegp.control.trajectory import Reference
@@ -68,13 +68,22 @@ class Log:
             saturated=torch.zeros(steps, dtype=torch.bool),
         )
 
-    def write(
-        self, k: int, q: Tensor, qd: Tensor, Q_u: Tensor, forces: ContactForces, *, saturated: bool
-    ) -> None:
-        """Write down step k, all but the acceleration, which is known a step later."""
-        self.q[k], self.qd[k], self.tau[k], self.Q[k] = q, qd, Q_u, forces.Q
-        self.Q_I[k], self.Q_z[k], self.multiplier[k] = forces.Q_I, forces.Q_z, forces.multiplier
-        self.c[k], self.contact[k], self.saturated[k] = forces.c, forces.closed, saturated
+    def arrays(self) -> LogRows:
+        """The columns as arrays that share their memory, to write single rows."""
+        names = (f.name for f in fields(self))
+        return LogRows({n: x.numpy() for n in names if isinstance(x := getattr(self, n), Tensor)})
+
+
+class LogRows:
+    """The columns of a log, written row by row."""
+
+    def __init__(self, columns: dict[str, np.ndarray]) -> None:
+        self._columns = columns
+
+    def write(self, k: int, **values: object) -> None:
+        """Write values of row k, by column."""
+        for name, value in values.items():
+            self._columns[name][k] = value
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem
 from forcegp.control.plan import Plan
-from forcegp.control.task_space import control_torque, tool_motion
+from forcegp.control.task_space import Target, control_torque
 from forcegp.simulate.config import Sensors, SimulationConfig
 from forcegp.simulate.contact_solver import NO_FORCE, ContactSolverEngine
 from forcegp.simulate.guard import Progress, check_speed, report, torque_limit
+from forcegp.simulate.mechanics import Mechanics
 from forcegp.simulate.result import Log
 
 
@@ -37,24 +39,23 @@ def follow_with_solver(
     Returns:
         The log: true motion and forces, and what was measured where sensors are not perfect.
     """
-    log, limit, sensors = Log.empty(config.steps, system), torque_limit(system, config), config.sensors
+    log, mechanics, sensors = Log.empty(config.steps, system), Mechanics(system, plan), config.sensors
+    rows, limit, targets = log.arrays(), torque_limit(system, config).numpy(), plan.arrays()
     measured = {"q": torch.zeros_like(log.q), "qd": torch.zeros_like(log.qd)}
     F_I, F_z = (log.q.new_zeros(config.steps, len(system.contacts), 3) for _ in range(2))
     engine.reset(plan.start, torch.zeros_like(plan.start))
     for k in range(config.steps):
         true_q, true_qd = engine.state()
-        check_speed(k * config.dt, true_q, true_qd)
+        check_speed(k * config.dt, true_q.numpy(), true_qd.numpy())
         q, qd = _measured_state(true_q, true_qd, sensors, generator)
-        eom = system.equations(q, qd)
-        tool = tool_motion(system.robot, eom.poses, eom.motion, qd, plan.frame, plan.point)
-        wanted = control_torque(tool, eom, q, qd, plan.target(k), plan.normal(eom), config.gains)
-        Q_u = wanted.clamp(-limit, limit)
-        found = engine.forces(Q_u)
-        log.q[k], log.qd[k], log.tau[k], log.saturated[k] = true_q, true_qd, Q_u, not torch.equal(Q_u, wanted)
-        for name in ("qdd", "Q", "Q_I", "Q_z", "multiplier"):
-            getattr(log, name)[k] = torch.from_numpy(getattr(found, name))
-        F_I[k], F_z[k] = torch.from_numpy(found.F_I), torch.from_numpy(found.F_z)
         measured["q"][k], measured["qd"][k] = q, qd
+        eom, target = mechanics.equations(q.numpy(), qd.numpy()), Target(*(values[k] for values in targets))
+        wanted = control_torque(eom.tool, eom, q.numpy(), qd.numpy(), target, plan.normal(eom), config.gains)
+        Q_u = np.clip(wanted, -limit, limit)
+        found = engine.forces(Q_u)
+        rows.write(k, q=true_q, qd=true_qd, tau=Q_u, saturated=(Q_u != wanted).any(), qdd=found.qdd)
+        rows.write(k, Q=found.Q, Q_I=found.Q_I, Q_z=found.Q_z, multiplier=found.multiplier)
+        F_I[k], F_z[k] = torch.from_numpy(found.F_I), torch.from_numpy(found.F_z)
         engine.step()
         report(progress, k + 1, config.steps)
     log.c.copy_(system.equations(log.q, log.qd).c)

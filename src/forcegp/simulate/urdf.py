@@ -39,6 +39,7 @@ def write_urdf(robot: RobotModel) -> str:
 
 
 def link_name(robot: RobotModel, index: int) -> str:
+    """Name of a link in the written file."""
     return WORLD if index == BASE else f"link_of_{robot.joint_names[index]}"
 
 
