@@ -38,6 +38,7 @@ LAYERS = (
     ("control",),
     ("simulate",),
     ("scene",),
+    ("logs", "checks"),
     ("rollout",),
     ("models",),
     ("evaluation",),

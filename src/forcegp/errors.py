@@ -125,6 +125,10 @@ class SceneError(ForceGPError, ValueError):
     """A scene file that is not valid (the message names file, line and key)."""
 
 
+class MappingError(ForceGPError, ValueError):
+    """A mapping of log columns that is not valid, or does not fit the log (names file, line and key)."""
+
+
 class ModelError(ForceGPError, ValueError):
     """A model that is asked for what it cannot do, or a saved model that cannot be read."""
 

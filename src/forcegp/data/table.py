@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,9 @@ HEADER_KEY = b"forcegp"
 COPIES = 4
 """A table is in memory as the reader's columns, as arrays, side by side, and as tensors."""
 
+GROUP_ROWS = 1 << 18
+"""Rows that are written at a time, so that memory holds one copy of a long log and not two."""
+
 
 class IgnoredColumnsWarning(UserWarning):
     """Columns of a log that are not of a name this library knows were left out."""
@@ -42,14 +45,23 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = pa.table({name: pa.array(values) for name, values in columns.items()})
-    table = table.replace_schema_metadata({HEADER_KEY: header.to_json().encode()})
-    with atomic_file(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd")
+    schema = pa.schema({name: pa.from_numpy_dtype(values.dtype) for name, values in columns.items()})
+    schema = schema.with_metadata({HEADER_KEY: header.to_json().encode()})
+    rows = max(map(len, columns.values()), default=0)
+    with atomic_file(path) as temporary, pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+        for start in range(0, rows, GROUP_ROWS):
+            group = {name: pa.array(values[start : start + GROUP_ROWS]) for name, values in columns.items()}
+            writer.write_table(pa.table(group, schema=schema))
 
 
-def read_table(path: str | Path) -> tuple[Columns, DataHeader]:
+def read_table(
+    path: str | Path, *, missing: Literal["refuse", "nan"] = "refuse"
+) -> tuple[Columns, DataHeader]:
     """Read the numeric columns of a Parquet or CSV file, and its header (defaults where it has none).
+
+    Args:
+        path: the file.
+        missing: whether an empty value is an error or becomes a NaN.
 
     Raises:
         DataError: no such file, a kind of file that is not read, or one that is damaged or too large.
@@ -64,7 +76,7 @@ def read_table(path: str | Path) -> tuple[Columns, DataHeader]:
         )
     table, header = readers[file.suffix.lower()](file)
     pairs = zip(table.column_names, table.columns, strict=True)
-    return {name: _numeric(file, name, column) for name, column in pairs}, header
+    return {name: _numeric(file, name, column, missing) for name, column in pairs}, header
 
 
 def _files_beside(file: Path) -> str | None:
@@ -195,8 +207,8 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
     return numeric
 
 
-def _numeric(file: Path, name: str, column: pa.ChunkedArray) -> NDArray[np.generic]:
-    if column.null_count:
+def _numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
+    if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(
             f"{file}: column {name!r} has {column.null_count} missing values, the first in row {row}",
