@@ -117,7 +117,7 @@ def pulling(system: ContactSystem, active: Array, multiplier: Array) -> Array:
     return any_row(system, multiplier < -PULL) & can_open(system, active) & active
 
 
-def reached(system: ContactSystem, active: Array, c: ConstraintVector, cd: ConstraintVector) -> Tensor:
+def reached(system: ContactSystem, active: Array, c: Array, cd: Array) -> Array:
     """Open contacts that the robot has reached, c ≤ 0 while ċ < 0, and that therefore close.
 
     Args:
