@@ -17,7 +17,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.identification import parameter_vector, regressor
-from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, inertial_parameters, log_cholesky
+from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, log_cholesky
 from forcegp.robot.inertia import pseudo_inertia as pseudo_inertia_of
 from forcegp.robot.model import RobotModel
 
@@ -141,16 +141,13 @@ def _minimise(
     """Levenberg-Marquardt on ½ xᵀ gram x − rightᵀ x over x = ((π(θ) − π₀)/S, friction)."""
     centre, links = parameter_vector(robot).detach().reshape(-1, 10), prior.reshape(-1, 10)
 
-    def scaled(t: Tensor) -> Tensor:
-        return inertial_parameters(*from_pseudo_inertia(from_log_cholesky(t)))
-
     def at(t: Tensor, f: Tensor) -> Tensor:
-        return torch.cat([((scaled(t) - centre) / links).flatten(), f])
+        return torch.cat([((_parameters(from_log_cholesky(t)) - centre) / links).flatten(), f])
 
     x, damping = at(theta, friction), 1e-3
     value = 0.5 * x @ gram @ x - right @ x
     for _ in range(STEPS):
-        by_link = torch.func.vmap(torch.func.jacrev(scaled))(theta) / links[..., None]
+        by_link = _slopes(theta) / links[..., None]
         J = torch.block_diag(*by_link, torch.eye(len(friction), dtype=x.dtype))
         H, slope = J.mT @ gram @ J, J.mT @ (gram @ x - right)
         step = torch.linalg.solve(H + damping * H.diagonal().clamp(min=1e-12).diag(), -slope)
@@ -166,3 +163,30 @@ def _minimise(
         else:
             damping *= 10.0
     return theta, x
+
+
+def _parameters(J: Tensor) -> Tensor:
+    """π `(..., 10)` of pseudo-inertias `(..., 4, 4)`, a linear map: I_o = tr(Σ) 1 − Σ."""
+    S = J[..., :3, :3]
+    I = S.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * torch.eye(3, dtype=J.dtype) - S
+    rows, columns = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+    return torch.cat([J[..., 3, 3:], J[..., :3, 3], I[..., rows, columns]], dim=-1)
+
+
+def _slopes(theta: Tensor) -> Tensor:
+    """∂π/∂θ `(nq, 10, 10)` in closed form: J = U Uᵀ, and every entry of U depends on α and one more."""
+    scale = theta[:, 0].exp()
+    dU = theta.new_zeros(len(theta), 10, 4, 4)
+    for k, (i, j) in enumerate(
+        ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)), start=1
+    ):
+        dU[:, k, i, j] = scale * (theta[:, k].exp() if i == j else 1.0)
+    s12, s23, s13, *t = (scale * theta[:, k] for k in range(4, 10))
+    for k, value in (((0, 1), s12), ((1, 2), s23), ((0, 2), s13), *(((i, 3), t[i]) for i in range(3))):
+        dU[:, 0, k[0], k[1]] = value
+    for i in range(3):
+        dU[:, 0, i, i] = dU[:, i + 1, i, i]
+    U = dU[:, 0].clone()
+    dU[:, 0, 3, 3] = U[:, 3, 3] = scale
+    dJ = dU @ U[:, None].mT
+    return _parameters(dJ + dJ.mT).mT
