@@ -14,7 +14,19 @@ import forcegp
 ROOT = Path(forcegp.__file__).parent
 
 LAYERS = (
-    ("errors", "types", "files", "linalg", "batchlast", "threads"),
+    (
+        "limits",
+        "errors",
+        "types",
+        "temporary",
+        "exchange",
+        "files",
+        "destination",
+        "memory",
+        "linalg",
+        "batchlast",
+        "threads",
+    ),
     ("robot",),
     ("kinematics", "friction", "dynamics"),
     ("compiled", "derivatives", "identification"),
@@ -26,7 +38,9 @@ LAYERS = (
     ("control",),
     ("simulate",),
     ("scene",),
-    ("rollout", "models"),
+    ("logs", "checks"),
+    ("rollout",),
+    ("models",),
     ("evaluation",),
     ("report",),
     ("paper",),

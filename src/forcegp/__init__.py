@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from forcegp.forces.priors.normal_force import NormalForcePrior
     from forcegp.forces.priors.operator import OperatorForcePrior
     from forcegp.gp.optimise import LearningOptions
+    from forcegp.logs import read_log
     from forcegp.models.analytical import AnalyticalModel
     from forcegp.models.independent_gp import IndependentGP
     from forcegp.models.load import load_model
@@ -77,6 +78,7 @@ _HOME = {
     "load_model": "models.load",
     "load_robot": "robot",
     "load_scene": "scene",
+    "read_log": "logs",
 }
 """The subpackage of each public name; empty where the name is a module itself."""
 
@@ -120,6 +122,7 @@ __all__ = [
     "load_model",
     "load_robot",
     "load_scene",
+    "read_log",
 ]
 
 

@@ -15,7 +15,7 @@ import forcegp
 from forcegp import evaluate
 from forcegp.errors import DataError, ModelError
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.base import FitProgress, FitResult, Model, Prediction
+from forcegp.models.base import Prediction, Predictor
 from random_data import NOISE_STD, random_data, table_system
 
 ROUNDING = 1e-12
@@ -25,7 +25,7 @@ system = table_system()
 data = random_data(system, 3000)
 
 
-class KnownError(Model):
+class KnownError(Predictor):
     """Predicts the noise-free acceleration plus a given error, and claims a given standard deviation."""
 
     kind = "known_error"
@@ -33,9 +33,6 @@ class KnownError(Model):
     def __init__(self, error: Tensor, std: float | None, noise_std: float = NOISE_STD) -> None:
         self.system, self.error, self.std, self.noise_std = system, error, std, noise_std
         self.seen = 0
-
-    def fit(self, data: forcegp.Dataset, *, progress: FitProgress | None = None) -> FitResult:
-        raise NotImplementedError
 
     def save(self, path: str | Path) -> None:
         raise NotImplementedError
@@ -49,6 +46,7 @@ class KnownError(Model):
         *,
         active: Tensor | None = None,
         covariance: bool = True,
+        system: forcegp.ConstrainedSystem | None = None,
     ) -> Prediction:
         rows = slice(self.seen, self.seen + len(q))
         self.seen += len(q)

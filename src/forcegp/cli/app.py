@@ -9,6 +9,7 @@ import typer
 
 from forcegp.cli.evaluate import evaluate
 from forcegp.cli.fit import fit
+from forcegp.cli.import_ import import_
 from forcegp.cli.predict import predict
 from forcegp.cli.reproduce import reproduce
 from forcegp.cli.rollout import rollout
@@ -29,6 +30,7 @@ app = typer.Typer(
 )
 for command in (reproduce, simulate, select, fit, predict, evaluate, rollout):
     app.command()(command)
+app.command("import")(import_)
 
 
 def _version(wanted: bool) -> bool:

@@ -16,7 +16,7 @@ from forcegp.evaluation.predicted import CHUNK_STATES, Predicted, Progress, pred
 from forcegp.evaluation.scores import Errors, JointErrors, moving_joints
 from forcegp.evaluation.uncertainty import MultiplierScore, Uncertainty, multiplier_scores, nlpd
 from forcegp.evaluation.verdict import PredictorScores, Verdict, sentence, verdicts
-from forcegp.models.base import Model
+from forcegp.models.base import Predictor
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Evaluation:
 
 
 def evaluate(
-    model: Model,
+    model: Predictor,
     data: Dataset,
     *,
     train: Dataset | None = None,
@@ -128,8 +128,8 @@ def evaluate(
         train: data that the trivial predictors are fitted to; by default each half of `data` (in order
             of its rows) is predicted by those fitted to the other half.
         compare: whether to fit the trivial predictors at all.
-        system: robot and contacts before any learning, for the constraint residual, the torque errors
-            and the trivial predictors; the model's by default.
+        system: robot and contacts for the constraint residual, the torque errors and the trivial
+            predictors; by default those of the model, before it learned any parameters of theirs.
         progress: called with the number of states predicted and their total number.
 
     Returns:
@@ -143,14 +143,14 @@ def evaluate(
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
     data.check_robot(model.system.robot)
-    system = system or model.system
-    predicted = predict_all(model, data, system, progress)
+    before = system or getattr(model, "specified", model.system)
+    predicted = predict_all(model, data, system or model.system, progress)
     clean, noise_std = data.extras.get("qdd_clean"), predicted.noise_std
     spread = None
     if predicted.variance is not None and noise_std is not None:
         spread = Uncertainty.of(predicted.mean, predicted.variance, noise_std, data.qdd, clean)
     residual = predicted.residual
-    scores = _predictors(predicted, spread, system, data, train) if compare else ()
+    scores = _predictors(predicted, spread, before, data, train) if compare else ()
     return Evaluation(
         kind=model.kind,
         samples=len(data),

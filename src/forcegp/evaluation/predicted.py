@@ -11,13 +11,11 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.models.base import Model
+from forcegp.models.base import Predictor
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.models.structured_problem import NOISE
 
 CHUNK_STATES = 2000
 """States predicted at a time."""
-LEARNED_NOISE = f"{NOISE}0.log_noise_std"
 Progress = Callable[[int, int], None]
 
 
@@ -40,7 +38,7 @@ class Predicted:
 
 
 def predict_all(
-    model: Model, data: Dataset, system: ConstrainedSystem, progress: Progress | None
+    model: Predictor, data: Dataset, system: ConstrainedSystem, progress: Progress | None
 ) -> Predicted:
     """Predict a data set chunk by chunk.
 
@@ -75,9 +73,10 @@ def _residual(system: ConstrainedSystem, data: Dataset, rows: slice, qdd: Tensor
     return residual[system.active_rows(active, qdd.shape[:-1])]
 
 
-def _noise_std(model: Model, data: Dataset) -> Tensor | None:
+def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
     """The noise that the model assumes for measured accelerations, or the data's, `(nq,)`."""
-    if isinstance(model, StructuredGP) and model.learn_noise and LEARNED_NOISE in model.hyperparameters:
-        return model.hyperparameters[LEARNED_NOISE].exp()
-    noise = getattr(model, "noise_std", data.header.noise_std)
+    if isinstance(model, StructuredGP):
+        return model.fitted.problem.noise_at(model.hyperparameters, 0)
+    noise = getattr(model, "noise_std", None)
+    noise = data.header.noise_std if noise is None else noise
     return None if noise is None else torch.as_tensor(noise, dtype=data.dtype).expand(data.nq).to(data.device)

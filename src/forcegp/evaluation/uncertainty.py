@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.models.base import Model
+from forcegp.models.base import Predictor
 
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Probabilities of the central intervals whose coverage is counted."""
@@ -84,7 +84,7 @@ class MultiplierScore:
 
 
 @torch.no_grad()
-def multiplier_scores(model: Model, data: Dataset, chunk: int) -> tuple[MultiplierScore, ...]:
+def multiplier_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[MultiplierScore, ...]:
     """Compare λ with what a sensor or simulator logged as `multiplier`, contact by contact.
 
     Args:

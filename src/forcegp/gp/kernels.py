@@ -16,15 +16,8 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.draws import (
-    Features,
-    FunctionDraw,
-    LinearDraw,
-    OuterDraw,
-    ProductDraw,
-    SumDraw,
-    stacked,
-)
+from forcegp.gp.draws import FunctionDraw, LinearDraw, OuterDraw, ProductDraw, SumDraw
+from forcegp.gp.features import Features, stacked
 
 Parameters = Mapping[str, Tensor]
 Initial = dict[str, Tensor]

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.files import Header
-from forcegp.forces.states import states
+from forcegp.forces.priors.base import CONSTRAINT
+from forcegp.forces.quantities import states
 from forcegp.gp.structured_covariance import Block as Rows
 from forcegp.gp.structured_covariance import cross_gram
 from forcegp.models.structured_gp import StructuredGP
@@ -64,13 +65,13 @@ def covariance_blocks(model: StructuredGP, data: Dataset, name: str) -> Covarian
     system, fitted = model.system, model.posterior
     at = states(system, data.q, data.qd, data.tau, data.active(system.contact_names))
     # A force along the constraint, which no acceleration shows, is left out of the plot.
-    pairs = [pair for pair in zip(fitted.priors, fitted.scales, strict=True) if pair[0].measurable]
+    pairs = [pair for pair in zip(fitted.priors, fitted.scales, strict=True) if pair[0].target != CONSTRAINT]
     priors = [prior for prior, _ in pairs]
     features = tuple(scale.apply(prior.features(system, at)) for prior, scale in pairs)
     E = tuple(prior.operator(system, at) for prior in priors)
     force = Rows(features, E, torch.zeros_like(at.q))
     acceleration = Rows(features, tuple(at.eom.H @ operator for operator in E), torch.zeros_like(at.q))
-    k_Q, k_qdd = (cross_gram(priors, fitted.params, [rows], [rows]) for rows in (force, acceleration))
+    k_Q, k_qdd = (cross_gram(priors, model.hyperparameters, [rows], [rows]) for rows in (force, acceleration))
     eigenvalues = torch.linalg.eigvalsh(k_qdd)
     return CovarianceData(
         model=name,

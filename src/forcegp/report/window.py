@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.files import Header
-from forcegp.models.base import Model
+from forcegp.models.base import Predictor
 from forcegp.report.style import INK, Picture, colour, draw, label
 from forcegp.report.values import Series, as_tensor, columns, series
 
@@ -62,7 +62,7 @@ def opening(data: Dataset, seconds: float) -> Dataset:
 
 
 @torch.no_grad()
-def predicted_window(model: Model, data: Dataset, name: str) -> WindowData:
+def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
     """Mean and standard deviation of the accelerations at the samples of a window.
 
     Args:

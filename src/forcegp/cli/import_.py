@@ -1,0 +1,110 @@
+"""`forcegp import`: from the log of any program to a data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from forcegp.cli.common import AsJson, progress_bar, show
+
+if TYPE_CHECKING:
+    from forcegp.constraints import ConstrainedSystem
+    from forcegp.logs import Imported
+
+
+def import_(
+    log: Annotated[Path, typer.Argument(help="Log file or folder.")],
+    scene: Annotated[
+        str | None, typer.Option("--scene", "-s", help="Scene file, or the name of a bundled one.")
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="In place of a scene: URDF or MJCF file, or a bundled robot.")
+    ] = None,
+    mapping: Annotated[
+        str | None, typer.Option("--mapping", "-m", help="Mapping file, or the name of a bundled one.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Where the data set goes (.parquet).")
+    ] = None,
+    guess: Annotated[
+        Path | None, typer.Option(help="Write a mapping to this file for you to check, and import nothing.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Import a log: CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bags, MCAP or LeRobot.
+
+    A mapping in TOML says which column is which joint, with units, signs and frames; --guess writes one.
+
+    [bold]Examples[/bold]
+
+    forcegp import run.csv --scene my_scene.toml --guess mapping.toml
+
+    forcegp import run.csv --scene my_scene.toml --mapping mapping.toml --out log.parquet
+
+    forcegp import run.bag --robot ur3.urdf --mapping ur3_bag --out log.parquet
+    """
+    from forcegp.errors import ForceGPError
+    from forcegp.logs import import_log
+
+    if (scene is None) == (robot is None):
+        raise ForceGPError("nothing says which robot moved", hint="give either --scene or --robot")
+    system = _system(scene, robot)
+    if guess is not None:
+        show(_guess(log, system, guess), as_json)
+        return
+    if out is None or out.suffix.lower() != ".parquet":
+        raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
+    with progress_bar(f"reading {log.name}", 1) as advance:
+        imported = import_log(log, system, mapping, progress=lambda done, total: advance(done, total))
+    imported.data.write(out)
+    show(_summary(imported) | {"file": str(out)} if not as_json else _json(imported, out), as_json)
+
+
+def _system(scene: str | None, robot: str | None) -> ConstrainedSystem:
+    from forcegp.constraints import ConstrainedSystem
+    from forcegp.robot import load_robot
+    from forcegp.scene import load_scene
+
+    return load_scene(scene).system() if scene is not None else ConstrainedSystem(load_robot(str(robot)))
+
+
+def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]:
+    from forcegp.files import write_text
+    from forcegp.logs.guess import guess_mapping
+
+    with progress_bar(f"looking at {log.name}", 1) as advance:
+        guessed = guess_mapping(log, system, progress=lambda done, total: advance(done, total))
+    write_text(out, guessed.toml)
+    doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
+    return {"mapping": str(out), **doubts, "next": f"check {out}, then import with --mapping {out}"}
+
+
+def _summary(imported: Imported) -> dict[str, object]:
+    """Rows, trajectories and period, then what was found and done."""
+    data, report = imported.data, imported.report
+    result: dict[str, object] = {
+        "rows": f"{len(data)} of {report.rows_read}",
+        "segments": int(data.segment[-1]) + 1,
+        "period_s": data.header.dt,
+    }
+    result |= {f"found_{i + 1}": finding.message for i, finding in enumerate(report.findings)}
+    return result | {f"step_{i + 1}": step for i, step in enumerate(report.steps)}
+
+
+def _json(imported: Imported, out: Path) -> dict[str, object]:
+    from dataclasses import asdict
+
+    data, report = imported.data, imported.report
+    return {
+        "file": str(out),
+        "format": report.format,
+        "rows_read": report.rows_read,
+        "rows": len(data),
+        "segments": len(data.segment.unique()),
+        "period_s": data.header.dt,
+        "noise_std": data.header.noise_std,
+        "findings": [asdict(finding) for finding in report.findings],
+        "steps": report.steps,
+    }

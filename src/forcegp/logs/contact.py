@@ -1,0 +1,206 @@
+"""Intervals in which a contact is closed, with the evidence for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.errors import DataError
+from forcegp.logs import evidence
+from forcegp.logs.mapping import Mapping
+from forcegp.logs.report import Report
+from forcegp.logs.sections import ContactSection
+from forcegp.logs.signals import Array, Signals, runs
+
+MAD_TO_STD = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
+SEPARATION = 6.0
+"""Least distance between the two levels of force, in standard deviations of the open one."""
+RELEASE_STD = 4.0
+"""A contact counts as closed from where the force leaves the open level by so many of its deviations."""
+TOUCHING = 1e-3
+"""How near the surface the touching point is in contact, unless the mapping says otherwise [m]."""
+BINS = 512
+"""Bins of the histogram that the two levels are told apart in."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a contact's state was read from.
+
+    Attributes:
+        contact: its name.
+        source: `wrench`, `multiplier` or `distance`.
+        threshold, release: closed from `threshold` on, and then up to `release` on either side [N] or [m].
+        closed_level, closed_spread, open_level, open_spread: median and deviation of the evidence in each
+            state; NaN where the state does not occur.
+        intervals: first and last time of each closed interval [s].
+        merged: intervals that were too short and got their neighbours' state.
+    """
+
+    contact: str
+    source: str
+    threshold: float
+    release: float
+    closed_level: float
+    closed_spread: float
+    open_level: float
+    open_spread: float
+    intervals: tuple[tuple[float, float], ...]
+    merged: int
+
+    def sentence(self) -> str:
+        """The evidence in one sentence."""
+        unit, scale = ("mm", 1e3) if self.source == "distance" else ("N", 1.0)
+        closed, spread = scale * self.closed_level, scale * self.closed_spread
+        return (
+            f"contact {self.contact!r} by {self.source}: {len(self.intervals)} closed intervals, "
+            f"{closed:.3g} ± {spread:.2g} {unit} closed, {scale * self.open_level:.3g} ± "
+            f"{scale * self.open_spread:.2g} {unit} open, threshold {scale * self.threshold:.3g} {unit}"
+        )
+
+
+def detect(signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: Report) -> list[Evidence]:
+    """Set `signals.contact` for every contact of the scene.
+
+    Args:
+        signals: the log, with `qd` and `qdd` where a contact is found from λ.
+        system: the robot with its contacts.
+        mapping: how each contact's state is known.
+        report: gets the evidence.
+
+    Returns:
+        The evidence for each contact that was detected.
+
+    Raises:
+        DataError: the evidence does not tell two states apart.
+        MappingError: the mapping does not say how a contact is known, or names one that the scene lacks.
+    """
+    sections = mapping.sections.contact
+    for name in sections:
+        if name not in system.contact_names:
+            listing = ", ".join(system.contact_names) or "no contacts"
+            raise mapping.error(("contact", name), f"the scene has no contact {name!r}", listing)
+    found, states = [], {}
+    for contact in system.contacts:
+        if contact.name not in sections:
+            raise mapping.error(
+                ("contact",),
+                f"nothing says whether contact {contact.name!r} is closed",
+                expected=f"[contact.{contact.name}] with source = column, wrench, multiplier, distance, "
+                "always or never",
+            )
+        section = sections[contact.name]
+        if section.source in ("always", "never"):
+            states[contact.name] = np.full(len(signals), section.source == "always")
+        elif section.source == "column":
+            states[contact.name] = signals.contact[contact.name]
+        elif not isinstance(contact, SurfaceContact):
+            key = ("contact", contact.name, "source")
+            raise mapping.error(
+                key, "only a contact with a surface can be detected", "column, always or never"
+            )
+        else:
+            state, seen = _detect(signals, system, mapping, contact, section)
+            states[contact.name] = state
+            found.append(seen)
+            report.find("contact", seen.sentence(), signals.row[state])
+            if seen.merged:
+                report.find("short contact", f"{seen.merged} intervals of {contact.name!r} were too short")
+    signals.contact = states
+    return found
+
+
+def _detect(
+    signals: Signals,
+    system: ConstrainedSystem,
+    mapping: Mapping,
+    contact: SurfaceContact,
+    section: ContactSection,
+) -> tuple[NDArray[np.bool_], Evidence]:
+    if section.source == "distance":
+        values = evidence.distance(signals, system, contact)
+        high = section.threshold if section.threshold is not None else TOUCHING
+        low = section.release if section.release is not None else high
+        closed = hysteresis(-values, -high, -low, signals.segment)
+    else:
+        if section.source == "wrench":
+            values = evidence.normal_force(signals, system, mapping, contact)
+        else:
+            values = evidence.multiplier(signals, system, contact)
+        high, low = force_levels(values, contact.name, section)
+        closed = hysteresis(values, high, low, signals.segment)
+    merged = _merge_short(closed, signals, section.shortest)
+    level = {state: _level(values[closed == state]) for state in (True, False)}
+    spans = [rows for rows in runs(signals.segment, closed) if closed[rows.start]]
+    times = tuple((float(signals.t[s.start]), float(signals.t[s.stop - 1])) for s in spans)
+    return closed, Evidence(
+        contact.name, section.source, high, low, *level[True], *level[False], times, merged
+    )
+
+
+def force_levels(values: Array, name: str, section: ContactSection) -> tuple[float, float]:
+    """Force from which a contact is closed, and the force up to which that interval then extends [N].
+
+    The first is the one that parts the forces into the two groups with the least variance within them (Otsu
+    1979); the second lies `RELEASE_STD` deviations above the median of the open group.
+
+    Raises:
+        DataError: the two groups are not apart, so that the log may hold one state only.
+    """
+    if section.threshold is not None:
+        return section.threshold, section.release if section.release is not None else 0.5 * section.threshold
+    counts, edges = np.histogram(values, BINS)
+    centers = 0.5 * (edges[1:] + edges[:-1])
+    below, sums = np.cumsum(counts), np.cumsum(counts * centers)
+    above = below[-1] - below
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
+    high = float(edges[1:][int(np.nanargmax(between[:-1]))])
+    open_level, open_spread = _level(values[values <= high])
+    closed_level, _ = _level(values[values > high])
+    if not closed_level - open_level > SEPARATION * open_spread:
+        raise DataError(
+            f"the {section.source} does not show when contact {name!r} is closed",
+            expected=f"two levels at least {SEPARATION:g} standard deviations apart",
+            got=f"{open_level:.3g} ± {open_spread:.2g} N and {closed_level:.3g} N",
+            hint=f"set threshold under [contact.{name}], or source to always, never or distance",
+        )
+    low = section.release if section.release is not None else open_level + RELEASE_STD * open_spread
+    return high, min(low, high)
+
+
+def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Stretches above `low` that reach `high` somewhere.
+
+    >>> hysteresis(np.array([0.0, 2, 5, 2, 0, 2, 0]), 4.0, 1.0, np.zeros(7, dtype=np.int64)).astype(int)
+    array([0, 1, 1, 1, 0, 0, 0])
+    """
+    above = values >= low
+    result = np.zeros(len(values), dtype=bool)
+    for rows in runs(segment, above):
+        result[rows] = above[rows.start] and bool((values[rows] >= high).any())
+    return result
+
+
+def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -> int:
+    """Give intervals that are shorter than `shortest` [s], between two of the other state, that state."""
+    count = 0
+    for trajectory in signals.runs():
+        inner = runs(closed[trajectory])[1:-1]
+        for rows in inner:
+            span = slice(trajectory.start + rows.start, trajectory.start + rows.stop)
+            if signals.t[span.stop - 1] - signals.t[span.start] < shortest:
+                closed[span] = ~closed[span]
+                count += 1
+    return count
+
+
+def _level(values: Array) -> tuple[float, float]:
+    if not len(values):
+        return float("nan"), float("nan")
+    middle = float(np.median(values))
+    return middle, MAD_TO_STD * float(np.median(np.abs(values - middle)))

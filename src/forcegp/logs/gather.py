@@ -1,0 +1,207 @@
+"""From a table and its mapping to quantities in SI units, in the robot's joint order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from forcegp.errors import DataError
+from forcegp.logs import clock, resample, torque, units
+from forcegp.logs.mapping import Mapping
+from forcegp.logs.readers import read
+from forcegp.logs.report import Report, listed
+from forcegp.logs.signals import Array, Signals
+from forcegp.logs.table import LogTable, Progress, Stream
+
+SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
+"""Quantity of a mapping → name in a data set."""
+
+
+def gather(
+    path: str | Path,
+    mapping: Mapping,
+    joints: Sequence[str],
+    report: Report,
+    progress: Progress | None = None,
+    rows: int | None = None,
+) -> Signals:
+    """Read the mapped columns of a log onto one clock.
+
+    Args:
+        path: the log.
+        mapping: what its columns mean.
+        joints: the robot's joints.
+        report: gets what was found.
+        progress: called while the log is read.
+        rows: read no more rows than this, where the format allows to stop early.
+
+    Raises:
+        DataError: the log cannot be read, or a value or a time stamp is not usable; names the rows.
+        MappingError: the mapping does not fit the robot.
+    """
+    needed = _needed(mapping, joints)
+    table = read(path, wanted=needed.__contains__, rows=rows, progress=progress)
+    report.format = table.format
+    for remark in table.remarks:
+        report.find("reader", remark)
+    return _Gathering(table, mapping, tuple(joints), report).run()
+
+
+def _needed(mapping: Mapping, joints: Sequence[str]) -> set[str]:
+    """Names of the columns that the mapping speaks of."""
+    sections = mapping.sections
+    names = {sections.time.column, *([sections.time.segment] if sections.time.segment else [])}
+    for name in SYMBOLS:
+        if mapping.quantity(name) is not None:
+            names |= set(mapping.columns_of(name, joints))
+    if sections.wrench is not None:
+        names |= {*sections.wrench.force, *(sections.wrench.torque or ())}
+    return names | {c.column for c in sections.contact.values() if c.column is not None}
+
+
+class _Gathering:
+    """The columns of a table while they are taken out of it."""
+
+    def __init__(self, table: LogTable, mapping: Mapping, joints: tuple[str, ...], report: Report) -> None:
+        self.table, self.mapping, self.joints, self.report = table, mapping, joints, report
+        self.time = mapping.sections.time
+        position = mapping.columns_of("position", joints)
+        section = mapping.sections.position
+        self.reference = table.stream_of(position[0], section.stream)
+
+    def run(self) -> Signals:
+        """The quantities, those of the reference stream first."""
+        own, others = {}, {}
+        for name, symbol in SYMBOLS.items():
+            if self.mapping.quantity(name) is not None:
+                stream, values = self._vector(name)
+                (own if stream is self.reference else others)[symbol] = (stream, values)
+        if self.mapping.sections.wrench is not None:
+            stream, values = self._wrench()
+            (own if stream is self.reference else others)["wrench"] = (stream, values)
+        flags = self._flags()
+        for name, (stream, values) in flags.items():
+            (own if stream is self.reference else others)[f"contact {name}"] = (stream, values)
+        signals = self._reference({name: values for name, (_, values) in own.items()})
+        for name, (stream, values) in others.items():
+            t = self._stamps(stream)
+            good = np.isfinite(values).all(axis=1) & np.isfinite(t)
+            resample.join(signals, name, t[good], values[good], self.time.gap, self.report)
+        for name in flags:
+            signals.contact[name] = signals.vectors.pop(f"contact {name}")[:, 0] >= 0.5
+        return signals
+
+    def _take(self, stream: Stream, column: str) -> Array:
+        return self.table.stream_of(column, stream.name).columns[column]
+
+    def _vector(self, name: str) -> tuple[Stream, Array]:
+        """A joint vector in SI units on the joint side."""
+        section = self.mapping.quantity(name)
+        assert section is not None
+        columns = self.mapping.columns_of(name, self.joints)
+        stream = self.table.stream_of(columns[0], section.stream)
+        scale, offset = torque.factors(self.mapping, name, self.joints)
+        result = np.empty((len(stream), len(self.joints)))
+        for i, column in enumerate(columns):
+            values = self._take(stream, column)
+            np.subtract(values, offset[i], out=result[:, i])
+            result[:, i] *= scale[i]
+            _release(stream, column)
+        return stream, result
+
+    def _wrench(self) -> tuple[Stream, Array]:
+        """Force and moment as the sensor gives them, in SI units, offsets taken off; no moment is zero."""
+        section = self.mapping.sections.wrench
+        assert section is not None
+        stream = self.table.stream_of(section.force[0], section.stream)
+        result = np.zeros((len(stream), 6))
+        names = (*section.force, *(section.torque or ()))
+        force, moment = (
+            units.QUANTITY["force"][section.force_unit],
+            units.QUANTITY["moment"][section.torque_unit],
+        )
+        for i, column in enumerate(names):
+            result[:, i] = (self._take(stream, column) - section.offset[i]) * (force if i < 3 else moment)
+        return stream, result
+
+    def _flags(self) -> dict[str, tuple[Stream, Array]]:
+        found = {}
+        for name, section in self.mapping.sections.contact.items():
+            if section.source == "column" and section.column is not None:
+                stream = self.table.stream_of(section.column, section.stream)
+                values = self._take(stream, section.column)
+                wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
+                if len(wrong):
+                    raise DataError(
+                        f"{self.table.source}: column {section.column!r} is no flag in row {wrong[0]}",
+                        expected="0 or 1",
+                        got=values[wrong[0]],
+                    )
+                found[name] = (stream, values[:, None])
+        return found
+
+    def _stamps(self, stream: Stream) -> Array:
+        """Time stamps of a stream [s]."""
+        holder = stream if self.time.column in stream.columns else None
+        if holder is None:
+            if len(self.table.streams) > 1 and stream is not self.reference:
+                raise DataError(
+                    f"{self.table.source}: stream {stream.name!r} has no column {self.time.column!r}",
+                    expected="a time stamp in every stream that is used",
+                )
+            holder = self.table.stream_of(self.time.column, self.time.stream)
+        return holder.columns[self.time.column] * units.TIME[self.time.unit]
+
+    def _reference(self, vectors: dict[str, Array]) -> Signals:
+        """The stream of the positions: complete rows, cropped, cut into trajectories."""
+        t = self._stamps(self.reference)
+        self.report.rows_read = len(t)
+        segment = np.zeros(len(t), dtype=np.int64)
+        if self.time.segment is not None:
+            numbers = self._take(self.reference, self.time.segment)
+            segment[1:] = np.cumsum(numbers[1:] != numbers[:-1])
+        signals = Signals(self.joints, t, np.arange(len(t)), segment, vectors)
+        self._complete(signals)
+        clock.drop_repeated(signals, self.report)
+        self._crop(signals)
+        clock.split(signals, self.time.gap, self.report)
+        if "tau" in signals.vectors:
+            clock.find_held(signals, self.time.held == "drop", self.report)
+        return signals
+
+    def _complete(self, signals: Signals) -> None:
+        bad = ~np.isfinite(signals.t)
+        for values in signals.vectors.values():
+            bad |= ~np.isfinite(values).all(axis=1)
+        if not bad.any():
+            return
+        rows = signals.row[bad]
+        if self.time.missing == "error":
+            raise DataError(
+                f"{self.table.source}: values are missing or not finite in "
+                f"row{'s' * (len(rows) > 1)} {listed(rows)}",
+                expected="a number in every mapped column",
+                got=f"{len(rows)} incomplete rows of {len(signals)}",
+                hint='missing = "drop" under [time] drops them',
+            )
+        self.report.find("missing", f"{len(rows)} incomplete rows were dropped", rows)
+        signals.keep(~bad)
+
+    def _crop(self, signals: Signals) -> None:
+        start = -np.inf if self.time.start is None else self.time.start
+        stop = np.inf if self.time.stop is None else self.time.stop
+        inside = (signals.t >= start) & (signals.t <= stop)
+        if not inside.any():
+            span = f"{signals.t.min():.6g} to {signals.t.max():.6g} s" if len(signals) else "no complete row"
+            raise DataError(f"{self.table.source}: no row between start and stop", expected=span)
+        if not inside.all():
+            self.report.did(f"kept the {inside.sum()} rows from {start:g} to {stop:g} s")
+            signals.keep(inside)
+
+
+def _release(stream: Stream, column: str) -> None:
+    """Let go of a column that has been taken, so that memory holds it once."""
+    if isinstance(stream.columns, dict) and len(stream.columns) > 1:
+        del stream.columns[column]

@@ -1,0 +1,231 @@
+"""`--guess`: a mapping proposed from headings, magnitudes and the robot's own dynamics.
+
+Units and signs are tried: the logged velocity is compared with the derivative of the position, and the logged
+torque with the inverse dynamics of the scene's robot, gravity included. What is left open is marked CHECK.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from forcegp import dynamics
+from forcegp.constraints import ConstrainedSystem
+from forcegp.logs import headings, smoothing, units
+from forcegp.logs.draft import Draft
+from forcegp.logs.gather import gather
+from forcegp.logs.mapping import Mapping, parse_mapping
+from forcegp.logs.readers import read
+from forcegp.logs.report import Report
+from forcegp.logs.signals import Array, Signals
+from forcegp.logs.table import LogTable, Progress, Stream
+from forcegp.robot import RobotModel
+
+ROWS = 100_000
+"""Rows that are looked at."""
+TRIED_ROWS = 3000
+"""Rows on which the inverse dynamics are evaluated."""
+DEFAULT = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s2", "torque": "Nm"}
+"""Units that are assumed before any is tried."""
+MOST_RADIANS, LEAST_DEGREES = 60.0, 0.02
+"""Beyond the first, positions are in degrees; below the second, a log in degrees would not move at all."""
+CLEARER = 1.5
+"""A unit is certain if the torque fits so much better than in the other one."""
+NEAR = 1.3
+"""A ratio is that of a unit if it is within this factor."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A proposed mapping.
+
+    Attributes:
+        toml: the file, with comments.
+        doubts: what the user must check, one sentence each.
+    """
+
+    toml: str
+    doubts: tuple[str, ...]
+
+    def mapping(self) -> Mapping:
+        """The proposal as a mapping."""
+        return parse_mapping(self.toml.encode(), "proposed mapping")
+
+
+def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Guess:
+    """Propose a mapping for a log.
+
+    Args:
+        path: the log.
+        system: the robot with its contacts.
+        progress: called while the log is read.
+
+    Raises:
+        DataError: the log cannot be read.
+        MappingError: time, positions or torques are not recognised.
+    """
+    table = read(path, rows=ROWS, progress=progress)
+    draft = Draft(str(path))
+    stream = headings.find_time(table, draft)
+    headings.find_families(stream, system.robot, draft)
+    headings.find_wrench(table, system.robot, draft)
+    _try(path, draft, system, _possible_units(draft, stream))
+    _contacts(table, draft, system)
+    return Guess(draft.toml(), tuple(draft.doubts))
+
+
+def _possible_units(draft: Draft, stream: Stream) -> list[str]:
+    """Units that the range of the positions allows."""
+    family = draft.families["position"]
+    if family.declared and family.unit is not None:
+        return [family.unit]
+    reach = max(float(np.nanmax(np.abs(stream.columns[c]))) for c in family.columns.values())
+    draft.say("position", f"values up to {reach:.4g}")
+    return ["deg"] if reach > MOST_RADIANS else ["rad"] if reach < LEAST_DEGREES else ["rad", "deg"]
+
+
+def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:
+    """Read the log by the draft, and settle what its values can: units, and the sign of the torque."""
+    for quantity, family in draft.families.items():
+        family.unit = family.unit or DEFAULT[quantity]
+    fits = {}
+    for unit in possible:
+        draft.families["position"].unit = unit
+        _, correlation = torque_slopes(_signals(path, draft, system, without="velocity"), system.robot)
+        fits[unit] = float((correlation**2).mean())
+    best = max(fits, key=fits.__getitem__)
+    draft.families["position"].unit = best
+    if len(fits) > 1:
+        listing = ", ".join(f"{fit:.2f} in {unit}" for unit, fit in fits.items())
+        doubt = fits[best] < CLEARER * min(fits.values())
+        draft.say("position", f"mean squared correlation of the torque with the model: {listing}", doubt)
+    if "velocity" in draft.families:
+        _velocity_unit(draft, _signals(path, draft, system))
+    _torque(draft, _signals(path, draft, system), system.robot)
+
+
+def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
+    """The log by the draft, `without` one quantity, with accelerations; incomplete rows left out."""
+    families = {name: family for name, family in draft.families.items() if name != without}
+    toml = (
+        replace(draft, families=families, contacts={})
+        .toml()
+        .replace("[time]\n", '[time]\nmissing = "drop"\n', 1)
+    )
+    mapping = parse_mapping(toml.encode(), "proposed mapping")
+    signals = gather(path, mapping, system.robot.joint_names, Report(str(path)), rows=ROWS)
+    smoothing.even_clock(signals, None, Report(str(path)))
+    signals.contact = {}
+    settings = mapping.sections.derivatives.model_copy(update={"source": "position"})
+    smoothing.complete(signals, settings, Report(str(path)))
+    return signals
+
+
+def _velocity_unit(draft: Draft, trial: Signals) -> None:
+    """The slope of the logged velocity over the derivative of the position names its unit and sign."""
+    family = draft.families["velocity"]
+    q, qd = trial.vectors["q"], trial.vectors["qd"]
+    inner = np.flatnonzero(trial.segment[2:] == trial.segment[:-2]) + 1
+    rate = (q[inner + 1] - q[inner - 1]) / (trial.t[inner + 1] - trial.t[inner - 1])[:, None]
+    slopes = (rate * qd[inner]).sum(axis=0) / np.maximum((rate**2).sum(axis=0), 1e-300)
+    moving = rate.std(axis=0) > 0.05 * rate.std(axis=0).max()
+    slope = float(np.median(slopes[moving]))
+    current = units.VELOCITY[family.unit or "rad/s"]
+    ratios = {u: 1.0 / units.VELOCITY[u] for u in ("rad/s", "deg/s", "rpm", "rev/s", "mrad/s")}
+    unit = min(ratios, key=lambda u: abs(np.log(ratios[u]) - np.log(max(abs(slope / current), 1e-12))))
+    miss = abs(slope) / current / ratios[unit]
+    near = 1.0 / NEAR < miss < NEAR
+    if family.declared and unit != family.unit:
+        draft.say(
+            "velocity", f"{family.unit} is declared; it is {slope:.3g} times the derivative of q", doubt=True
+        )
+    elif not near:
+        draft.say("velocity", f"the velocity is {slope:.3g} times the derivative of the position", doubt=True)
+    else:
+        family.unit = unit
+        draft.say("velocity", f"{unit}: {slope:.3g} times the derivative of the position in rad/s")
+    family.sign = _signs(slopes, moving, trial.joint_names)
+
+
+def _signs(slopes: Array, clear: np.ndarray, joints: tuple[str, ...]) -> float | dict[str, float]:
+    """One sign for all joints, or one for each where they differ."""
+    negative = slopes[clear] < 0.0
+    if negative.all() and clear.any():
+        return -1.0
+    if not negative.any():
+        return 1.0
+    return {j: -1.0 if c and s < 0.0 else 1.0 for j, s, c in zip(joints, slopes, clear, strict=True)}
+
+
+def _torque(draft: Draft, trial: Signals, robot: RobotModel) -> None:
+    """Compare the logged torque with that of the rigid body, beside friction and a constant per joint."""
+    family = draft.families["torque"]
+    slopes, correlation = torque_slopes(trial, robot)
+    clear = np.abs(correlation) > 0.5
+    listing = ", ".join(f"{j} {c:+.2f}" for j, c in zip(trial.joint_names, correlation, strict=True))
+    draft.say("torque", f"correlation with the robot's inverse dynamics: {listing}")
+    if not clear.any():
+        draft.say(
+            "torque", "no joint's torque follows the robot's inverse dynamics: sign unknown", doubt=True
+        )
+        return
+    family.sign = _signs(slopes, clear, trial.joint_names)
+    if isinstance(family.sign, dict):
+        draft.say("torque", "the sign differs between joints; are the joints in the right order?", doubt=True)
+    elif not clear.all():
+        draft.say("torque", f"the sign is that of {clear.sum()} of {len(clear)} joints", doubt=True)
+    size = float(np.median(np.abs(slopes[clear])))
+    words = headings.tokens(family.pattern)
+    if not family.declared and ("current" in words or "currents" in words):
+        family.unit = "A"
+        draft.say("torque", "a current: give the gear ratio and the torque constant [N m/A]", doubt=True)
+    elif not family.declared and 1000.0 / NEAR**2 < size < 1000.0 * NEAR**2:
+        family.unit = "mNm"
+        draft.say("torque", f"{size:.4g} times the inverse dynamics: taken for mNm", doubt=True)
+    elif not 0.5 < size < 2.0:
+        draft.say("torque", f"{size:.3g} times the inverse dynamics: a current, or motor side?", doubt=True)
+
+
+def torque_slopes(trial: Signals, robot: RobotModel) -> tuple[Array, Array]:
+    """Slope and partial correlation of the logged torque over the inverse dynamics, `(nq,)` each.
+
+    τ_log = k τ_rigid + v q̇ + f sign(q̇) + const by least squares, joint by joint; the correlation is that of
+    what friction and the constant leave of both sides.
+
+    Args:
+        trial: the log, with `qd`, `qdd` and `tau`.
+        robot: the robot.
+    """
+    rows = np.linspace(0, len(trial) - 1, min(TRIED_ROWS, len(trial))).astype(int)
+    q, qd, qdd, tau = (np.ascontiguousarray(trial.vectors[name][rows]) for name in ("q", "qd", "qdd", "tau"))
+    rigid = dynamics.inverse_dynamics(robot, *(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
+    slopes, correlation = np.zeros(robot.nq), np.zeros(robot.nq)
+    for i in range(robot.nq):
+        others = np.column_stack([np.ones(len(rows)), qd[:, i], np.sign(qd[:, i])])
+        both = np.column_stack([rigid[:, i], tau[:, i]])
+        left = both - others @ np.linalg.lstsq(others, both, rcond=None)[0]
+        power = (left**2).sum(axis=0)
+        if power.min() > 0.0:
+            product = float(left[:, 0] @ left[:, 1])
+            slopes[i], correlation[i] = product / power[0], product / float(np.sqrt(power[0] * power[1]))
+    return slopes, correlation
+
+
+def _contacts(table: LogTable, draft: Draft, system: ConstrainedSystem) -> None:
+    """How the state of each contact of the scene may be known."""
+    for name in system.contact_names:
+        column = next(
+            (c for c in table.names if "contact" in c.lower() and (name in c or system.m == 1)), None
+        )
+        if column is not None and np.isin(table.stream_of(column).columns[column], (0.0, 1.0)).all():
+            draft.contacts[name] = ['source = "column"', f'column = "{column}"']
+        elif draft.wrench:
+            draft.contacts[name] = ['source = "wrench"']
+        else:
+            draft.contacts[name] = ['source = "multiplier"   # or "distance", "always", "never"']
+            draft.say(
+                f"contact {name}", "the log has no contact column: λ of the rigid body shows it", doubt=True
+            )

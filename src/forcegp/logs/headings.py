@@ -1,0 +1,237 @@
+"""What headings say: the column of time, families of columns with one member per joint, units, sensors."""
+
+from __future__ import annotations
+
+import re
+from difflib import SequenceMatcher
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from forcegp.errors import MappingError
+from forcegp.logs import units
+from forcegp.logs.draft import Draft, Family
+from forcegp.logs.table import LogTable, Stream
+from forcegp.robot import RobotModel
+
+WORDS = {
+    "acceleration": ("qdd", "ddq", "acc", "accel", "acceleration", "accelerations", "qddot"),
+    "velocity": ("qd", "dq", "vel", "velocity", "velocities", "speed", "omega", "qdot", "mdq", "w"),
+    "torque": ("tau", "torque", "torques", "effort", "trq", "mtorque", "moment", "tq", "current", "currents"),
+    "position": (
+        "q",
+        "pos",
+        "position",
+        "positions",
+        "angle",
+        "angles",
+        "theta",
+        "mq",
+        "phi",
+        "state",
+        "joint",
+    ),
+}
+"""Words that name a quantity, by quantity, in the order in which they are looked for."""
+MEASURED = ("meas", "measured", "actual", "act", "msr", "sensor", "observation")
+"""Words of columns that were measured."""
+COMMANDED = (
+    "des", "desired", "target", "cmd", "command", "commanded", "ref", "reference", "con", "set", "goal",
+    "filt", "filtered", "fric", "err", "error", "action", "temperature", "temp", "voltage", "mode", "status",
+)  # fmt: skip
+"""Words of columns that are not what is looked for."""
+_TIME = re.compile(
+    r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
+)
+_DECLARED = re.compile(r"[\[(]([^\])]*)[\])]|_(deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps)$")
+_AXES = (("force", "f"), ("torque", "m", "t", "moment"))
+_SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
+
+
+def tokens(name: str) -> list[str]:
+    """Words of a heading, in lower case.
+
+    >>> tokens("actualJointPos_3 [deg]")
+    ['actual', 'joint', 'pos', '3', 'deg']
+    """
+    spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
+    return re.findall(r"[a-z]+|\d+", spaced.lower())
+
+
+def declared_unit(name: str, stream: Stream) -> str | None:
+    """The unit that a heading or the line below it declares, or `None`."""
+    if name in stream.units:
+        return units.spelled(stream.units[name])
+    for found in _DECLARED.finditer(name):
+        unit = units.spelled(found[1] if found[1] is not None else found[2])
+        if unit is not None:
+            return unit
+    return None
+
+
+def find_time(table: LogTable, draft: Draft) -> Stream:
+    """The stream with the columns of the joints, and its column of time.
+
+    Raises:
+        MappingError: no column increases like time.
+    """
+    stream = max(table.streams, key=lambda s: (len(s.columns), len(s)))
+    found = []
+    for name, values in stream.columns.items():
+        steps = np.diff(values[np.isfinite(values)])
+        if not len(steps) or not (steps > 0.0).mean() > 0.95:
+            continue
+        middle = np.median(steps[steps > 0.0])
+        even = float((np.abs(steps - middle) < 0.5 * middle).mean())
+        named = bool(_TIME.match(name.lower())) or name == "header"
+        found.append((2.0 * named + even + (name == "header"), name))
+    if not found:
+        raise MappingError(
+            f"{table.source}: no column increases like time",
+            expected="a column of time stamps",
+            got=", ".join(stream.columns)[:300],
+        )
+    draft.time = max(found)[1]
+    values = stream.columns[draft.time]
+    unit = declared_unit(draft.time, stream)
+    steps = np.diff(values[np.isfinite(values)])
+    step = float(np.median(steps[steps > 0.0]))
+    if unit in units.TIME:
+        draft.time_unit = unit
+        draft.say("time", f"the unit {unit} is declared; steps are {step:.6g} {unit}")
+    else:
+        # Robots are logged at 10 Hz to 10 kHz, so the step alone tells s, ms, µs and ns apart.
+        draft.time_unit = "s" if step <= 0.1 else "ms" if step <= 100.0 else "us" if step <= 1e5 else "ns"
+        draft.say(
+            "time", f"steps of {step:.6g} were taken for {draft.time_unit}", doubt=draft.time_unit != "s"
+        )
+    draft.segment = next((name for name in _SEGMENTS if name in stream.columns), None)
+    return stream
+
+
+def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
+    """The columns of each quantity, and what the log calls each joint.
+
+    Raises:
+        MappingError: no family of columns is the position or the torque of the robot's joints.
+    """
+    families = _families(stream, robot)
+    for quantity in WORDS:
+        rated = [(rating, family) for family in families if (rating := _rate(family, quantity)) > 0.0]
+        rated.sort(key=lambda item: -item[0])
+        if rated:
+            draft.families[quantity] = rated[0][1]
+            others = [family.pattern for _, family in rated[1:]]
+            if others:
+                draft.say(
+                    quantity,
+                    f"{rated[0][1].pattern!r} was taken; also there: {', '.join(others)}",
+                    doubt=True,
+                )
+    for quantity in ("position", "torque"):
+        if quantity not in draft.families:
+            raise MappingError(
+                f"{draft.source}: no columns were recognised as the {quantity} of {robot.nq} joints",
+                expected=f"headings such as {WORDS[quantity][1]}_1 to {WORDS[quantity][1]}_{robot.nq}",
+                got=", ".join(stream.columns)[:300],
+                hint="write the mapping by hand; docs/import.md shows every key",
+            )
+    _match_joints(robot, draft)
+    for quantity, family in draft.families.items():
+        found = {declared_unit(column, stream) for column in family.columns.values()} - {None}
+        known = [unit for unit in found if unit in units.QUANTITY[quantity]]
+        if len(known) == 1:
+            family.unit, family.declared = known[0], True
+            draft.say(quantity, f"the unit {known[0]} is declared")
+
+
+def _families(stream: Stream, robot: RobotModel) -> list[Family]:
+    """Columns that differ in a joint's name, a number, or what follows the first dot."""
+    groups: dict[str, dict[str, str]] = {}
+    names = sorted(robot.joint_names, key=len, reverse=True)
+    for column in stream.columns:
+        joint = next((j for j in names if j in column), None)
+        if joint is not None:
+            groups.setdefault(column.replace(joint, "{joint}", 1), {})[joint] = column
+            continue
+        for found in re.finditer(r"\d+", column):
+            pattern = f"{column[: found.start()]}{{joint}}{column[found.end() :]}"
+            groups.setdefault(pattern, {})[found[0]] = column
+        head, dot, tail = column.partition(".")
+        if dot and tail and head in ("position", "velocity", "effort"):
+            groups.setdefault(f"{head}.{{joint}}", {})[tail] = column
+    exact = set(robot.joint_names)
+    result = []
+    for pattern, columns in groups.items():
+        if exact <= set(columns):
+            columns = {joint: columns[joint] for joint in robot.joint_names}
+        if len(columns) == robot.nq:
+            result.append(Family(pattern, columns, stream.name))
+    return result
+
+
+def _rate(family: Family, quantity: str) -> float:
+    """How well a family's name fits a quantity; 0 where it does not."""
+    words = tokens(family.pattern.replace("{joint}", " "))
+    if not any(word in WORDS[quantity] for word in words):
+        return 0.0
+    earlier = list(WORDS)[: list(WORDS).index(quantity)]
+    if any(word in WORDS[other] for other in earlier for word in words):
+        return 0.0
+    score = 1.0 + 0.5 * any(w in MEASURED for w in words) - 0.8 * any(w in COMMANDED for w in words)
+    return score - 0.01 * len(words) - 0.2 * ("current" in words or "currents" in words)
+
+
+def _match_joints(robot: RobotModel, draft: Draft) -> None:
+    """What the log calls each joint, from the names of the positions."""
+    names = list(draft.families["position"].columns)
+    if set(names) == set(robot.joint_names):
+        return
+    if all(name.isdigit() for name in names):
+        ordered = sorted(names, key=int)
+        draft.say("joints", "the log numbers its joints; they were taken from base to tip", doubt=True)
+        draft.joints = dict(zip(robot.joint_names, ordered, strict=True))
+    else:
+        likeness = np.array([[_likeness(j, name) for name in names] for j in robot.joint_names])
+        # Among names that are equally alike, the order of the log decides; the user confirms it.
+        likeness += 0.3 * np.eye(len(names))
+        rows, columns = linear_sum_assignment(-likeness)
+        draft.joints = {robot.joint_names[i]: names[k] for i, k in zip(rows, columns, strict=True)}
+        draft.say("joints", "the names were matched by their likeness", doubt=True)
+    for quantity, family in list(draft.families.items()):
+        if set(family.columns) != set(names):
+            del draft.families[quantity]
+            draft.say(
+                "joints", f"{family.pattern!r} numbers its joints otherwise and was left out", doubt=True
+            )
+
+
+def _likeness(joint: str, name: str) -> float:
+    a, b = joint.lower(), name.lower()
+    numbers = re.findall(r"\d+", a) == re.findall(r"\d+", b)
+    shared = len(set(tokens(a)) & set(tokens(b)))
+    return shared + 0.3 * numbers + SequenceMatcher(None, a, b).ratio()
+
+
+def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
+    """Columns of a force-torque sensor: `force.x`, `Fx`, `f_x`, …"""
+    for stream in table.streams:
+        found: dict[tuple[int, str], str] = {}
+        for column in stream.columns:
+            words = tokens(column)
+            axis = words[-1][-1] if words and words[-1][-1] in "xyz" else ""
+            stem = words[-1][:-1] or (words[-2] if len(words) > 1 else "")
+            for part, names in enumerate(_AXES):
+                if axis and stem in names:
+                    found.setdefault((part, axis), column)
+        if all((0, axis) in found for axis in "xyz"):
+            draft.wrench_stream = stream.name
+            parts = [0, 1] if all((1, axis) in found for axis in "xyz") else [0]
+            draft.wrench = [[found[part, axis] for axis in "xyz"] for part in parts]
+            draft.wrench_frame = robot.frame_names[-1]
+            draft.say(
+                "wrench",
+                "the sensor's frame, its sign (acts_on) and the tool's weight are not in the log",
+                True,
+            )
+            return

@@ -1,0 +1,214 @@
+"""Mapping files: which column of a log is which quantity of which joint, in TOML (docs/import.md).
+
+Joints are matched by name. `[joints]` says what the log calls each joint of the robot, and a column such as
+`"q_{joint}"` is filled in with that name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib.resources import files
+from pathlib import Path
+
+from forcegp.errors import MappingError, SceneError
+from forcegp.logs import units
+from forcegp.logs.sections import MappingSections, PerJoint, QuantitySection
+from forcegp.logs.validation import validated
+from forcegp.scene.toml import Document, Key
+
+BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "ur3_mat")
+"""Mappings that come with the library: those of published logs, and of ROS topics with the robot's names."""
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """A mapping file that has been read and checked.
+
+    Attributes:
+        sections: the tables.
+        document: the file, for messages.
+    """
+
+    sections: MappingSections
+    document: Document
+
+    @property
+    def source(self) -> str:
+        """Name of the file."""
+        return self.document.source
+
+    def quantity(self, name: str) -> QuantitySection | None:
+        """The table of a joint vector: `position`, `velocity`, `acceleration` or `torque`."""
+        return getattr(self.sections, name)
+
+    def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
+        """The log's column of a quantity for each joint of the robot.
+
+        Args:
+            name: the quantity.
+            joints: the robot's joints.
+
+        Raises:
+            MappingError: a joint has no column, or a name is no joint of the robot.
+        """
+        section = self.quantity(name)
+        assert section is not None
+        self._check_joints(("joints",), self.sections.joints, joints)
+        self._check_joints((name, "columns"), section.columns, joints)
+        found = []
+        for joint in joints:
+            if joint in section.columns:
+                found.append(section.columns[joint])
+            elif section.column is not None and (joint in self.sections.joints or not self.sections.joints):
+                found.append(section.column.replace("{joint}", self.sections.joints.get(joint, joint)))
+            else:
+                raise self.error(
+                    (name,), f"joint {joint!r} has no column", expected=f"{joint} = under columns"
+                )
+        if len(set(found)) < len(found):
+            twice = next(c for c in found if found.count(c) > 1)
+            raise self.error((name,), f"column {twice!r} is given for two joints", expected="'{joint}' in it")
+        return found
+
+    def per_joint(self, name: str, key: str, joints: Sequence[str]) -> list[float]:
+        """The numbers of a key that holds one for all joints or one for each.
+
+        Raises:
+            MappingError: a joint is missing or unknown.
+        """
+        value: PerJoint = getattr(self.quantity(name), key)
+        if not isinstance(value, dict):
+            return [float(value)] * len(joints)
+        self._check_joints((name, key), value, joints)
+        for joint in joints:
+            if joint not in value:
+                raise self.error((name, key), f"joint {joint!r} is missing", expected=", ".join(joints))
+        return [value[joint] for joint in joints]
+
+    def error(
+        self, key: Key, message: str, expected: object = None, got: object = None, hint: str | None = None
+    ) -> MappingError:
+        """An error at a key of the file."""
+        place = self.document.place(key)
+        return MappingError(f"{place}: {message}", expected=expected, got=got, hint=hint)
+
+    def _check_joints(self, key: Key, named: Iterable[str], joints: Sequence[str]) -> None:
+        for joint in named:
+            if joint not in joints:
+                near = get_close_matches(joint, joints, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else None
+                raise self.error(
+                    (*key, joint),
+                    f"{joint!r} is no joint of the robot",
+                    expected=", ".join(joints),
+                    hint=hint,
+                )
+
+
+def load_mapping(source: str | Path) -> Mapping:
+    """Read a mapping file.
+
+    Args:
+        source: a path, or the name of a mapping that comes with the library.
+
+    Raises:
+        MappingError: no such mapping, or it is not valid; the message names file, line and key.
+
+    >>> load_mapping("ros_joint_states").sections.torque.unit
+    'Nm'
+    """
+    bundled = str(source) in BUNDLED
+    path = Path(str(files("forcegp.logs") / "bundled" / f"{source}.toml")) if bundled else Path(source)
+    if not path.is_file():
+        near = get_close_matches(str(source), BUNDLED, n=1)
+        raise MappingError(
+            f"{path}: no such mapping",
+            expected=f"a TOML file, or one of {', '.join(BUNDLED)}",
+            hint=f"did you mean {near[0]!r}?" if near else "write one with --guess",
+        )
+    return parse_mapping(path.read_bytes(), str(path))
+
+
+def parse_mapping(content: bytes, source: str) -> Mapping:
+    """A mapping from the bytes of its file.
+
+    Raises:
+        MappingError: it is not valid; the message names file, line and key.
+    """
+    try:
+        document = Document(content, source)
+    except SceneError as error:
+        raise MappingError(error.message, expected=error.expected, got=error.got, hint=error.hint) from error
+    mapping = Mapping(validated(MappingSections, document), document)
+    _check(mapping)
+    return mapping
+
+
+def _check(mapping: Mapping) -> None:
+    """What the tables cannot say by themselves: units, and keys that need each other."""
+    for name in ("position", "velocity", "acceleration", "torque"):
+        section = mapping.quantity(name)
+        if section is None:
+            continue
+        known = units.QUANTITY[name]
+        if section.unit not in known:
+            near = units.spelled(section.unit)
+            hint = f"did you mean {near!r}?" if near in known else None
+            raise mapping.error(
+                (name, "unit"), "unknown unit", f"one of {', '.join(known)}", repr(section.unit), hint
+            )
+        if section.column is None and not section.columns:
+            raise mapping.error((name,), "no column", expected='column = "…{joint}…", or columns = {…}')
+        if section.side == "motor" and section.gear_ratio is None:
+            raise mapping.error(
+                (name, "side"), "the motor's side needs a gear ratio", expected="gear_ratio = …"
+            )
+        _check_numbers(mapping, name, section)
+    _check_current(mapping)
+    for name, contact in mapping.sections.contact.items():
+        if contact.source == "column" and contact.column is None:
+            raise mapping.error(("contact", name, "source"), "key 'column' is missing", expected="column = …")
+        if contact.source == "wrench" and mapping.sections.wrench is None:
+            raise mapping.error(
+                ("contact", name, "source"), "the log's wrench is not mapped", "a table [wrench]"
+            )
+    _check_time(mapping)
+
+
+def _check_numbers(mapping: Mapping, name: str, section: QuantitySection) -> None:
+    for key, what in (
+        ("sign", "1 or -1"),
+        ("gear_ratio", "a number that is not 0"),
+        ("torque_constant", "> 0"),
+    ):
+        value = getattr(section, key, None)
+        numbers = value.values() if isinstance(value, dict) else [] if value is None else [value]
+        wrong = [n for n in numbers if n == 0 or (key == "sign" and abs(n) != 1) or (key[0] == "t" and n < 0)]
+        if wrong:
+            raise mapping.error((name, key), f"not a valid {key.replace('_', ' ')}", what, wrong[0])
+
+
+def _check_current(mapping: Mapping) -> None:
+    torque = mapping.sections.torque
+    if (torque.unit in units.CURRENT) != (torque.torque_constant is not None):
+        raise mapping.error(
+            ("torque", "unit"),
+            "a current needs a torque constant, and nothing else has one",
+            expected='unit = "A" with torque_constant = … [N m/A], or a unit of torque without it',
+            got=repr(torque.unit),
+        )
+
+
+def _check_time(mapping: Mapping) -> None:
+    time, derivatives = mapping.sections.time, mapping.sections.derivatives
+    if time.start is not None and time.stop is not None and time.start >= time.stop:
+        raise mapping.error(("time", "stop"), "the log would be empty", f"more than {time.start}", time.stop)
+    if derivatives.window % 2 == 0 or derivatives.order >= derivatives.window:
+        got = f"window {derivatives.window}, order {derivatives.order}"
+        raise mapping.error(
+            ("derivatives", "window"), "the filter is not defined", "an odd window > order", got
+        )
+    if derivatives.source == "velocity" and mapping.sections.velocity is None:
+        raise mapping.error(("derivatives", "source"), "the velocity is not mapped", "a table [velocity]")

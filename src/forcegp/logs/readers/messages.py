@@ -1,0 +1,189 @@
+"""Joint states and wrenches of ROS messages as columns, whichever bag they come from.
+
+Columns of a joint state: `position.<joint>`, `velocity.<joint>`, `effort.<joint>`. Of a wrench:
+`force.x` to `torque.z`. Of both: `header`, the stamp that the driver gave [s], and `receive`, the time of
+recording [s], each counted from the earliest one in the log, as float64 has no nanoseconds since 1970.
+
+The layouts are those of the ROS distributions; definitions that a bag carries are not compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from forcegp.errors import DataError
+from forcegp.logs import limits
+from forcegp.logs.readers.extras import require
+from forcegp.logs.table import Column, LogTable, Stream, Wanted
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+KINDS = (JOINT_STATE, WRENCH)
+"""Message types that are read."""
+QUANTITIES = ("position", "velocity", "effort")
+CLOCKS = ("header", "receive")
+"""Columns of time that every topic has."""
+
+Decode = Callable[[bytes], Any]
+
+
+def canonical(kind: str) -> str:
+    """The ROS 2 name of a message type.
+
+    >>> canonical("sensor_msgs/JointState")
+    'sensor_msgs/msg/JointState'
+    """
+    package, _, name = kind.partition("/")
+    return f"{package}/msg/{name}" if "/" not in name else kind
+
+
+def decoder(kind: str, encoding: str) -> Decode:
+    """Decodes messages of a type.
+
+    Args:
+        kind: one of `KINDS`.
+        encoding: `ros1` or `cdr`.
+
+    Raises:
+        MissingDependencyError: `rosbags` is not installed.
+    """
+    typesys = require("rosbags.typesys", "rosbags", "ROS messages")
+    if encoding == "ros1":
+        store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+        return lambda raw: store.deserialize_ros1(raw, kind)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    return lambda raw: store.deserialize_cdr(raw, kind)
+
+
+@dataclass
+class Collector:
+    """Gathers the messages of a bag, one stream for each topic and set of joints.
+
+    Args:
+        source: name of the bag, for messages.
+    """
+
+    source: str
+    _rows: dict[tuple[str, str, tuple[str, ...]], list[list[float]]] = field(default_factory=dict)
+    _stamps: dict[tuple[str, str, tuple[str, ...]], list[tuple[int, int]]] = field(default_factory=dict)
+    _orders: dict[tuple[str, tuple[str, ...]], tuple[str, ...]] = field(default_factory=dict)
+    _numbers: int = 0
+    _messages: int = 0
+
+    def add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
+        """Take one message.
+
+        Raises:
+            DataError: it is too large, or its arrays do not fit its joint names.
+        """
+        limits.check_count(self.source, "bytes in one message", len(raw), limits.MAX_MESSAGE_BYTES)
+        message = decode(raw)
+        names, values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
+        # One stream for a set of joints, in the order of its first message, whatever the order of the others.
+        self._orders.setdefault((topic, tuple(sorted(names))), names)
+        order = self._orders[topic, tuple(sorted(names))]
+        if order != names:
+            values = _reordered(values, names, order)
+        key = (topic, kind, order)
+        stamp = message.header.stamp
+        self._rows.setdefault(key, []).append(values)
+        self._stamps.setdefault(key, []).append((stamp.sec * 10**9 + stamp.nanosec, receive_ns))
+        self._numbers += len(values)
+        self._messages += 1
+        limits.check_count(self.source, "numbers", self._numbers, limits.MAX_VALUES)
+        limits.check_count(self.source, "streams", len(self._rows), limits.MAX_STREAMS)
+
+    @property
+    def rows(self) -> int:
+        """Rows of the longest stream so far."""
+        return max(map(len, self._rows.values()), default=0)
+
+    def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
+        """The log.
+
+        Args:
+            format_: name of the format.
+            topics: topic → message type, of all topics in the bag.
+            wanted: which columns to keep.
+
+        Raises:
+            DataError: no topic has a message type that is read.
+        """
+        if not self._rows:
+            listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
+            raise DataError(
+                f"{self.source}: no message of a type that is read",
+                expected=" or ".join(KINDS),
+                got=listing[:600] or "no topics",
+            )
+        origin = np.min([np.min(np.array(stamps), axis=0) for stamps in self._stamps.values()], axis=0)
+        taken: dict[str, int] = {}
+        streams = []
+        for key in sorted(self._rows, key=lambda k: (k[0], -len(self._rows[k]))):
+            topic = key[0]
+            taken[topic] = taken.get(topic, 0) + 1
+            name = topic if taken[topic] == 1 else f"{topic}#{taken[topic]}"
+            streams.append(self._stream(name, key, origin, wanted))
+        unread = [f"{t} ({k})" for t, k in topics.items() if canonical(k) not in KINDS]
+        remarks = [f"topics of other types were not read: {', '.join(unread)[:600]}"] if unread else []
+        remarks.append(f"time 0 is {origin[0] * 1e-9:.9f} s on the clock of the headers")
+        return LogTable(self.source, format_, tuple(streams), tuple(remarks))
+
+    def _stream(
+        self, name: str, key: tuple[str, str, tuple[str, ...]], origin: np.ndarray, wanted: Wanted
+    ) -> Stream:
+        values = np.array(self._rows.pop(key), dtype=np.float64)
+        stamps = (np.array(self._stamps[key], dtype=np.int64) - origin) * 1e-9
+        _, kind, names = key
+        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps.T), strict=True))
+        parts = (
+            [f"{q}.{n}" for q in QUANTITIES for n in names] if kind == JOINT_STATE else list(WRENCH_COLUMNS)
+        )
+        for i, part in enumerate(parts):
+            column = np.ascontiguousarray(values[:, i])
+            if not np.isnan(column).all() and wanted(part):
+                columns[part] = column
+        units = {p: u for p, u in zip(parts, _units(kind, len(names)), strict=True) if p in columns}
+        return Stream(name, columns, units | dict.fromkeys(CLOCKS, "s"))
+
+
+WRENCH_COLUMNS = tuple(f"{part}.{axis}" for part in ("force", "torque") for axis in "xyz")
+
+
+def _units(kind: str, count: int) -> list[str]:
+    """Units by REP 103."""
+    if kind == WRENCH:
+        return ["N"] * 3 + ["Nm"] * 3
+    return ["rad"] * count + ["rad/s"] * count + ["Nm"] * count
+
+
+def _joint_state(source: str, topic: str, message: Any) -> tuple[tuple[str, ...], list[float]]:
+    """Joint names, and position, velocity and effort in their order; NaN where a quantity is empty."""
+    names = tuple(str(name)[: limits.MAX_NAME] for name in message.name)
+    if not names or len(set(names)) < len(names):
+        raise DataError(f"{source}: a joint state on {topic} has no joint names, or one twice", got=names[:8])
+    values: list[float] = []
+    for quantity in QUANTITIES:
+        numbers = getattr(message, quantity)
+        if len(numbers) not in (0, len(names)):
+            raise DataError(
+                f"{source}: a joint state on {topic} has {len(numbers)} values of {quantity}",
+                expected=f"one for each of its {len(names)} joints, or none",
+            )
+        values += [float(x) for x in numbers] if len(numbers) else [np.nan] * len(names)
+    return names, values
+
+
+def _reordered(values: list[float], names: tuple[str, ...], order: tuple[str, ...]) -> list[float]:
+    """Values of a joint state whose message names the joints in another order."""
+    index = [names.index(name) for name in order]
+    return [values[block * len(names) + i] for block in range(len(QUANTITIES)) for i in index]
+
+
+def _wrench(message: Any) -> tuple[tuple[str, ...], list[float]]:
+    force, torque = message.wrench.force, message.wrench.torque
+    return (), [force.x, force.y, force.z, torque.x, torque.y, torque.z]

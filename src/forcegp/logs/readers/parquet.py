@@ -1,0 +1,134 @@
+"""Parquet tables, with vectors in one column or one column per number."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forcegp.errors import DataError
+from forcegp.logs import limits
+from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, foreign
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+BATCH_ROWS = 1 << 16
+"""Rows that are decoded at a time."""
+
+
+def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the columns of numbers, flags and times; a list column becomes `name[0]`, `name[1]`, …
+
+    Raises:
+        DataError: the file is damaged or too large, or a list column has lists of different length.
+    """
+    remarks: list[str] = []
+    with foreign(str(path), "Parquet"):
+        columns = read_columns([path], wanted, rows, remarks, progress)
+    return LogTable(str(path), "parquet", (Stream("", columns),), tuple(remarks))
+
+
+def read_columns(
+    paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
+) -> dict[str, Column]:
+    """The columns of one or more files one after another.
+
+    Args:
+        paths: the files, in order.
+        wanted: which columns to read, by their name, or by `name[i]` for a list column.
+        rows: stop after so many rows.
+        remarks: gets a sentence for each column that is left out.
+        progress: called with the rows read and their total.
+    """
+    import pyarrow.parquet as pq
+
+    chunks: dict[str, list[Column]] = {}
+    total = 0
+    for path in paths:
+        with pq.ParquetFile(path) as file:
+            total += _check(str(path), file)
+            limits.check_values(str(path), total, 1)
+    done = 0
+    for path in paths:
+        with pq.ParquetFile(path, pre_buffer=False) as file:
+            names = _readable(file, wanted, remarks)
+            for batch in file.iter_batches(BATCH_ROWS, columns=names, use_threads=False):
+                for name in names:
+                    for part, values in _expand(str(path), name, batch.column(name)).items():
+                        if wanted(part) or wanted(name):
+                            chunks.setdefault(part, []).append(values)
+                done += len(batch)
+                limits.check_values(str(path), done, max(len(chunks), 1))
+                if progress is not None:
+                    progress(done, total)
+                if rows is not None and done >= rows:
+                    break
+    return _joined(str(paths[0]), chunks, done, rows)
+
+
+def _joined(source: str, chunks: dict[str, list[Column]], done: int, rows: int | None) -> dict[str, Column]:
+    columns: dict[str, Column] = {}
+    for name in list(chunks):
+        columns[name] = np.concatenate(chunks.pop(name))[:rows]
+        if len(columns[name]) != min(done, rows or done):
+            raise DataError(f"{source}: column {name!r} is missing in some of the files")
+    return columns
+
+
+def _check(source: str, file: object) -> int:
+    """Number of rows of a file whose claimed size is within the limits."""
+    shape = file.metadata  # pyright: ignore[reportAttributeAccessIssue]
+    limits.check_count(source, "columns", shape.num_columns, limits.MAX_COLUMNS)
+    groups = [shape.row_group(i) for i in range(shape.num_row_groups)]
+    numbers = sum(group.column(j).num_values for group in groups for j in range(group.num_columns))
+    limits.check_count(source, "numbers", numbers, limits.MAX_VALUES)
+    return shape.num_rows
+
+
+def _readable(file: object, wanted: Wanted, remarks: list[str]) -> list[str]:
+    import pyarrow.types as kinds
+
+    names = []
+    for field in file.schema_arrow:  # pyright: ignore[reportAttributeAccessIssue]
+        kind, listed = field.type, False
+        if kinds.is_list(kind) or kinds.is_fixed_size_list(kind) or kinds.is_large_list(kind):
+            kind, listed = kind.value_type, True
+        numeric = kinds.is_floating(kind) or kinds.is_integer(kind) or kinds.is_boolean(kind)
+        asked = wanted(field.name) or (listed and any(wanted(f"{field.name}[{i}]") for i in range(64)))
+        if asked and (numeric or (kinds.is_timestamp(kind) and not listed)):
+            names.append(field.name)
+        elif asked:
+            remark = f"column {field.name!r} of type {field.type} was left out"
+            remarks += [remark] if remark not in remarks else []
+    return names
+
+
+def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
+    import pyarrow as pa
+    import pyarrow.compute as pc
+    import pyarrow.types as kinds
+
+    if kinds.is_timestamp(values.type):
+        nanoseconds = pc.cast(pc.cast(values, pa.timestamp("ns")), pa.int64())
+        return {name: nanoseconds.to_numpy(zero_copy_only=False) * 1e-9}
+    if not (
+        kinds.is_list(values.type)
+        or kinds.is_large_list(values.type)
+        or kinds.is_fixed_size_list(values.type)
+    ):
+        return {name: pc.cast(values, pa.float64(), safe=False).to_numpy(zero_copy_only=False)}
+    lengths = pc.list_value_length(values).to_numpy(zero_copy_only=False)
+    width = int(lengths[0]) if len(lengths) and lengths[0] == lengths[0] else 0
+    if len(lengths) and not (lengths == width).all():
+        row = int(np.flatnonzero(lengths != width)[0])
+        raise DataError(
+            f"{source}: column {name!r} has lists of different length",
+            expected=f"{width} numbers in every row",
+            got=f"{lengths[row]} in row {row}",
+        )
+    limits.check_count(source, "columns", width, limits.MAX_COLUMNS)
+    flat = pc.cast(values.flatten(), pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+    table = flat.reshape(len(values), width)
+    return {f"{name}[{i}]": np.ascontiguousarray(table[:, i]) for i in range(width)}

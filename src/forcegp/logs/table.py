@@ -1,0 +1,187 @@
+"""What every reader returns: named columns of numbers, grouped by the clock that they share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forcegp.errors import DataError, ForceGPError
+from forcegp.logs import limits
+
+Column = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+"""Called with the work done and the total, in bytes or messages."""
+Wanted = Callable[[str], bool]
+"""Whether a column of this name is to be read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Columns with a common clock: a table, a topic of a bag, arrays of one length.
+
+    Args:
+        name: name of the topic or group; empty for the only table of a file.
+        columns: name → `(n,)` float64; a missing value is NaN.
+        units: name → unit, where the file declares one.
+    """
+
+    name: str
+    columns: Mapping[str, Column]
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(next(iter(self.columns.values()))) if self.columns else 0
+
+
+@dataclass(frozen=True, eq=False)
+class LogTable:
+    """A log as it was read, before anything is known about the meaning of its columns.
+
+    Args:
+        source: name of the file or folder.
+        format: name of the format.
+        streams: the columns by clock.
+        remarks: what was left out or assumed by the reader, one sentence each.
+    """
+
+    source: str
+    format: str
+    streams: tuple[Stream, ...]
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Every column name, stream by stream."""
+        return [name for stream in self.streams for name in stream.columns]
+
+    def stream_of(self, column: str, stream: str | None = None) -> Stream:
+        """The stream that holds a column.
+
+        Raises:
+            DataError: no such stream or column, or several streams hold it and none is named.
+        """
+        among = [s for s in self.streams if stream is None or s.name == stream]
+        if not among:
+            raise missing(self.source, "stream", stream or "", [s.name for s in self.streams])
+        holding = [s for s in among if column in s.columns]
+        if not holding:
+            raise missing(self.source, "column", column, [n for s in among for n in s.columns])
+        if len(holding) > 1:
+            raise DataError(
+                f"{self.source}: several streams have a column {column!r}",
+                expected="a key 'stream' that names one of them",
+                got=", ".join(s.name or "(unnamed)" for s in holding),
+            )
+        return holding[0]
+
+
+class Growing:
+    """A column that is read piece by piece, in one place, so that memory holds it once.
+
+    Args:
+        expected: how many numbers are expected; more are possible.
+    """
+
+    def __init__(self, expected: int) -> None:
+        self._values = np.empty(max(1024, min(expected, limits.MAX_VALUES)))
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, values: Column) -> None:
+        """Add numbers at the end."""
+        end = self._count + len(values)
+        if end > len(self._values):
+            self._values.resize(end + end // 4, refcheck=False)
+        self._values[self._count : end] = values
+        self._count = end
+
+    def array(self, most: int | None = None) -> Column:
+        """The column, cut to `most` numbers; nothing can be added afterwards."""
+        self._values.resize(self._count if most is None else min(most, self._count), refcheck=False)
+        return self._values
+
+
+def missing(source: str, kind: str, name: str, known: list[str]) -> DataError:
+    """The error for a stream or column that a log does not hold."""
+    near = get_close_matches(name, known, n=1, cutoff=0.5)
+    shown = ", ".join(repr(k) for k in known[:16]) + (f", … ({len(known)})" if len(known) > 16 else "")
+    return DataError(
+        f"{source}: the log has no {kind} {name!r}",
+        expected=f"one of {shown}" if known else "a log with columns of numbers",
+        hint=f"did you mean {near[0]!r}?" if near else None,
+    )
+
+
+@contextmanager
+def foreign(source: str, kind: str) -> Iterator[None]:
+    """Turn whatever a third-party parser raises on a damaged file into `DataError`."""
+    try:
+        yield
+    except ForceGPError:
+        raise
+    except FileNotFoundError as cause:
+        raise DataError(f"{source}: no such file", got=str(cause)) from cause
+    except PermissionError as cause:
+        raise DataError(f"{source}: the file may not be read", got=str(cause)) from cause
+    except (Exception, RecursionError, MemoryError) as cause:
+        lines = str(cause).splitlines()
+        raise DataError(
+            f"{source}: the file is damaged, truncated or not {kind}",
+            got=lines[0][:300] if lines else type(cause).__name__,
+            hint="write it again from its source; an interrupted copy is the usual cause",
+        ) from cause
+
+
+def arrays_to_streams(
+    source: str, arrays: Mapping[str, NDArray[np.generic]], remarks: list[str]
+) -> tuple[Stream, ...]:
+    """Streams of the arrays of a file, one for each number of rows.
+
+    A matrix `(n, d)` becomes the columns `name[0]` to `name[d-1]`. Rows run along the axis whose length
+    most arrays share; `(d, n)` is transposed. Arrays of another length are streams of their own.
+
+    Args:
+        source: name of the file, for messages.
+        arrays: numeric arrays of one or two dimensions.
+        remarks: gets a sentence for each array that was transposed or left out.
+    """
+    usable = {}
+    for name, array in arrays.items():
+        squeezed = array.reshape(-1) if array.ndim == 2 and 1 in array.shape else array
+        if squeezed.dtype.kind not in "fiub" or squeezed.ndim not in (1, 2) or squeezed.size < 2:
+            remarks.append(f"{name!r} of shape {array.shape} and type {array.dtype} was left out")
+        else:
+            usable[name[: limits.MAX_NAME]] = squeezed
+    lengths = [length for array in usable.values() for length in set(array.shape)]
+    common = max(set(lengths), key=lambda length: (lengths.count(length), length), default=0)
+    groups: dict[int, dict[str, Column]] = {}
+    for name, array in usable.items():
+        rows = common if common in array.shape else max(array.shape)
+        if array.ndim == 2 and array.shape[0] != rows:
+            array = array.T
+            remarks.append(f"{name!r} was transposed: its rows are samples")
+        limits.check_values(source, rows, 1 if array.ndim == 1 else array.shape[1])
+        groups.setdefault(rows, {}).update(_columns(name, array))
+    limits.check_count(source, "arrays of different length", len(groups), limits.MAX_STREAMS)
+    for rows, columns in groups.items():
+        limits.check_values(source, rows, len(columns))
+    return tuple(
+        Stream("" if rows == common else f"{rows} rows", columns)
+        for rows, columns in sorted(groups.items(), key=lambda item: item[0] != common)
+    )
+
+
+def _columns(name: str, array: NDArray[np.generic]) -> dict[str, Column]:
+    if array.ndim == 1:
+        return {name: np.ascontiguousarray(array, dtype=np.float64)}
+    return {
+        f"{name}[{i}]": np.ascontiguousarray(array[:, i], dtype=np.float64) for i in range(array.shape[1])
+    }

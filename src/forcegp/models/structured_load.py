@@ -1,0 +1,132 @@
+"""Reading structured Gaussian processes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ForceGPError, ModelError
+from forcegp.forces.learn import kernel_parameters
+from forcegp.forces.mean import AnalyticalMean
+from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.gp.exact import ExactPosterior
+from forcegp.gp.features import Standardization
+from forcegp.models.base import FitResult
+from forcegp.models.structured_fit import StructuredFit
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_spec import CLASSES, COLUMNS, Specification, StructuredSettings
+from forcegp.robot.parameters import AnalyticalParameters
+from forcegp.storage.descriptions import decode
+from forcegp.storage.folder import ModelHeader, settings_of
+from forcegp.storage.system import take_robot
+
+
+def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+
+
+def load_structured(
+    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+) -> StructuredGP:
+    """The model that `StructuredFit.save` wrote.
+
+    Raises:
+        ModelError: a tensor or setting is missing or not valid; names file and field.
+    """
+    settings = settings_of(header, StructuredSettings, source)
+    spec = _specification(settings, tensors, system, source)
+    model = StructuredGP(
+        spec.system, spec.mean, spec.priors, spec.noise_std, spec.learn_noise, spec.parameters
+    )
+    try:
+        for name, value in tensors.items():
+            finite = name.removeprefix("start.") in ("lower", "upper", "velocity_limit", "effort_limit")
+            if value.is_complex() or not (finite or bool(torch.isfinite(value).all())):
+                raise ValueError(f"tensor {name!r} holds values that are not finite real numbers")
+        training = _training(settings, spec, tensors)
+        hyper = _below(tensors, "hyper.")
+        _check_hyperparameters(spec, training, hyper)
+        model.adopt(_restored(spec, training, hyper, tensors["alpha"], settings, system))
+    except (KeyError, RuntimeError, ValueError, IndexError) as cause:
+        raise ModelError(f"{source}: the model's tensors do not fit its settings", got=str(cause)) from cause
+    return model
+
+
+def _specification(
+    settings: StructuredSettings, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+) -> Specification:
+    priors = tuple(
+        decode(dict(prior), CLASSES, f"{source}: settings.priors.{i}")
+        for i, prior in enumerate(settings.priors)
+    )
+    parameters = None
+    if settings.analytical is not None:
+        original = take_robot(tensors, "start.", system.robot, source)
+        try:
+            system = system.with_robot(original)
+            parameters = AnalyticalParameters(original, settings.analytical)
+        except ForceGPError as cause:
+            raise ModelError.at(f"{source}: field 'settings.analytical'", cause) from cause
+    return Specification(
+        system, AnalyticalMean(settings.mean), priors, settings.noise_std, settings.learn_noise, parameters
+    )
+
+
+def _training(settings: StructuredSettings, spec: Specification, tensors: Mapping[str, Tensor]) -> Training:
+    measurements, noise = [], []
+    for i, quantity in enumerate(settings.measured):
+        m = Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in COLUMNS})
+        std = tensors[f"data.{i}.noise_std"]
+        if std.shape not in (m.values.shape, m.values.shape[-1:]) or not bool((std > 0.0).all()):
+            raise ValueError(f"noise of measurement {i} has shape {tuple(std.shape)}, or is not positive")
+        measurements.append(m)
+        noise.append(std)
+    scales = tuple(
+        Standardization(
+            _below(tensors, f"scale.{prior.name}.mean."),
+            _below(tensors, f"scale.{prior.name}.std."),
+            constant,
+        )
+        for prior, constant in zip(spec.priors, settings.constant, strict=True)
+    )
+    return Training(tuple(measurements), tuple(noise), scales)
+
+
+def _check_hyperparameters(spec: Specification, training: Training, hyper: Mapping[str, Tensor]) -> None:
+    """Raise `ValueError` or `KeyError` where hyperparameters are not those of the kernels."""
+    for prior, scale in zip(spec.priors, training.scales, strict=True):
+        widths = {name: x.shape[-1] for name, x in scale.mean.items()}
+        for key, value in prior.kernel.initial(prior.outputs(spec.system.robot), widths).items():
+            found = hyper[f"{prior.prefix}.{key}"]
+            if found.shape != value.shape:
+                raise ValueError(f"hyperparameter '{prior.prefix}.{key}' has shape {tuple(found.shape)}")
+
+
+@torch.no_grad()
+def _restored(
+    spec: Specification,
+    training: Training,
+    hyper: dict[str, Tensor],
+    alpha: Tensor,
+    settings: StructuredSettings,
+    system: ConstrainedSystem,
+) -> StructuredFit:
+    """The fit with its weights as they were; the factorisation waits until a covariance is asked for."""
+    problem = spec.problem(training)
+    blocks = problem.rows(hyper).blocks
+    rows = sum(block.rows for block in blocks)
+    if alpha.shape != (rows,):
+        raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
+    latent = ExactPosterior(problem.priors, kernel_parameters(hyper), blocks, alpha)
+    posterior = ForcePosterior(problem.priors, training.scales, problem.mean, latent)
+    constant = tuple(
+        f"{p.name}.{name}"
+        for p, scale in zip(spec.priors, training.scales, strict=True)
+        for name in scale.constant
+    )
+    result = FitResult(**settings.result.model_dump(), constant_inputs=constant)
+    return StructuredFit(spec, problem, hyper, posterior, result, system)
