@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -163,3 +164,57 @@ def test_wrong_use_is_refused() -> None:
         evaluate(forcegp.IndependentGP(system), data[:5])
     with pytest.raises(DataError, match="joint"):
         evaluate(forcegp.AnalyticalModel(system), data.select(tuple(reversed(data.joint_names))))
+
+
+def test_a_perfect_model_is_better_than_every_trivial_predictor() -> None:
+    some = data[:200]
+    found = evaluate(KnownError(gaussian(0.01), 0.01), some, train=data[200:400])
+    assert [v.against for v in found.verdicts] == ["mean", "robot file", "least squares"]
+    assert all(v.better for v in found.verdicts) and "but" not in found.verdict
+    error = gaussian(0.01)[:200] + some.qdd_clean - some.qdd
+    M = forcegp.dynamics.mass_matrix(system.robot, some.q)
+    torque = torch.einsum("nij,nj->ni", M, error).square().mean(0).sqrt()
+    model = found.predictors[0]
+    assert model.torque.all == pytest.approx(torque.tolist(), rel=1e-9)
+    assert model.nlpd == found.nlpd
+
+
+def test_the_robot_file_is_not_better_than_itself() -> None:
+    found = evaluate(forcegp.AnalyticalModel(system), data[:100], train=data[100:200])
+    against = {v.against: v for v in found.verdicts}
+    assert against["robot file"].torque == pytest.approx(1.0) and not against["robot file"].better
+    assert "but is not better than" in found.verdict
+
+
+def test_without_training_data_each_half_is_predicted_from_the_other() -> None:
+    some = data[:100]
+    halves = evaluate(KnownError(gaussian(0.01), None), some)
+    errors = [some.qdd[50:].mean(0) - some.qdd[:50], some.qdd[:50].mean(0) - some.qdd[50:]]
+    mean = next(p for p in halves.predictors if p.name == "mean")
+    assert mean.acceleration.all == pytest.approx(torch.cat(errors).square().mean(0).sqrt().tolist())
+
+
+class KnownMultiplier(KnownError):
+    """Predicts a multiplier that is 1 N too large, with a standard deviation of 1 N."""
+
+    def force_field(self) -> Any:
+        return lambda system, at: at.q
+
+    def predict(
+        self, q: Tensor, qd: Tensor, tau: Tensor, quantity: str = "qdd", **settings: Any
+    ) -> Prediction:
+        if quantity == "qdd":
+            return super().predict(q, qd, tau, **settings)
+        rows = settings["active"][:, 0].cumsum(0)[:, None].to(q)
+        return Prediction(rows + 1.0, torch.ones(len(q), 1, 1, dtype=q.dtype))
+
+
+def test_multipliers_are_held_against_a_logged_sensor() -> None:
+    some, closed = data[:50], data.contact["table"][:50]
+    logged = closed.cumsum(0).double()
+    some = some.replace(contact_extras={"multiplier": {"table": logged}})
+    (found,) = evaluate(KnownMultiplier(gaussian(0.0), 0.1), some, compare=False).multipliers
+    assert (found.contact, found.samples) == ("table", int(closed.sum()))
+    assert found.bias == pytest.approx(1.0) and found.spread == pytest.approx(0.0, abs=1e-9)
+    assert found.correlation == pytest.approx(1.0) and found.coverage == 1.0
+    assert evaluate(KnownError(gaussian(0.0), 0.1), some, compare=False).multipliers == ()
