@@ -24,21 +24,27 @@ def test_ratios_are_geometric_means_over_the_joints() -> None:
     model = scores("model", (1.0, 4.0), (1.0, 1.0))
     (found,) = verdicts([model, scores("mean", (2.0, 4.0), (4.0, 4.0))], ("a", "b"))
     assert found.torque == pytest.approx(math.sqrt(0.5)) and found.acceleration == pytest.approx(0.25)
-    assert found.better and found.worse == () and "Better than the mean: 0.707 times" in found.text()
+    assert (
+        found.better
+        and found.worse == ()
+        and found.text() == ("Better than the mean: error ratio 0.707 in torque and 0.25 in acceleration.")
+    )
 
 
 def test_a_model_must_be_better_in_both_units() -> None:
     model = scores("model", (1.0, 1.0), (3.0, 1.0))
     (found,) = verdicts([model, scores("least squares", (2.0, 2.0), (1.0, 1.0))], ("a", "b"))
     assert not found.better and found.worse == ("a",)
-    assert found.text().startswith("Not better than least squares: 0.5 times its torque error")
+    assert found.text().startswith("Not better than least squares: error ratio 0.5 in torque ")
     assert found.text().endswith("; worse on a.")
 
 
 def test_equal_predictors_are_not_better_and_exact_ones_do_not_divide_by_zero() -> None:
     same = scores("model", (0.0, 1.0), (0.0, 1.0))
     (found,) = verdicts([same, same], ("a", "b"))
-    assert found.torque == 1.0 and not found.better
+    assert found.torque == 1.0 and not found.better and found.worse == ()
+    worse = scores("model", (2.0, 2.0), (2.0, 2.0))
+    assert verdicts([worse, same], ("a", "b"))[0].worse == ("every joint",)
 
 
 def test_the_sentence_names_each_predictor_once() -> None:

@@ -38,7 +38,7 @@ class Verdict:
         against: name of the predictor.
         torque, acceleration: the model's error relative to the predictor's, geometric mean over the joints,
             samples in motion; below 1 the model is better.
-        worse: joints on which the model's torque or acceleration error is larger.
+        worse: joints on which the model's torque or acceleration error is larger, or `every joint`.
     """
 
     against: str
@@ -53,12 +53,9 @@ class Verdict:
 
     def text(self) -> str:
         """The comparison as one sentence."""
-        head = f"{'Better' if self.better else 'Not better'} than the {self.against}"
-        if self.against == "least squares":
-            head = head.replace("the ", "")
-        ratios = f": {self.torque:.3g} times its torque error and {self.acceleration:.3g} times its "
-        ratios += "acceleration error (geometric mean over the joints, in motion)"
-        return f"{head}{ratios}{'; worse on ' + ', '.join(self.worse) if self.worse else ''}."
+        head = f"{'Better' if self.better else 'Not better'} than {_noun(self.against)}: error ratio "
+        joints = f"; worse on {_listed(self.worse)}" if self.worse else ""
+        return f"{head}{self.torque:.3g} in torque and {self.acceleration:.3g} in acceleration{joints}."
 
 
 def verdicts(scores: Sequence[PredictorScores], joint_names: Sequence[str]) -> tuple[Verdict, ...]:
@@ -78,6 +75,7 @@ def verdicts(scores: Sequence[PredictorScores], joint_names: Sequence[str]) -> t
             name for name, pair in zip(joint_names, zip(*ratios.values(), strict=True), strict=True)
             if max(pair) > 1.0
         ]  # fmt: skip
+        worse = ["every joint"] if len(worse) == len(joint_names) else worse
         means = {unit: math.exp(sum(map(math.log, r)) / len(r)) for unit, r in ratios.items()}
         found.append(Verdict(other.name, **means, worse=tuple(worse)))
     return tuple(found)
@@ -90,13 +88,16 @@ def _ratios(ours: JointErrors, theirs: JointErrors) -> list[float]:
 
 def sentence(found: Sequence[Verdict]) -> str:
     """The verdict in one sentence, or "" where there was nothing to compare with."""
-    better = _listed([v.against for v in found if v.better])
-    worse = _listed([v.against for v in found if not v.better])
+    better = _listed([_noun(v.against) for v in found if v.better])
+    worse = _listed([_noun(v.against) for v in found if not v.better])
     parts = [f"is better than {better}"] if better else []
     parts += [f"is not better than {worse}"] if worse else []
     return f"The model {', but '.join(parts)}." if parts else ""
 
 
-def _listed(names: Sequence[str]) -> str:
-    words = [name if name == "least squares" else f"the {name}" for name in names]
+def _listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _noun(predictor: str) -> str:
+    return predictor if predictor == "least squares" else f"the {predictor}"

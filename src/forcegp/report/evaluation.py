@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -47,7 +48,8 @@ def write_evaluation(
     Returns:
         The path of the page.
     """
-    pictures = [draw_predictions(window), draw_errors(window)]
+    drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
+    pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
     pictures += [draw_calibration(found)] if found.calibration else []
     for name, picture in zip(PLOTS, pictures, strict=False):
         write_text(folder / name, picture.svg)
@@ -70,11 +72,10 @@ def _blocks(window: WindowData, pictures: list[Picture]) -> list[Block]:
     blocks = [
         Block(
             "Predictions and errors",
-            f"The first {window.seconds:.2g} s. Left: accelerations by joint, measured in black, predicted "
-            f"in "
-            "colour, with the ±2σ band if the model gives one. Right: errors, that is measured (grey) and, "
-            "if "
-            "logged, noise-free (black) acceleration less the prediction.",
+            f"The first {window.seconds:.2g} s. Predictions: accelerations by joint, measured in black, "
+            f"predicted "
+            "in colour, with the ±2σ band if the model gives one. Errors: measured (grey) and, if logged, "
+            "noise-free (black) acceleration less the prediction.",
             tuple(pictures[:2]),
             WINDOW,
         )
@@ -107,24 +108,24 @@ def draw_calibration(found: Evaluation) -> Picture:
 
 
 def error_tables(found: Evaluation) -> tuple[Table, ...]:
-    """Torque and acceleration errors by joint, beside the trivial predictors; worse ones in red."""
-    units = {
-        "torque": ("Torque error M(q)(predicted − measured q̈), root mean square in motion [N m, N]", "nRMSE"),
-        "acceleration": ("Acceleration error, root mean square in motion [rad/s², m/s²]", "nRMSE"),
-    }
+    """Torque and acceleration errors by joint, beside the trivial predictors; worse ones in red.
+
+    nRMSE is the error over all samples divided by the standard deviation of the measured quantity.
+    """
+    units = {"torque": "[N m, N]", "acceleration": "[rad/s², m/s²]"}
     tables = []
-    for unit, (caption, normalised) in units.items() if found.predictors else ():
+    for unit, names in units.items() if found.predictors else ():
         errors: dict[str, JointErrors] = {p.name: getattr(p, unit) for p in found.predictors}
         own, *others = errors.values()
-        head = ("joint", *errors, "model, at rest", f"model, {normalised}")
+        head = ("joint", *errors, "model, at rest", "model, nRMSE")
         rows, bad = [], set()
         for i, joint in enumerate(found.joint_names):
             shown = [e.in_motion[i] for e in errors.values()]
             rows.append((joint, *map(_short, (*shown, own.rest[i], own.normalised[i]))))
             if any((shown[0] or 0.0) > (e.in_motion[i] or 0.0) for e in others):
                 bad.add((i, 1))
-        tables.append(Table(f"{caption}; nRMSE: divided by the standard deviation of the measured quantity",
-                            head, tuple(rows), frozenset(bad)))  # fmt: skip
+        caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: worse than another"
+        tables.append(Table(caption, head, tuple(rows), frozenset(bad)))
     return tuple(tables)
 
 
