@@ -29,7 +29,8 @@ def error_table(results: Results, paper: PaperNumbers) -> Table:
             for split in SPLITS
             for kind in ("noisy", "clean")
         ]
-        rows.append((label(model), str(points), *cells, paper_value(paper, model, points)))
+        theirs = paper_value(paper, paper.beside(results, model), points)
+        rows.append((label(model), str(points), *cells, theirs))
     ours = [f"{kind}, {split}" for split in ("held out", "paper's split") for kind in ("noisy", "clean")]
     head = ("model", "N", *ours, "noisy, paper")
     return Table("Mean absolute error of predicted accelerations [rad/s²]", head, tuple(rows))
