@@ -6,6 +6,8 @@ comparison; the default kernels are a different model.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -106,9 +108,7 @@ def _curves(axes: Axes, results: Results, split: str, measure: str) -> None:
         axes.plot([], [], color=INK, linestyle=KERNEL_LINE, linewidth=1.0, label="paper's kernel")
 
 
-def _curve(
-    axes: Axes, results: Results, model: str, split: str, measure: str, style: dict[str, object]
-) -> None:
+def _curve(axes: Axes, results: Results, model: str, split: str, measure: str, style: dict[str, Any]) -> None:
     found = {n: v for n in results.sizes(model) if (v := results.values(model, split, n, measure))}
     if found:
         axes.plot(list(found), [sum(v) / len(v) for v in found.values()], **style)
