@@ -64,6 +64,11 @@ def test_errors_name_file_line_and_key(before: str, after: str, message: str) ->
         parse_mapping(GOOD.replace(before, after).encode(), "m.toml")
 
 
+def test_a_hostile_mapping_is_a_mapping_error() -> None:
+    with pytest.raises(MappingError, match="a key of too many parts"):
+        parse_mapping(b".".join([b"a"] * 1000) + b" = 1", "m.toml")
+
+
 def test_names_of_joints_are_checked_against_the_robot() -> None:
     mapping = parse_mapping(GOOD.encode(), "m.toml")
     with pytest.raises(

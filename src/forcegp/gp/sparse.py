@@ -25,7 +25,7 @@ from forcegp.gp.kernels import Parameters
 from forcegp.gp.pathwise import FEATURES, FunctionSamples
 from forcegp.gp.sparse_draws import draw_functions
 from forcegp.gp.structured_covariance import Block, Process
-from forcegp.gp.sums import Sums, accumulate, add_rows
+from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 from forcegp.linalg import cholesky
 
 CHUNK_PREDICTIONS = 256
@@ -44,13 +44,13 @@ class SparsePosterior:
 
     Attributes:
         basis: basis functions.
-        sums: sums over the samples.
+        moments: sums over the samples but for G, which the factor holds.
         L: lower Cholesky factor of A = I + G.
         jitter: what was added to the diagonal, 0.0 as a rule.
     """
 
     basis: LatentBasis
-    sums: Sums
+    moments: Moments
     L: Tensor
     jitter: float = 0.0
 
@@ -63,19 +63,28 @@ class SparsePosterior:
         """
         A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
         L, jitter = cholesky(A)
-        return cls(basis, sums, L, jitter)
+        result = cls(basis, Moments(*sums.moments), L, jitter)
+        result.__dict__["sums"] = sums
+        return result
+
+    @cached_property
+    def sums(self) -> Sums:
+        """All sums over the samples, G from the factor where samples were added to it."""
+        eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
+        return Sums(*self.moments.moments, self.L @ self.L.mT - (1.0 + self.jitter) * eye)
 
     @cached_property
     def weights(self) -> Tensor:
         """A⁻¹v, the posterior mean of the basis functions' weights `(size,)`."""
-        return torch.cholesky_solve(self.sums.v[:, None], self.L)[:, 0]
+        return torch.cholesky_solve(self.moments.v[:, None], self.L)[:, 0]
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
         """Of each process, whether any row shows it; the samples change nothing about the others."""
-        diagonal = self.sums.G.diagonal()
+        # The factor of A = I + G is that of the identity where G is zero.
+        diagonal = self.L.diagonal().abs()
         own = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
-        return tuple(bool((diagonal[columns] > 0.0).any()) for columns in own)
+        return tuple(bool((diagonal[columns] > 1.0).any()) for columns in own)
 
     def is_measured(self, p: int) -> bool:
         """Whether any row depends on process p; where none does, its posterior is its prior."""
@@ -177,8 +186,8 @@ class SparsePosterior:
         rows = sum(block.rows for block in blocks)
         if rows > UPDATE_FRACTION * self.basis.size or self.L.device.type != "cpu":
             return SparsePosterior.of(self.basis, self.sums + accumulate(self.basis, blocks))
-        sums, Phi = add_rows(self.basis, self.sums, blocks)
-        return SparsePosterior(self.basis, sums, _extended(self.L, Phi), self.jitter)
+        moments, Phi = add_rows(self.basis, self.moments, blocks)
+        return SparsePosterior(self.basis, moments, _extended(self.L, Phi), self.jitter)
 
     def forgetting(self, factor: float) -> SparsePosterior:
         """With every sample so far counting `factor` times; with 0 the prior is left.
@@ -203,9 +212,9 @@ def _extended(L: Tensor, rows: Tensor) -> Tensor:
 
     Its diagonal may be negative, which solves do not mind.
     """
-    upper, below = np.asfortranarray(L.numpy().T), np.asfortranarray(rows.numpy())
+    upper, below = np.array(L.numpy().T, order="F"), np.array(rows.numpy(), order="F")
     (tpqrt,) = scipy.linalg.lapack.get_lapack_funcs(("tpqrt",), (upper,))
-    R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below)
+    R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below, overwrite_a=1, overwrite_b=1)
     if info != 0:
         raise NumericalError("a Cholesky factor could not be updated", got=f"LAPACK tpqrt info {info}")
     return torch.from_numpy(R).mT

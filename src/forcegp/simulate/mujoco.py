@@ -95,6 +95,6 @@ def _import_mujoco() -> Any:
         import mujoco
     except ImportError:
         raise MissingDependencyError(
-            "the engine 'mujoco' needs the package mujoco", hint="pip install mujoco"
+            "the engine 'mujoco' needs the package mujoco", hint='pip install "forcegp[mujoco]"'
         ) from None
     return mujoco
