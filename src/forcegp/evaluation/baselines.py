@@ -11,7 +11,7 @@ from torch import Tensor
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.evaluation.least_squares import LeastSquares, identify_rigid
+from forcegp.evaluation.least_squares import CHUNK_STATES, LeastSquares, identify_rigid
 
 FEWEST = 20
 """Minimum number of samples to fit a baseline to."""
@@ -59,5 +59,7 @@ def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
 
 def as_torque(system: ConstrainedSystem, q: Tensor, error: Tensor) -> Tensor:
     """Errors of acceleration as torques M(q)(predicted − measured q̈), `(n, nq)` [N m, N]."""
+    pairs = zip(q.split(CHUNK_STATES), error.split(CHUNK_STATES), strict=True)
     with torch.no_grad():
-        return (dynamics.mass_matrix(system.robot, q) @ error[..., None])[..., 0]
+        parts = [dynamics.mass_matrix(system.robot, at) @ e[..., None] for at, e in pairs]
+    return torch.cat(parts)[..., 0]

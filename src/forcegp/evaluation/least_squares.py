@@ -22,7 +22,7 @@ from forcegp.robot.inertia import pseudo_inertia as pseudo_inertia_of
 from forcegp.robot.model import RobotModel
 
 CHUNK_STATES = 1000
-"""States whose regressor is held at a time."""
+"""States handled at a time, which bounds the memory."""
 MOST = 4000
 """Samples used at most, evenly spaced: some hundred times the number of unknowns in equations."""
 MASS_SHARE, LENGTH = 0.3, 0.1
@@ -50,6 +50,10 @@ class LeastSquares:
     @torch.no_grad()
     def predict(self, data: Dataset) -> Tensor:
         """Accelerations `(n, nq)` under the logged torques, on the constraint."""
+        parts = (data[i : i + CHUNK_STATES] for i in range(0, len(data), CHUNK_STATES))
+        return torch.cat([self._predict(part) for part in parts])
+
+    def _predict(self, data: Dataset) -> Tensor:
         eom = self.system.equations(data.q, data.qd, data.active(self.system.contact_names))
         lost = (_friction_columns(self.system.robot, data.qd) @ self.friction[:, None])[..., 0]
         return eom.acceleration(eom.Q_K + data.tau - lost)

@@ -45,7 +45,7 @@ def overview_table(results: Results) -> Table:
         cells = [number(results.values(model, "stretches", points, m), digits) for m, digits in measures]
         rows.append((label(model), str(points), *cells))
     return Table(
-        "Held-out motion without training points, noise-free accelerations",
+        "Motion without training points: error against noise-free q̈, coverage of noisy q̈",
         ("model", "N", "error [rad/s²]", "±2σ coverage", "|A q̈ − b| [m/s²]"),
         tuple(rows),
     )
