@@ -185,3 +185,11 @@ def test_diagnostics_tell_when_more_points_would_help() -> None:
     smoother = Phi @ np.linalg.solve(A, Phi.T)
     assert many.diagnostics.learned == pytest.approx(np.trace(smoother), rel=1e-6)
     assert many.diagnostics.residual == pytest.approx(((y - smoother @ y) ** 2).mean(), rel=1e-6)
+
+
+def test_log_likelihood_is_the_textbook_bound_and_follows_updates() -> None:
+    old, more = rows(30), rows(4, r=2, seed=1)
+    Z = first(rows(12, seed=5), 12)
+    posterior, params = fitted([old], Z)
+    dense = textbook([old, more], Z, params).negative_bound()
+    assert float(posterior.updated([more]).log_likelihood()) == pytest.approx(-dense, rel=1e-9)

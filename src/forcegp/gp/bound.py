@@ -6,7 +6,6 @@ over twice, once for the sums and once for the gradient, in memory that does not
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,14 +19,7 @@ from forcegp.gp.kernels import Parameters
 from forcegp.gp.places import Gradient, Place, from_tensors, tensors_of
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block, Process
-from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
-
-
-def bound_of(sums: Sums, posterior: SparsePosterior) -> Tensor:
-    """The negative bound from the sums `()`."""
-    fit = sums.yy - sums.v @ posterior.weights
-    log_determinant = 2.0 * posterior.L.diagonal().abs().log().sum()
-    return 0.5 * (fit + log_determinant + sums.rows * math.log(2.0 * math.pi) + sums.missed.sum())
+from forcegp.gp.sums import CHUNK_SAMPLES, accumulate
 
 
 def negative_bound(
@@ -69,8 +61,7 @@ class _NegativeBound(torch.autograd.Function):
         named = dict(zip(places, (t.detach() for t in tensors), strict=True))
         params, blocks = from_tensors(named)
         basis = latent_basis(processes, params, inducing, components_of(blocks[0]))
-        sums = accumulate(basis, blocks)
-        posterior = SparsePosterior.of(basis, sums)
+        posterior = SparsePosterior.of(basis, accumulate(basis, blocks))
         needs = ctx.needs_input_grad[3:]
         ctx.wanted = [i for i, need in enumerate(needs) if need]
         if ctx.wanted:
@@ -79,7 +70,7 @@ class _NegativeBound(torch.autograd.Function):
             ctx.save_for_backward(
                 *(gradient.get(places[i], torch.zeros_like(tensors[i])) for i in ctx.wanted)
             )
-        return bound_of(sums, posterior)
+        return -posterior.log_likelihood()
 
     @staticmethod
     def backward(ctx: Any, *grad: Tensor) -> tuple[Any, ...]:
