@@ -213,7 +213,7 @@ def markdown(result: dict) -> str:
     parts = [
         "## Sparse posterior",
         f"Synthetic rows, seven per sample, one thread, float64, {result['machine']}; "
-        "`python benchmarks/sparse.py --json FILE --docs docs/benchmarks.md` measures it again. Conditioning:",
+        "`python benchmarks/sparse.py --json FILE --docs docs/benchmarks.md` measures it again.",
         table(["samples", "wall [s]", "processor [s]", "peak memory [MiB]"], rows),
         f"With {one['basis_functions']} basis functions, in ms of processor time: mean of one state "
         f"{one['one_mean_ms']['processor']:.2f}, with covariance "
@@ -225,8 +225,9 @@ def markdown(result: dict) -> str:
     if "exact" in result:
         exact = result["exact"]
         parts.append(
-            f"Exact inference on {exact['samples']} samples: {exact['condition_seconds']:.1f} s to condition, "
-            f"{exact['likelihood_seconds']:.1f} s for one likelihood with gradient, {exact['peak_mib']:.0f} MiB."
+            f"Exact inference on {exact['samples']} samples takes {exact['condition_seconds']:.1f} s to "
+            f"condition, {exact['likelihood_seconds']:.1f} s for one likelihood with gradient, and "
+            f"{exact['peak_mib']:.0f} MiB."
         )
     return "\n\n".join(parts)
 
