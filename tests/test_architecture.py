@@ -26,6 +26,7 @@ LAYERS = (
         "linalg",
         "batchlast",
         "threads",
+        "optional",
     ),
     ("robot",),
     ("kinematics", "friction", "dynamics"),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -50,12 +50,22 @@ class ForcePosterior:
         priors, scales: the force priors and the standardization of their inputs.
         mean: prior mean of Q.
         latent: the conditioned processes.
+        offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
     """
 
     priors: tuple[ForcePrior, ...]
     scales: tuple[Standardization, ...]
     mean: ForceMean
     latent: LatentPosterior
+    offsets: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def latent_mean(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | None:
+        """Posterior mean of the force of prior p, `(n, components)`; `None` where it is zero."""
+        offset = self.offsets.get(self.priors[p].name)
+        if not self.latent.is_measured(p):
+            return None if offset is None else offset.expand(len(at.q), -1)
+        mean = self.latent.latent_mean(p, self.features_of(p, system, at))
+        return mean if offset is None else mean + offset
 
     def features_of(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         """Standardized kernel inputs of prior p at states."""
@@ -65,8 +75,8 @@ class ForcePosterior:
         """Posterior mean of Q̄ = m + Σ E f, `(n, nq)`: the force field of a rollout."""
         force = self.mean(system, at)
         for p, prior in enumerate(self.priors):
-            if self.latent.is_measured(p):
-                latent = self.latent.latent_mean(p, self.features_of(p, system, at))
+            latent = self.latent_mean(p, system, at)
+            if latent is not None:
                 force = force + (prior.operator(system, at) @ latent[..., None])[..., 0]
         return force
 
@@ -74,9 +84,9 @@ class ForcePosterior:
         """Posterior mean of a quantity, o + B(m + Σ E f), `(n, d)`."""
         mean = prior_mean(system, at, z, self.mean)
         for p, prior in enumerate(self.priors):
-            if self.latent.is_measured(p):
+            latent = self.latent_mean(p, system, at)
+            if latent is not None:
                 (W,) = prior_operators([prior], system, at, z)
-                latent = self.latent.latent_mean(p, self.features_of(p, system, at))
                 mean = mean + (W @ latent[..., None])[..., 0]
         return mean
 

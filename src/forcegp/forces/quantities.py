@@ -25,6 +25,7 @@ class States:
         q, qd, tau: `(n, nq)`.
         active: `(n, n_contacts)` bool.
         eom: the equations of motion at these states.
+        qdd: `(n, nq)` measured acceleration, where one is known.
     """
 
     q: Tensor
@@ -32,11 +33,19 @@ class States:
     tau: Tensor
     active: Tensor
     eom: Equations
+    qdd: Tensor | None = None
 
 
-def states(system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> States:
+def states(
+    system: ConstrainedSystem,
+    q: Tensor,
+    qd: Tensor,
+    tau: Tensor,
+    active: Tensor,
+    qdd: Tensor | None = None,
+) -> States:
     """Evaluate the equations of motion at a batch of states."""
-    return States(q, qd, tau, active, system.equations(q, qd, active))
+    return States(q, qd, tau, active, system.equations(q, qd, active), qdd)
 
 
 class FlatStates(NamedTuple):

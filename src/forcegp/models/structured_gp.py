@@ -5,6 +5,7 @@ q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and likewise for every other quantit
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
+from forcegp.forces.inference import check_method
 from forcegp.forces.learn import Problem, Search
 from forcegp.forces.mean import AnalyticalMean, mean_of
 from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
@@ -22,7 +24,8 @@ from forcegp.forces.priors.default import default_priors
 from forcegp.gp.optimise import LearningOptions, Progress
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_spec import Specification
+from forcegp.models.structured_learning import in_motion, prepared, solve
+from forcegp.models.structured_spec import Specification, torque_noise_of
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
@@ -60,14 +63,30 @@ class StructuredGP(Model[StructuredFit]):
         noise_std: NoiseStd | None = None,
         learn_noise: bool = False,
         analytical_parameters: nn.Module | None = None,
+        torque_noise: NoiseStd | str | None = "auto",
+        inference: str = "auto",
     ) -> None:
         form = mean_of(mean)
         priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
         check_priors(priors, system)
         self.specified = system
         self.specification = Specification(
-            system, form, priors, noise_std, learn_noise, analytical_parameters
+            system,
+            form,
+            priors,
+            noise_std,
+            learn_noise,
+            analytical_parameters,
+            torque_noise_of(torque_noise, priors),
+            check_method(inference),
         )
+
+    @classmethod
+    def of(cls, specification: Specification) -> StructuredGP:
+        """A model with a given specification."""
+        model = cls.__new__(cls)
+        model.specified, model.specification = specification.system, specification
+        return model
 
     @property
     def mean(self) -> AnalyticalMean:
@@ -120,14 +139,15 @@ class StructuredGP(Model[StructuredFit]):
         spec = self.specification
         options = options or (LearningOptions() if spec.parameters is None else WITH_PARAMETERS)
         chosen = self._chosen(learn)
-        problem = spec.problem(self._training(data, chosen))
-        start = problem.initial(spec.learn_noise)
+        training, doubts = in_motion(spec, self._training(data, chosen))
+        problem = spec.problem(training)
+        start = problem.initial(spec.learn_noise, spec.learns_torque_noise)
         before = {} if self._fitted is None else self._fitted.hyperparameters
         current = {key: before.get(key, value) for key, value in start.items()}
         held = {key: value for key, value in current.items() if key.split(".")[0] not in chosen}
         free = {key: value for key, value in start.items() if key not in held}
         if not free:
-            return self.adopt(conditioned(spec, problem.training, held))
+            return self.adopt(conditioned(spec, prepared(spec, problem, held), held, warnings=doubts))
 
         def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
             if progress is not None:
@@ -139,8 +159,9 @@ class StructuredGP(Model[StructuredFit]):
             saved = Checkpoint(Path(checkpoint), _key(problem, options, free))
             found = saved.read(free)
             begin, note = begin if found is None else found, saved.noting(report)
-        learned = Search(free, held, options).solve(problem, note, begin)
-        fitted = self.adopt(conditioned(spec, problem.training, {**held, **learned.tensors}, learned))
+        lesson = solve(spec, problem, Search(free, held, options), note, begin)
+        doubts = (*doubts, *lesson.warnings)
+        fitted = self.adopt(conditioned(spec, lesson.problem, lesson.hyperparameters, lesson.learned, doubts))
         if saved is not None:
             saved.remove()
         return fitted
@@ -169,7 +190,9 @@ class StructuredGP(Model[StructuredFit]):
                 hint='call fit(data, learn=["noise"]), which learns the noise alone',
             )
         values = fitted.hyperparameters if hyperparameters is None else hyperparameters
-        return self.adopt(conditioned(self.specification, training, values))
+        spec, (moving, doubts) = self.specification, in_motion(self.specification, training)
+        problem = prepared(spec, dataclasses.replace(fitted.problem, training=moving), values)
+        return self.adopt(conditioned(spec, problem, values, warnings=doubts))
 
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import torch
@@ -15,6 +16,7 @@ from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
+from forcegp.gp.sparse_tensors import posterior_of_tensors
 from forcegp.models.base import FitResult
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
@@ -39,9 +41,7 @@ def load_structured(
     """
     settings = settings_of(header, StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)
-    model = StructuredGP(
-        spec.system, spec.mean, spec.priors, spec.noise_std, spec.learn_noise, spec.parameters
-    )
+    model = StructuredGP.of(spec)
     try:
         for name, value in tensors.items():
             finite = name.removeprefix("start.") in ("lower", "upper", "velocity_limit", "effort_limit")
@@ -50,7 +50,7 @@ def load_structured(
         training = _training(settings, spec, tensors)
         hyper = _below(tensors, "hyper.")
         _check_hyperparameters(spec, training, hyper)
-        model.adopt(_restored(spec, training, hyper, tensors["alpha"], settings, system))
+        model.adopt(_restored(spec, training, hyper, tensors, settings, system))
     except (KeyError, RuntimeError, ValueError, IndexError) as cause:
         raise ModelError(f"{source}: the model's tensors do not fit its settings", got=str(cause)) from cause
     return model
@@ -63,16 +63,22 @@ def _specification(
         decode(dict(prior), CLASSES, f"{source}: settings.priors.{i}")
         for i, prior in enumerate(settings.priors)
     )
-    parameters = None
+    original, parameters = take_robot(tensors, "start.", system.robot, source), None
+    system = system.with_robot(original)
     if settings.analytical is not None:
-        original = take_robot(tensors, "start.", system.robot, source)
         try:
-            system = system.with_robot(original)
             parameters = AnalyticalParameters(original, settings.analytical)
         except ForceGPError as cause:
             raise ModelError.at(f"{source}: field 'settings.analytical'", cause) from cause
     return Specification(
-        system, AnalyticalMean(settings.mean), priors, settings.noise_std, settings.learn_noise, parameters
+        system,
+        AnalyticalMean(settings.mean),
+        priors,
+        settings.noise_std,
+        settings.learn_noise,
+        parameters,
+        settings.torque_noise,
+        settings.inference,
     )
 
 
@@ -111,18 +117,28 @@ def _restored(
     spec: Specification,
     training: Training,
     hyper: dict[str, Tensor],
-    alpha: Tensor,
+    tensors: Mapping[str, Tensor],
     settings: StructuredSettings,
     system: ConstrainedSystem,
 ) -> StructuredFit:
     """The fit with its weights as they were; the factorisation waits until a covariance is asked for."""
-    problem = spec.problem(training)
-    blocks = problem.rows(hyper).blocks
-    rows = sum(block.rows for block in blocks)
-    if alpha.shape != (rows,):
-        raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
-    latent = ExactPosterior(problem.priors, kernel_parameters(hyper), blocks, alpha)
-    posterior = ForcePosterior(problem.priors, training.scales, problem.mean, latent)
+    problem = dataclasses.replace(
+        spec.problem(training),
+        system=spec.system if spec.parameters is not None else system,
+        power=settings.power,
+        offsets=_below(tensors, "offset."),
+        torque_std=tensors.get("torque_std"),
+    )
+    params = kernel_parameters(hyper)
+    if "alpha" in tensors:
+        blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
+        rows = sum(block.rows for block in blocks)
+        if alpha.shape != (rows,):
+            raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
+        latent = ExactPosterior(problem.priors, params, blocks, alpha)
+    else:
+        latent = posterior_of_tensors(problem.priors, params, _below(tensors, "sparse."))
+    posterior = ForcePosterior(problem.priors, training.scales, problem.mean, latent, problem.offsets)
     constant = tuple(
         f"{p.name}.{name}"
         for p, scale in zip(spec.priors, training.scales, strict=True)
