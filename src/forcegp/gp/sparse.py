@@ -7,7 +7,6 @@ hundred samples and after a million.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -143,13 +142,6 @@ class SparsePosterior:
             parts.append(W @ self.latent_covariance(own.features) @ W.mT)
         covariance = torch.cat(parts)
         return 0.5 * (covariance + covariance.mT)
-
-    def log_likelihood(self) -> Tensor:
-        """Collapsed bound on log p(y) of the rows, never above the exact value `()`."""
-        sums = self.moments
-        fit = sums.yy - sums.v @ self.weights + sums.missed.sum()
-        log_determinant = 2.0 * self.L.diagonal().abs().log().sum()
-        return -0.5 * (fit + log_determinant + sums.rows * math.log(2.0 * math.pi))
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
