@@ -28,7 +28,7 @@ from torch import Tensor
 import forcegp
 from forcegp.data import split_by_stretches
 from forcegp.forces.priors.default import PAPER, default_priors
-from forcegp.forces.states import states
+from forcegp.forces.quantities import states
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.models.structured_problem import kernel_parameters
 from forcegp.simulate import simulate

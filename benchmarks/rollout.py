@@ -64,10 +64,10 @@ def measure(model: StructuredGP, run: SimulationResult, seconds: float, samples:
     """Wall and processor time of one rollout, the growth of memory, and what its result holds."""
     data = run.data
     options = RolloutOptions(on_divergence="keep")
-    model.rollout(data.q[0], data.qd[0], data.tau, 0.05, samples, options=options)
+    model.rollout(data.q[0], data.qd[0], data, 0.05, samples, options=options)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     wall, processor = time.perf_counter(), time.process_time()
-    path = model.rollout(data.q[0], data.qd[0], data.tau, seconds, samples, options=options)
+    path = model.rollout(data.q[0], data.qd[0], data, seconds, samples, options=options)
     wall, processor = time.perf_counter() - wall, time.process_time() - processor
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     parts = [path] if path.samples is None else [path, path.samples]
@@ -94,7 +94,7 @@ def drift(model: StructuredGP, run: SimulationResult, seconds: float) -> list[di
     control = TaskSpaceControl(system, plan, config.dt, config.gains)
     q0, qd0 = project_state(system, data.q[0], data.qd[0])
     rows = []
-    for loop, inputs in (("closed", control), ("open", data.tau)):
+    for loop, inputs in (("closed", control), ("open", data)):
         for stabilization, method, samples in DRIFT:
             options = RolloutOptions(method=method, stabilization=stabilization, on_divergence="keep")
             path = model.rollout(q0, qd0, inputs, seconds, samples, options=options)

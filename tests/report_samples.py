@@ -1,22 +1,18 @@
-"""Small results with numbers chosen by hand, for the tests of figures, tables and pages."""
+"""Small results with numbers chosen by hand, for the tests of plots, tables and pages."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
-from forcegp.report.data import (
-    CovarianceData,
-    IdentificationData,
-    IdentificationRun,
-    MultiplierBand,
-    MultiplierData,
-    Results,
-    Score,
-    TaskSpaceData,
-    WindowData,
-)
-from forcegp.report.page import FigureData
+from forcegp.paper.covariance import CovarianceData
+from forcegp.paper.figures import FigureData
+from forcegp.paper.identification import IdentificationData, IdentificationRun
+from forcegp.paper.multiplier import MultiplierBand, MultiplierData
+from forcegp.paper.results import Results, Score
+from forcegp.paper.task_space import TaskSpaceData
 from forcegp.report.rollout_data import Band, Film, ModelPath, RolloutData
+from forcegp.report.window import WindowData
 
 T = [i / 240 for i in range(72)]
 JOINTS = [f"joint_{i}" for i in range(1, 8)]
@@ -89,7 +85,6 @@ def window(model: str = "sgp-mean", *, std: bool = True, clean: bool = True) -> 
 def band(model: str = "sgp-mean", **changes: object) -> MultiplierBand:
     """A predicted multiplier."""
     values = {
-        "training_points": 200,
         "mean": [40.0 + math.sin(t) for t in T],
         "std": [0.5] * len(T),
         "inside": 0.96,
@@ -167,11 +162,11 @@ def rollouts(*models: ModelPath) -> RolloutData:
     )
 
 
-def figures() -> FigureData:
-    """The data of all figures."""
+def figures(**changes: object) -> FigureData:
+    """The data of all figures, some of them changed."""
     eye = [[float(i == j) for j in range(14)] for i in range(14)]
     three = waves(3, 0.1)
-    return FigureData(
+    made = FigureData(
         covariance=CovarianceData(
             model="sgp-zero", t=[0.0, 0.1], nq=7, operators=[[row[:7] for row in eye[:7]]] * 2, force=eye,
             acceleration=eye, rank=12,
@@ -185,3 +180,4 @@ def figures() -> FigureData:
         identification=identification(),
         rollouts=rollouts(),
     )  # fmt: skip
+    return dataclasses.replace(made, **changes)  # pyright: ignore[reportArgumentType]

@@ -14,7 +14,20 @@ import forcegp
 ROOT = Path(forcegp.__file__).parent
 
 LAYERS = (
-    ("errors", "types", "files", "linalg", "batchlast", "threads"),
+    (
+        "limits",
+        "errors",
+        "types",
+        "temporary",
+        "exchange",
+        "files",
+        "destination",
+        "memory",
+        "linalg",
+        "batchlast",
+        "threads",
+        "optional",
+    ),
     ("robot",),
     ("kinematics", "friction", "dynamics"),
     ("compiled", "derivatives", "identification"),
@@ -26,8 +39,9 @@ LAYERS = (
     ("control",),
     ("simulate",),
     ("scene",),
-    ("logs",),
-    ("rollout", "models"),
+    ("logs", "checks"),
+    ("rollout",),
+    ("models",),
     ("evaluation",),
     ("report",),
     ("paper",),

@@ -8,8 +8,9 @@ from typing import ClassVar
 
 import pytest
 
-from forcegp.errors import DataError
-from forcegp.files import MAX_HEADER_BYTES, Header, atomic_directory, atomic_file, write_json, write_text
+from forcegp.errors import DataError, DestinationError
+from forcegp.files import Header, atomic_directory, atomic_file, write_json, write_text
+from forcegp.limits import HEADER_BYTES
 
 
 class Card(Header):
@@ -64,7 +65,7 @@ def test_a_crash_leaves_the_old_folder_and_success_replaces_it_whole(tmp_path: P
 
 def test_a_folder_does_not_replace_a_file(tmp_path: Path) -> None:
     (tmp_path / "model").write_text("precious")
-    with pytest.raises(NotADirectoryError, match="is a file"), atomic_directory(tmp_path / "model"):
+    with pytest.raises(DestinationError, match="is a file"), atomic_directory(tmp_path / "model"):
         pass
     assert (tmp_path / "model").read_text() == "precious"
 
@@ -93,7 +94,8 @@ def test_header_round_trip() -> None:
         ('{"format": "card"}', "version None"),
         ('{"format": "card", "version": 3, "size": "big"}', "header field 'size'"),
         ('{"format": "card", "version": 3, "colour": 1}', "header field 'colour'"),
-        (" " * (MAX_HEADER_BYTES + 1), "too large"),
+        ('{"format": "card", "version": 3, "size": ' + "[" * 80 + "]" * 80 + "}", "nested too deeply"),
+        (" " * (HEADER_BYTES + 1), "too large"),
     ],
 )
 def test_bad_headers_say_what_is_wrong(text: str, message: str) -> None:

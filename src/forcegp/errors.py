@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
-from typing import TypeVar
+from itertools import islice
+from typing import Any, TypeVar
+
+from forcegp.limits import NAME_COMPARED, NAMES_COMPARED
+
+LONGEST_VALUE = 2000
+"""Characters of a wrong value that a message shows."""
 
 E = TypeVar("E", bound="ForceGPError")
 
@@ -25,7 +31,7 @@ class ForceGPError(Exception):
         self.message, self.expected, self.got, self.hint = message, expected, got, hint
         parts = [message]
         parts += [f"expected: {expected}"] if expected is not None else []
-        parts += [f"got: {got}"] if got is not None else []
+        parts += [f"got: {_shortened(str(got), LONGEST_VALUE)}"] if got is not None else []
         parts += [f"hint: {hint}"] if hint else []
         super().__init__("\n  ".join(parts))
 
@@ -33,7 +39,36 @@ class ForceGPError(Exception):
     def at(cls: type[E], place: str, cause: ForceGPError) -> E:
         """An error of this class that adds to another one where it arose (a file, a line)."""
         message = f"{place}: {cause.message}"
-        return cls(message, expected=cause.expected, got=cause.got, hint=cause.hint)
+        error = cls.__new__(cls)
+        ForceGPError.__init__(error, message, expected=cause.expected, got=cause.got, hint=cause.hint)
+        return error
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How to copy the error, or to send it to another process: its text and plain values."""
+        state = {name: _plain(value) for name, value in self.__dict__.items()}
+        return _rebuilt, (type(self), tuple(map(_plain, self.args)), state)
+
+
+def _plain(value: object) -> object:
+    """The value itself where every process can hold it, else the text that the message shows."""
+    return value if isinstance(value, str | int | float | None) else str(value)
+
+
+def _rebuilt(kind: type[E], args: tuple[object, ...], state: dict[str, object]) -> E:
+    """The error that `ForceGPError.__reduce__` took apart; no constructor runs a second time."""
+    error = kind.__new__(kind, *args)
+    error.args = args
+    error.__dict__.update(state)
+    return error
+
+
+def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[str]:
+    """The valid name nearest to a misspelt one, or none; long names and long lists are not compared."""
+    text = str(name)
+    if len(text) > NAME_COMPARED:
+        return []
+    compared = (other for other in islice(valid, NAMES_COMPARED) if len(other) <= NAME_COMPARED)
+    return get_close_matches(text, list(compared), n=1, cutoff=cutoff)
 
 
 class RobotFileError(ForceGPError, ValueError):
@@ -57,12 +92,25 @@ class UnknownNameError(ForceGPError, LookupError):
 
     def __init__(self, kind: str, name: object, valid: Iterable[str]) -> None:
         names = list(valid)
-        near = get_close_matches(str(name), names, n=1)
+        near = near_names(name, names)
         super().__init__(
-            f"unknown {kind} {name!r}",
-            expected="one of " + ", ".join(names) if names else "none are defined",
+            f"unknown {kind} {_shortened(repr(name), NAME_COMPARED)}",
+            expected="one of " + _listed(names) if names else "none are defined",
             hint=f"did you mean {near[0]!r}?" if near else None,
         )
+
+
+class ParameterError(ForceGPError, ValueError):
+    """A parameter that is out of range, such as a radius or a time step (the message names it)."""
+
+
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else text[:length] + "…"
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - NAMES_COMPARED
+    return ", ".join(names[:NAMES_COMPARED]) + (f" and {more} more" if more > 0 else "")
 
 
 class ShapeError(ForceGPError, ValueError):
@@ -91,3 +139,11 @@ class NumericalError(ForceGPError, ArithmeticError):
 
 class MissingDependencyError(ForceGPError, ImportError):
     """An optional package that the request needs and that is not installed."""
+
+
+class DestinationError(ForceGPError, OSError):
+    """A place where results are to be written and cannot be; names where they were kept, if they exist."""
+
+
+class MemoryLimitError(ForceGPError, RuntimeError):
+    """Work that needs more memory than is free, refused before it starts."""

@@ -16,11 +16,9 @@ from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.models.base import Model
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.models.structured_problem import NOISE
 
 CHUNK_STATES = 2000
 """States predicted at a time, which bounds the memory."""
-LEARNED_NOISE = f"{NOISE}0.log_noise_std"
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Probabilities of the central intervals whose coverage is counted."""
 
@@ -204,9 +202,10 @@ def _residual(system: ConstrainedSystem, data: Dataset, rows: slice, qdd: Tensor
 
 def _noise_std(model: Model, data: Dataset) -> Tensor | None:
     """The noise that the model takes for measured accelerations, or the data's, `(nq,)`."""
-    if isinstance(model, StructuredGP) and model.learn_noise and LEARNED_NOISE in model.hyperparameters:
-        return model.hyperparameters[LEARNED_NOISE].exp()
-    noise = getattr(model, "noise_std", data.header.noise_std)
+    if isinstance(model, StructuredGP):
+        return model.fitted.problem.noise_at(model.hyperparameters, 0)
+    noise = getattr(model, "noise_std", None)
+    noise = data.header.noise_std if noise is None else noise
     return None if noise is None else torch.as_tensor(noise, dtype=data.dtype).expand(data.nq).to(data.device)
 
 

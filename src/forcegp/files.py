@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import secrets
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,16 +12,16 @@ from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from forcegp.errors import ForceGPError
+from forcegp.errors import DestinationError, ForceGPError
+from forcegp.exchange import place, recover
+from forcegp.limits import HEADER_BYTES, HEADER_DEPTH
+from forcegp.temporary import Temporary, sweep
 
 H = TypeVar("H", bound="Header")
 
-MAX_HEADER_BYTES = 1 << 20
-"""A header is a page of text; anything larger is not one of ours."""
-
 
 def _sync(path: Path) -> None:
-    """Force a file to disk, so that a rename never outruns the data it names."""
+    """Force a file or folder to disk, so that a rename never outruns the data that it names."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -30,67 +29,113 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def _beside(target: Path) -> Path:
-    """A hidden, unused name beside `target` with the same ending, as some writers go by the ending."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    return target.with_name(f".{target.stem}.{secrets.token_hex(6)}{target.suffix}")
+def _sync_names(folder: Path) -> None:
+    """Force the names in a folder to disk, where the system can."""
+    with contextlib.suppress(OSError):
+        _sync(folder)
+
+
+def _refused(target: Path, cause: OSError) -> DestinationError:
+    return DestinationError(
+        f"{target}: cannot be written",
+        got=cause.strerror or str(cause),
+        hint="name a place that exists, is not full and can be written",
+    )
 
 
 @contextmanager
-def atomic_file(path: str | Path) -> Iterator[Path]:
+def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
+    """What a target is written to; gone when the block ends, unless it was moved."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        sweep(target)
+        temporary = Temporary(target, folder=folder, mode=mode)
+    except OSError as cause:
+        raise _refused(target, cause) from cause
+    try:
+        yield temporary.path
+    finally:
+        temporary.close()
+
+
+@contextmanager
+def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
     """A temporary path beside `path` that takes its place when the block ends without an error.
+
+    What a killed writer of the same file left is removed.
 
     Args:
         path: the file to write; missing parent folders are made.
+        mode: permissions of the new file, of which the umask takes away.
 
     Yields:
         Where to write. A reader of `path` sees the old file or the whole new one.
 
     Raises:
-        OSError: the place cannot be written.
+        DestinationError: the place cannot be written, or `path` is a folder.
+
+    Example:
+        >>> import os, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with atomic_file(f"{folder}/a.txt") as temporary:
+        ...         _ = temporary.write_text("whole")
+        ...     os.listdir(folder)
+        ['a.txt']
     """
     target = Path(path)
-    temporary = _beside(target)
-    try:
+    if target.is_dir():
+        raise DestinationError(f"{target} is a folder, and a file is to be written there")
+    with _temporary(target, folder=False, mode=mode) as temporary:
         yield temporary
-        _sync(temporary)
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
+        try:
+            _sync(temporary)
+            os.replace(temporary, target)
+        except OSError as cause:
+            raise _refused(target, cause) from cause
+        _sync_names(target.parent)
 
 
 @contextmanager
 def atomic_directory(path: str | Path) -> Iterator[Path]:
     """A temporary folder beside `path` that takes its place when the block ends without an error.
 
-    A folder cannot replace another in one step: a crash between the two renames leaves the old one
-    under a hidden name beside `path`, never a mixture of both.
+    The two folders are exchanged in one step; where the system has none, a crash may leave the old
+    folder under a hidden name, and `recover` (which every reader of ours calls) moves it back. Of two
+    writers the last one's folder stays. What a killed writer left is removed.
 
     Args:
-        path: the folder to write; missing parents are made.
+        path: the folder to write; missing parents are made. A symbolic link is written through.
+
+    Yields:
+        The folder to write the files to, piece by piece.
 
     Raises:
-        OSError: the place cannot be written, or `path` is a file.
+        DestinationError: the place cannot be written, or `path` is a file.
+
+    Example:
+        >>> import os, tempfile
+        >>> with tempfile.TemporaryDirectory() as parent:
+        ...     with atomic_directory(f"{parent}/run") as temporary:
+        ...         _ = (temporary / "a.txt").write_text("one")
+        ...         _ = (temporary / "b.txt").write_text("two")
+        ...     sorted(os.listdir(f"{parent}/run"))
+        ['a.txt', 'b.txt']
     """
     target = Path(path)
+    if target.is_symlink():
+        target = target.resolve()
     if target.exists() and not target.is_dir():
-        raise NotADirectoryError(f"{target} is a file, and a folder is to be written there")
-    temporary = _beside(target)
-    temporary.mkdir()
-    old = temporary.with_name(temporary.name + ".old")
-    try:
+        raise DestinationError(f"{target} is a file, and a folder is to be written there")
+    recover(target)
+    with _temporary(target, folder=True, mode=0o777) as temporary:
         yield temporary
-        for file in temporary.rglob("*"):
-            if file.is_file():
-                _sync(file)
-        if target.exists():
-            os.replace(target, old)
-        os.replace(temporary, target)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if old.exists() and not target.exists():
-            os.replace(old, target)
-        shutil.rmtree(old, ignore_errors=True)
+        try:
+            for inner in (*temporary.rglob("*"), temporary):
+                _sync(inner) if inner.is_file() else _sync_names(inner)
+            place(temporary, target)
+        except OSError as cause:
+            raise _refused(target, cause) from cause
+        _sync_names(target.parent)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -117,7 +162,7 @@ class Header(BaseModel):
 
     FORMAT: ClassVar[str]
     VERSION: ClassVar[int]
-    MAX_BYTES: ClassVar[int] = MAX_HEADER_BYTES
+    MAX_BYTES: ClassVar[int] = HEADER_BYTES
 
     def to_json(self) -> str:
         """The header as JSON text, format and version first."""
@@ -166,4 +211,15 @@ def _json_object(text: str | bytes, source: str, error: type[ForceGPError], most
         raise error(f"{source}: the header is not JSON", got=str(cause)) from cause
     if not isinstance(value, dict):
         raise error(f"{source}: the header is not a JSON object", got=type(value).__name__)
+    if depth(value) > HEADER_DEPTH:
+        raise error(f"{source}: the header is nested too deeply", expected=f"at most {HEADER_DEPTH} levels")
     return value
+
+
+def depth(value: object) -> int:
+    """How many mappings and lists lie inside each other at most, found without recursion."""
+    level, found = [value], 0
+    while level := [part for part in level if isinstance(part, dict | list)]:
+        found += 1
+        level = [inner for part in level for inner in (part.values() if isinstance(part, dict) else part)]
+    return found

@@ -14,9 +14,6 @@ from forcegp.errors import NumericalError
 JITTER_STEPS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)
 """Fractions of the mean diagonal that are tried, in order, until the factorisation succeeds."""
 
-RANK_TOLERANCE = 1e-10
-"""Singular values below this fraction of the largest count as zero."""
-
 
 def cholesky(K: Tensor) -> tuple[Tensor, float]:
     """Lower Cholesky factor of K + ε I, with the smallest ε of `JITTER_STEPS` that succeeds.
@@ -68,9 +65,11 @@ def cholesky_inverse_(L: Tensor) -> Tensor:
 class _NullSpaceBasis(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, A: Tensor, rank: int) -> Tensor:
-        Vh = torch.linalg.svd(A, full_matrices=True).Vh
+        left, values, Vh = torch.linalg.svd(A, full_matrices=True)
         U = Vh.mT[..., :, rank:].contiguous()
-        ctx.save_for_backward(torch.linalg.pinv(A, rtol=RANK_TOLERANCE), U)
+        # The rank is given, so the pseudo-inverse needs no tolerance of its own.
+        pinv = (Vh.mT[..., :, :rank] / values[..., None, :rank]) @ left[..., :, :rank].mT
+        ctx.save_for_backward(pinv, U)
         return U
 
     @staticmethod

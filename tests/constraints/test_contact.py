@@ -110,12 +110,12 @@ def test_a_loop_is_closed_between_two_links() -> None:
         (
             SurfaceContact("a", "tool", (0.0, 0.0), Plane()),
             ForceGPError,
-            "the touching point of 'a' is no point",
+            "the touching point of 'a' is not a point",
         ),
         (
             PointConnection("a", "tool", (0.0, 0.0, 0.0), None, (0.0,)),
             ForceGPError,
-            "an end of 'a' is no point",
+            "an end of 'a' is not a point",
         ),
     ],
 )

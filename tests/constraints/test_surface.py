@@ -105,18 +105,21 @@ def test_an_implicit_surface_need_not_be_a_distance() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Plane((0.0, 0.0, 0.0)), r"the plane's normal gives no direction\n  expected: three finite"),
-        (lambda: Plane((0.0, 1.0)), "the plane's normal gives no direction"),
-        (lambda: Plane((0.0, 0.0, float("nan"))), "the plane's normal gives no direction"),
-        (lambda: Plane((0.0, 0.0, 1.0), float("inf")), "the plane's offset is no distance"),
-        (lambda: Sphere((0.0, 0.0, 0.0), 0.0), r"the sphere's radius is not a length\n.*positive"),
-        (lambda: Sphere((0.0, 0.0), 1.0), "the sphere's center is no point"),
-        (lambda: Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0), "the cylinder's axis gives no direction"),
+        (lambda: Plane((0.0, 0.0, 0.0)), r"the plane's normal has no direction\n  expected: three finite"),
+        (lambda: Plane((0.0, 1.0)), "the plane's normal has no direction"),
+        (lambda: Plane((0.0, 0.0, float("nan"))), "the plane's normal has no direction"),
+        (lambda: Plane((0.0, 0.0, 1.0), float("inf")), "the plane's offset is not a distance"),
+        (lambda: Sphere((0.0, 0.0, 0.0), 0.0), r"the sphere's radius is not a valid length\n.*positive"),
+        (lambda: Sphere((0.0, 0.0), 1.0), "the sphere's center is not a point"),
+        (lambda: Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0), "the cylinder's axis has no direction"),
         (
             lambda: Cylinder((0.0, 0.0, float("nan")), (0.0, 0.0, 1.0), 1.0),
-            "the cylinder's center is no point",
+            "the cylinder's center is not a point",
         ),
-        (lambda: Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -1.0), "the cylinder's radius is not a length"),
+        (
+            lambda: Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -1.0),
+            "the cylinder's radius is not a valid length",
+        ),
     ],
 )
 def test_surfaces_that_are_none_are_refused(make, message: str) -> None:

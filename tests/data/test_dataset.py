@@ -14,7 +14,8 @@ import pytest
 import torch
 
 import forcegp
-from forcegp.data import Dataset, NotLoggedError, RobotMismatchWarning, table
+from forcegp import limits
+from forcegp.data import Dataset, NotLoggedError, RobotMismatchWarning
 from forcegp.data.table import IgnoredColumnsWarning
 from forcegp.errors import DataError, UnknownNameError
 from logs import JOINTS, random_log
@@ -240,7 +241,7 @@ def test_a_file_that_claims_to_be_huge_is_refused_before_it_is_read(
     columns = pa.table({"t": pa.array(np.zeros(2_000_000))})
     pq.write_table(columns, path)  # runs of equal values: some kilobytes on disk
     assert path.stat().st_size < 100_000
-    monkeypatch.setattr(table, "MAX_BYTES", 1_000_000)
+    monkeypatch.setattr(limits, "FREE_TABLE_BYTES", 1_000_000)
     with pytest.raises(DataError, match="claims to be larger"):
         Dataset.read(path)
 

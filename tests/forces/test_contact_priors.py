@@ -7,7 +7,7 @@ import torch
 
 import forcegp
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
-from forcegp.forces.states import states
+from forcegp.forces.quantities import states
 from forces.cases import draw, mixed_contacts, two_contacts
 from random_data import NOISE_STD, random_data, table_system
 

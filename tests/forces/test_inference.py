@@ -7,8 +7,7 @@ import torch
 
 import forcegp
 from forcegp.forces.measurements import COLUMNS, Observation
-from forcegp.forces.quantities import QUANTITIES, affine_map
-from forcegp.forces.states import states
+from forcegp.forces.quantities import QUANTITIES, affine_map, states
 from forcegp.gp.likelihood import negative_log_likelihood
 from forces.cases import conditioned, draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
@@ -66,11 +65,9 @@ def gradients(model: forcegp.StructuredGP, start: dict) -> tuple[dict, dict]:
     for dense in (False, True):
         leaves = {key: value.detach().clone().requires_grad_() for key, value in start.items()}
         if dense:
-            value = Textbook(
-                model, leaves, model._problem(model.training).system_at(leaves)
-            ).negative_log_likelihood()
+            value = Textbook(model, leaves, model.fitted.problem.system_at(leaves)).negative_log_likelihood()
         else:
-            rows = model._problem(model.training).rows(leaves)
+            rows = model.fitted.problem.rows(leaves)
             kernel = {k: v for k, v in leaves.items() if not k.startswith(("noise.", "analytical."))}
             value = negative_log_likelihood(model.force_priors, kernel, rows.blocks)[0] + rows.constant
         found = torch.autograd.grad(value, list(leaves.values()), allow_unused=True)
@@ -94,8 +91,7 @@ def test_gradient_of_analytical_parameters() -> None:
     theta = forcegp.AnalyticalParameters(
         robot, {"mass": joints[4:], "com": joints[5:], "damping": "all", "offset": joints[-1:]}
     )
-    model = conditioned(observed("qdd", "multiplier", n=6), learn_noise=True)
-    model.analytical_parameters = theta
+    model = conditioned(observed("qdd", "multiplier", n=6), learn_noise=True, analytical_parameters=theta)
     start = {f"analytical.{key}": value.detach() for key, value in theta.named_parameters()}
     ours, dense = gradients(model, {**model.hyperparameters, **start})
     for key in start:

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.quantities import states
 from forcegp.forces.samples import CHUNK_STATES, draw_samples
-from forcegp.forces.states import states
 from forces.cases import conditioned, draw, logged, mixed_contacts, two_contacts
 
 COUNT = 1500

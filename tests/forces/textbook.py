@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.quantities import affine_map
-from forcegp.forces.states import states
+from forcegp.forces.quantities import affine_map, states
 from forcegp.gp.kernels import Kernel, Linear, Product, Sum, sub
 from forcegp.gp.stationary import SquaredExponential
 from forcegp.models.structured_gp import StructuredGP
@@ -66,7 +65,7 @@ class Textbook:
         mean = z.o + torch.einsum("nab,nb->na", z.B_Q, self.model.mean(system, at))
         operators, inputs = [], []
         for p, prior in enumerate(self.model.force_priors):
-            B = z.B_z if prior.in_contact_only else z.B_Q
+            B = z.B_z if prior.target == "contact" else z.B_Q
             operators.append(B @ prior.operator(system, at))
             inputs.append(self._inputs(at, p))
         return mean, operators, inputs

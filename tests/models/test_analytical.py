@@ -104,7 +104,7 @@ def test_the_start_is_random_wide_and_repeatable() -> None:
 def test_wrong_use_is_refused() -> None:
     with pytest.raises(UnknownNameError, match="'weight'"):
         AnalyticalModel(system, learn={"weight": "all"})
-    with pytest.raises(ModelError, match="nothing to learn from"):
+    with pytest.raises(ModelError, match="no samples to learn from"):
         AnalyticalModel(system).fit(frictionless[:0])
     with pytest.raises(ModelError, match="epochs of training"):
         BatchOptions(epochs=0)

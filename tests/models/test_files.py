@@ -139,7 +139,7 @@ def test_a_flipped_bit_is_noticed(saved: Callable[[str], Path], tmp_path: Path) 
         ("gp", "settings.noise_std", [0.1, -1.0], "'settings.noise_std"),
         ("gp", "settings.colour", "red", "'settings.colour'"),
         ("nn", "settings.hidden", [81], "'network.0.weight' does not fit"),
-        ("nn", "settings.hidden", [0], "at least one unit"),
+        ("nn", "settings.hidden", [0], "does not fit"),
         ("analytical", "settings.learn", {"weight": []}, "unknown quantity"),
         ("analytical", "settings.relative", None, "'settings.relative'"),
         ("analytical", "system.robot.parents", [0] * 7, "system.robot.parents.0"),
@@ -181,7 +181,7 @@ def test_a_tensor_that_is_missing_or_of_another_shape_is_named(
         if what == "missing":
             del tensors[tensor]
         else:
-            tensors[tensor] = torch.zeros(3, 2, dtype=torch.float64)
+            tensors[tensor] = torch.ones(3, 2, dtype=torch.float64)
         content = safetensors.torch.save(tensors)
         (folder / "model.safetensors").write_bytes(content)
         header = json.loads((folder / "model.json").read_text())

@@ -12,6 +12,7 @@ from forcegp import IndependentGP
 from forcegp.errors import DataError, ModelError, ShapeError
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import LearningOptions
+from forcegp.models.independent_gp import joint_processes
 from random_data import NOISE_STD, random_data, table_system
 
 ROUNDING = 1e-9
@@ -46,8 +47,8 @@ def textbook(model: IndependentGP, joint: int) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, variance and negative log likelihood by dense solves."""
     X = standardized(torch.cat([data.q, data.qd, data.tau], dim=-1))
     X_test = standardized(torch.cat([test.q, test.qd, test.tau], dim=-1))
-    lengthscale = model.hyperparameters[f"qdd_{joint}.log_lengthscale"][0]
-    std = model.hyperparameters[f"qdd_{joint}.log_std"][0]
+    lengthscale = model.fitted.hyperparameters[f"qdd_{joint}.log_lengthscale"][0]
+    std = model.fitted.hyperparameters[f"qdd_{joint}.log_std"][0]
     K = textbook_kernel(X, X, lengthscale, std) + NOISE_STD**2 * torch.eye(len(data), dtype=torch.float64)
     k = textbook_kernel(X_test, X, lengthscale, std)
     y = data.qdd[:, joint]
@@ -76,22 +77,21 @@ def test_likelihood_is_the_textbook_one(model: IndependentGP) -> None:
 def test_gradient_is_that_of_the_textbook_formula(model: IndependentGP) -> None:
     X = standardized(torch.cat([data.q, data.qd, data.tau], dim=-1))
     names = ("log_lengthscale", "log_std")
-    leaves = {n: model.hyperparameters[f"qdd_2.{n}"].clone().requires_grad_() for n in names}
+    leaves = {n: model.fitted.hyperparameters[f"qdd_2.{n}"].clone().requires_grad_() for n in names}
     K = textbook_kernel(X, X, leaves["log_lengthscale"][0], leaves["log_std"][0])
     K = K + NOISE_STD**2 * torch.eye(len(data), dtype=torch.float64)
     y = data.qdd[:, 2]
     dense = 0.5 * (y @ torch.linalg.solve(K, y) + torch.logdet(K))
     expected = torch.autograd.grad(dense, list(leaves.values()))
 
-    assert model.training is not None
     own = {f"qdd_2.{n}": leaves[n] for n in names}
-    value, _ = negative_log_likelihood(model.priors[2:3], own, [model.block(model.training, 2)])
+    value, _ = negative_log_likelihood(joint_processes(7)[2:3], own, [model.fitted.training.block(2)])
     for got, wanted in zip(torch.autograd.grad(value, list(leaves.values())), expected, strict=True):
         torch.testing.assert_close(got, wanted, rtol=GRADIENT, atol=GRADIENT * float(wanted.abs().max()))
 
 
 def test_it_has_154_hyperparameters_and_learning_raises_the_likelihood(model: IndependentGP) -> None:
-    assert sum(value.numel() for value in model.hyperparameters.values()) == 154
+    assert sum(value.numel() for value in model.fitted.hyperparameters.values()) == 154
     start = IndependentGP(system, noise_std=NOISE_STD)
     start.fit(data, options=LearningOptions(max_evaluations=1))
     assert model.log_marginal_likelihood() > start.log_marginal_likelihood() + 10.0

@@ -32,7 +32,7 @@ def by_hand(model: NeuralNetwork, x: Tensor) -> Tensor:
     """Sigmoid layers and a linear one, on standardized inputs and outputs."""
     inputs = torch.cat([data.q, data.qd, data.tau], dim=-1)
     h = (x - inputs.mean(0)) / inputs.std(0, correction=0)
-    weights = list(model.network.parameters())
+    weights = list(model.fitted.network.parameters())
     for W, b in zip(weights[:-2:2], weights[1:-2:2], strict=True):
         h = 1.0 / (1.0 + torch.exp(-(h @ W.mT + b)))
     y = h @ weights[-2].mT + weights[-1]
@@ -51,7 +51,7 @@ def test_prediction_is_the_formula(model: NeuralNetwork) -> None:
 
 def test_derivatives_of_the_network_match_differences(model: NeuralNetwork) -> None:
     x = torch.randn(3, 21, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    assert torch.autograd.gradcheck(model.network, (x.requires_grad_(),))
+    assert torch.autograd.gradcheck(model.fitted.network, (x.requires_grad_(),))
 
 
 @pytest.mark.parametrize("hidden", PAPER_ARCHITECTURES, ids=str)
@@ -61,7 +61,7 @@ def test_the_networks_of_the_paper_learn(hidden: tuple[int, ...]) -> None:
     result = network.fit(data, options=BatchOptions(epochs=25, batch=20, learning_rate=0.005))
     assert result.evaluations == len(result.history) == 25
     assert result.objective == min(result.history) < 0.9 * result.history[0]
-    widths = [layer.out_features for layer in network.network if isinstance(layer, torch.nn.Linear)]
+    widths = [layer.out_features for layer in network.fitted.network if isinstance(layer, torch.nn.Linear)]
     assert widths == [*hidden, 7]
 
 
@@ -69,7 +69,7 @@ def test_the_seed_decides_and_nothing_else() -> None:
     def weights(seed: int) -> Tensor:
         network = NeuralNetwork(system, seed=seed)
         network.fit(data, options=FEW)
-        return next(network.network.parameters()).detach()
+        return next(network.fitted.network.parameters()).detach()
 
     first = weights(0)
     torch.rand(5)

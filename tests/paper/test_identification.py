@@ -9,13 +9,8 @@ import torch
 
 from forcegp.data import select_points
 from forcegp.forces.priors.contact import ContactForcePrior
-from forcegp.paper.identification import (
-    WRONG_MASS,
-    WRONG_OFFSET,
-    identify_alone,
-    identify_structured,
-    wrong_parameters,
-)
+from forcegp.paper.identification import Trace, identify_alone, identify_structured
+from forcegp.paper.last_link import WRONG_MASS, WRONG_OFFSET, wrong_parameters
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 
@@ -27,6 +22,18 @@ def test_the_start_is_wrong_by_what_is_said() -> None:
     off = wrong.placement_position - robot.placement_position
     assert torch.allclose(off[-1], torch.full((3,), WRONG_OFFSET, dtype=off.dtype)) and not off[:-1].any()
     assert torch.equal(wrong.mass[:-1], robot.mass[:-1])
+
+
+def test_the_trace_has_one_entry_per_evaluation_however_often_the_module_is_called() -> None:
+    robot = load_scene("kuka_plane").robot()
+    theta = wrong_parameters(robot)
+    trace = Trace(theta)
+    for mass, calls, objective in ((3.0, 1, 5.0), (2.0, 3, 1.0), (4.0, 2, 2.0)):
+        for _ in range(calls):
+            torch.func.functional_call(theta, {"log_mass": torch.tensor(mass, dtype=torch.float64).log()}, ())
+        trace.evaluated(objective)
+    # The third evaluation is worse than the second, which therefore stays the best.
+    assert trace.run(robot, "sgp-mean", 0).mass == pytest.approx([3.0, 2.0, 2.0])
 
 
 @pytest.mark.slow

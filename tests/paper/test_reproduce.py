@@ -9,14 +9,17 @@ import torch
 
 from forcegp.data import Dataset
 from forcegp.errors import DataError, UnknownNameError
-from forcegp.paper.figures import DATA
+from forcegp.paper.covariance import CovarianceData
+from forcegp.paper.multiplier import MultiplierData
 from forcegp.paper.profiles import Profile, profile_of
 from forcegp.paper.reproduce import Reproduction, run
+from forcegp.paper.results import Results
+from forcegp.paper.scores import RESIDUAL
+from forcegp.paper.stages import DATA
 from forcegp.paper.task import LOG
 from forcegp.report.animation import animation_source
-from forcegp.report.data import CovarianceData, MultiplierData, Results, WindowData
-from forcegp.report.findings import RESIDUAL
 from forcegp.report.rollout_data import RolloutData
+from forcegp.report.window import WindowData
 
 TEN_SECONDS = Profile(
     "test",
@@ -35,6 +38,7 @@ TEN_SECONDS = Profile(
     rollout_seconds=1.0,
     rollout_starts=2,
     rollout_samples=3,
+    calibration_starts=4,
 )
 
 pytestmark = pytest.mark.slow

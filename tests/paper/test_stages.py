@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.paper.stages import Advance, StageError, Stages, stage_key
+from forcegp.paper import stages as module
+from forcegp.paper.stages import Advance, StageError, Stages, code_digest, stage_key
 
 
 class Work:
@@ -88,7 +89,7 @@ def test_the_key_tells_name_settings_and_inputs_apart_but_not_their_order() -> N
 def test_one_name_with_two_meanings_is_an_error(tmp_path: Path) -> None:
     stages = Stages(tmp_path)
     stages.run("one", Work(), settings={"n": 1})
-    with pytest.raises(StageError, match="'one' was asked for twice"):
+    with pytest.raises(StageError, match="'one' was requested twice"):
         stages.run("one", Work(), settings={"n": 2})
 
 
@@ -104,3 +105,32 @@ def test_progress_is_opened_with_name_and_total_and_told_the_note(tmp_path: Path
 
     Stages(tmp_path, progress).run("one", Work(), settings={}, total=5)
     assert told == [("one", 5), (1, "done")]
+
+
+def package(root: Path, text: str = "x = 1") -> Path:
+    """A package with a module, a template and a command."""
+    for name, content in (("a.py", text), ("cli/b.py", "y = 2"), ("__pycache__/a.pyc", "z")):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(content)
+    return root
+
+
+def test_the_digest_follows_the_sources_but_not_caches_and_commands(tmp_path: Path) -> None:
+    digests = [code_digest(package(tmp_path / name)) for name in "ab"]
+    assert digests[0] == digests[1]
+    assert code_digest(package(tmp_path / "c", "x = 2")) != digests[0]
+    for ignored in ("cli/b.py", "__pycache__/a.pyc"):
+        changed = package(tmp_path / ignored.replace("/", "-"))
+        (changed / ignored).write_text("changed")
+        assert code_digest(changed) == digests[0]
+    renamed = package(tmp_path / "d")
+    (renamed / "a.py").rename(renamed / "e.py")
+    assert code_digest(renamed) != digests[0]
+
+
+def test_results_of_other_code_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    work = Work()
+    for text, runs in (("x = 1", 1), ("x = 1", 1), ("x = 2", 2)):
+        monkeypatch.setattr(module, "PACKAGE", package(tmp_path / text.replace(" ", ""), text))
+        Stages(tmp_path / "out").run("one", work, settings={})
+        assert work.runs == runs

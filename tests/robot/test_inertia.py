@@ -11,15 +11,15 @@ from hypothesis.extra.numpy import arrays
 
 import forcegp
 from forcegp.errors import InertiaError
+from forcegp.robot.check import inertia_doubt, inertia_error
 from forcegp.robot.inertia import (
     from_log_cholesky,
     from_pseudo_inertia,
-    inertia_doubt,
-    inertia_error,
     inertial_parameters,
     log_cholesky,
     pseudo_inertia,
 )
+from forcegp.robot.tree import Inertial
 
 ROUND_TRIP = 1e-9  # coordinates up to 2 square the condition of J to some 1e6 or so
 coordinates = arrays(np.float64, (3, 10), elements=st.floats(-1.5, 1.5))
@@ -30,8 +30,8 @@ coordinates = arrays(np.float64, (3, 10), elements=st.floats(-1.5, 1.5))
 def test_every_coordinate_is_a_physical_body(theta: np.ndarray) -> None:
     mass, com, inertia = from_pseudo_inertia(from_log_cholesky(torch.from_numpy(theta)))
     for m, c, I in zip(mass, com, inertia, strict=True):
-        assert inertia_error(m.item(), c.numpy(), I.numpy()) == ""
-        assert inertia_doubt(m.item(), I.numpy()) == ""
+        body = Inertial(m.item(), c.numpy(), I.numpy())
+        assert inertia_error(body) == inertia_doubt(body) == ""
         assert m > 0 and torch.linalg.eigvalsh(I)[0] > 0
 
 
@@ -89,7 +89,8 @@ def test_unphysical_body_has_none() -> None:
 )
 def test_reasons(mass: float, moments: tuple[float, ...], error: str, doubt: str) -> None:
     inertia = np.diag(np.array(moments, dtype=float))
-    reason = inertia_error(mass, np.zeros(3), inertia)
+    body = Inertial(mass, np.zeros(3), inertia)
+    reason = inertia_error(body)
     assert error in reason and bool(error) == bool(reason)
     if not error:
-        assert doubt in inertia_doubt(mass, inertia) and bool(doubt) == bool(inertia_doubt(mass, inertia))
+        assert doubt in inertia_doubt(body) and bool(doubt) == bool(inertia_doubt(body))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -202,7 +204,9 @@ TWO = ('<link name="base"/>', link("a"), link("b"))
             (*TWO, '<joint name="j" type="fixed"><parent link="a"/><parent link="b"/></joint>'),
             "'j' has several <parent>",
         ),
-        (('<xacro:macro xmlns:xacro="http://www.ros.org/wiki/xacro"/>',), "xacro macros"),
+        (('<xacro:macro xmlns:xacro="http://www.ros.org/wiki/xacro"/>',), "xacro macros(.|\n)*got: <macro>"),
+        (("<xacro:arm/>",), "xacro macros(.|\n)*expand them first: xacro"),  # no namespace: no XML either
+        ((link("${prefix}base"),), r"xacro macros(.|\n)*got: \$\{prefix\}base"),
     ],
 )
 def test_structure_is_checked(tmp_path: Path, parts: tuple[str, ...], message: str) -> None:
@@ -218,11 +222,18 @@ def test_structure_is_checked(tmp_path: Path, parts: tuple[str, ...], message: s
         ('<axis xyz="0 1"/>', r"joint 'j': axis xyz is not valid(.|\n)*expected: 3 finite(.|\n)*got: '0 1'"),
         ('<origin xyz="0 0 1e400"/>', "joint 'j': origin xyz is not valid"),
         ('<origin rpy="a b c"/>', "joint 'j': origin rpy is not valid"),
-        ('<limit lower="1" upper="-1"/>', r"limits the wrong way round(.|\n)*got: \(1.0, -1.0\)"),
+        (
+            '<limit lower="1" upper="-1"/>',
+            r"has its lower limit above its upper limit(.|\n)*got: \(1.0, -1.0\)",
+        ),
         ('<limit upper="nan"/>', "joint 'j': limit upper is not valid"),
         ('<limit effort="-3"/>', "joint 'j' has a negative limit"),
         ('<dynamics damping="-0.1"/>', "joint 'j' has negative friction"),
         ('<dynamics friction="much"/>', "joint 'j': dynamics friction is not valid"),
+        ('<mimic joint="i" multiplier="much"/>', "joint 'j': mimic multiplier is not valid"),
+        ('<mimic joint="i" offset="nan"/>', "joint 'j': mimic offset is not valid"),
+        ("<mimic>i</mimic>", "joint 'j': <mimic> has no joint"),
+        ('<origin rpy="0 0 ${pi/2}"/>', r"xacro macros that are not expanded(.|\n)*got: 0 0 \$\{pi/2\}"),
     ],
 )
 def test_joint_figures_are_checked(tmp_path: Path, rest: str, message: str) -> None:
@@ -239,7 +250,7 @@ def test_unsupported_joints_are_refused_by_name(tmp_path: Path, kind: str) -> No
 def test_mimic_joint_is_refused_unless_locked(tmp_path: Path) -> None:
     mimic = '<mimic joint="i"/><axis xyz="0 0 2"/><origin xyz="0 0 1"/>'
     path = write(tmp_path, *TWO, joint("i", "base", "a"), joint("j", "a", "b", mimic))
-    with pytest.raises(UnsupportedRobotError, match=r"'j' mimics joint 'i'(.|\n)*locked_joints={'j': 0.0}"):
+    with pytest.raises(UnsupportedRobotError, match=r"'j' mimics joint 'i'(.|\n)*={'i': 0.0, 'j': 0.0}"):
         forcegp.load_robot(path)
     with pytest.raises(UnknownNameError, match=r"unknown joint of .*robot\.urdf to lock 'jj'"):
         forcegp.load_robot(path, locked_joints={"jj": 0.0})
@@ -249,6 +260,69 @@ def test_mimic_joint_is_refused_unless_locked(tmp_path: Path) -> None:
     rotation, position = kinematics.frame_pose(robot, torch.zeros(1, dtype=robot.dtype), "b")
     np.testing.assert_allclose(rotation, Rotation.from_rotvec([0, 0, 0.7]).as_matrix(), atol=1e-15)
     np.testing.assert_allclose(position, [0, 0, 1])
+
+
+def test_the_hint_for_a_gripper_locks_leader_and_follower_within_their_limits(tmp_path: Path) -> None:
+    slide = '<axis xyz="0 1 0"/><limit lower="0.01" upper="0.04"/>'
+    follower = f'{slide}<mimic joint="left" multiplier="-2" offset="0.1"/>'
+    path = write(
+        tmp_path,
+        *TWO,
+        link("c"),
+        joint("arm", "base", "a"),
+        joint("left", "a", "b", slide, "prismatic"),
+        joint("right", "a", "c", follower, "prismatic"),
+    )
+    with pytest.raises(UnsupportedRobotError, match="'right' mimics joint 'left'") as caught:
+        forcegp.load_robot(path)
+    hint = caught.value.args[0].partition("locked_joints=")[2]
+    locked = {"left": 0.01, "right": 0.08}
+    assert hint.startswith(str(locked))
+    assert forcegp.load_robot(path, locked_joints=locked).joint_names == ("arm",)
+
+
+def test_an_undeclared_world_is_the_base_with_a_remark(tmp_path: Path) -> None:
+    """Drake attaches a robot to its world by a fixed joint, without declaring a link of that name."""
+    weld = joint("weld", "world", "base", '<origin xyz="0 0 0.5"/>', "fixed")
+    path = write(tmp_path, *TWO[:2], joint("j", "base", "a"), weld)
+    with pytest.warns(RobotFileWarning, match="link 'world' is used but not declared"):
+        robot = forcegp.load_robot(path)
+    assert len(robot.remarks) == 1 and robot.joint_names == ("j",)
+    zero = torch.zeros(1, dtype=robot.dtype)
+    np.testing.assert_array_equal(kinematics.frame_pose(robot, zero, "a")[1], [0, 0, 0.5])
+    np.testing.assert_array_equal(kinematics.frame_pose(robot, zero, "world")[1], [0, 0, 0])
+    declared = write(tmp_path, '<link name="world"/>', *TWO[:2], joint("j", "base", "a"), weld)
+    assert not forcegp.load_robot(declared).remarks
+    moving = write(tmp_path, *TWO[:2], joint("j", "base", "a"), joint("k", "world", "base"))
+    with pytest.raises(RobotFileError, match="unknown parent link 'world'"):
+        forcegp.load_robot(moving)
+
+
+def test_meshes_that_are_missing_do_not_matter(tmp_path: Path) -> None:
+    mesh = '<geometry><mesh filename="package://nowhere/hand.stl" scale="1 1 1"/></geometry>'
+    path = arm(tmp_path)
+    path.write_text(path.read_text().replace("</inertial>", f"</inertial><visual>{mesh}</visual>", 1))
+    path.write_text(path.read_text().replace("</visual>", f"</visual><collision>{mesh}</collision>", 1))
+    assert "nowhere" in path.read_text()
+    assert forcegp.load_robot(path).remarks == ()
+
+
+def test_urdf_needs_no_mujoco(tmp_path: Path) -> None:
+    """MuJoCo is optional: it is imported for MJCF only, and its absence is one error that says what to do."""
+    (tmp_path / "arm.xml").write_text("<mujoco><worldbody/></mujoco>")
+    code = f"""
+import sys
+sys.modules["mujoco"] = None  # as if it were not installed
+import forcegp
+assert forcegp.load_robot("kuka_iiwa").nq == 7
+try:
+    forcegp.load_robot({str(tmp_path / "arm.xml")!r})
+except forcegp.errors.MissingDependencyError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("Reading MJCF files needs the package 'mujoco'")
+    assert 'pip install "forcegp[mujoco]"' in done.stdout
 
 
 def _inertia(*moments: object) -> str:

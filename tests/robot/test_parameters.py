@@ -13,8 +13,9 @@ from safetensors.torch import load_file, save_file
 import forcegp
 from forcegp import dynamics, kinematics
 from forcegp.errors import InertiaError, ModelError, UnknownNameError
-from forcegp.robot.inertia import inertia_doubt, inertia_error
+from forcegp.robot.check import inertia_doubt, inertia_error
 from forcegp.robot.parameters import POSITIVE, SMALLEST, AnalyticalParameters
+from forcegp.robot.tree import Inertial
 from robots import random_states
 
 GRADIENT = 1e-6  # relative, against central differences with Richardson's extrapolation
@@ -97,7 +98,7 @@ def test_random_start_is_physical_reproducible_and_within_its_window(robot: forc
         made = theta()
         for m, c, I in zip(made.mass, made.com, made.inertia, strict=True):
             figures = m.item(), c.detach().numpy(), I.detach().numpy()
-            assert inertia_error(*figures) == inertia_doubt(figures[0], figures[2]) == ""
+            assert inertia_error(Inertial(*figures)) == inertia_doubt(Inertial(*figures)) == ""
         R = made.placement_rotation.detach()
         torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), rtol=0, atol=1e-12)
         assert 1 / np.e < made.mass[1].item() / robot.mass[1].item() < np.e

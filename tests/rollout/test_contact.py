@@ -72,7 +72,9 @@ def test_landing_is_located_and_inelastic(tmp_path) -> None:
 def test_a_jump_of_the_torque_opens_the_contact_at_its_sample(tmp_path) -> None:
     tau = torch.zeros(48, 2, dtype=torch.float64)
     tau[24:, 1] = 1.5 * WEIGHT
-    found = rollout(ANALYTICAL, slider(tmp_path), state(0, 0), state(0, 0), tau, 0.2, options=unilateral())
+    found = rollout(
+        ANALYTICAL, slider(tmp_path), state(0, 0), state(0, 0), tau, 0.2, options=unilateral(dt=1 / 240)
+    )
     (event,) = found.events
     assert event.t == pytest.approx(24 / 240)
     assert int(found.active[:, 0].sum()) == 24
@@ -100,9 +102,9 @@ def test_a_resting_contact_with_baumgarte_stays_closed_after_landing(tmp_path) -
 
 def test_sliding_motions_lose_no_contact() -> None:
     data = simulated().data
-    found = rollout(ANALYTICAL, arm(Baumgarte()), data.q[0], data.qd[0], data.tau, 0.5, options=unilateral())
+    found = rollout(ANALYTICAL, arm(Baumgarte()), data.q[0], data.qd[0], data, 0.5, options=unilateral())
     assert found.events == ()
-    bilateral = rollout(ANALYTICAL, arm(Baumgarte()), data.q[0], data.qd[0], data.tau, 0.5)
+    bilateral = rollout(ANALYTICAL, arm(Baumgarte()), data.q[0], data.qd[0], data, 0.5)
     assert torch.equal(found.q, bilateral.q)
 
 
@@ -111,7 +113,7 @@ def test_a_law_without_forces_cannot_lose_contact() -> None:
     data = simulated().data
     law = AccelerationLaw(None)  # type: ignore[arg-type]
     with pytest.raises(ModelError, match="no multiplier"):
-        rollout(law, arm(), data.q[0], data.qd[0], data.tau, 0.1, options=unilateral())
+        rollout(law, arm(), data.q[0], data.qd[0], data, 0.1, options=unilateral())
 
 
 def test_lift_off_of_the_arm_is_the_simulator_s() -> None:
@@ -126,7 +128,7 @@ def test_lift_off_of_the_arm_is_the_simulator_s() -> None:
         arm(Baumgarte()),
         data.q[start],
         data.qd[start],
-        data.tau[start:],
+        data[start:],
         0.25,
         options=unilateral(),
     )
@@ -148,7 +150,7 @@ def test_lift_off_is_learned_from_sliding(name: str) -> None:
         found = model.rollout(
             data.q[start],
             data.qd[start],
-            data.tau[start:],
+            data[start:],
             (before + 12) / 240,
             active=torch.tensor([True]),
             options=unilateral(),

@@ -25,7 +25,7 @@ class PrintedSign(Baumgarte):
 def roll(stabilization: str | Baumgarte, seconds: float = 0.7, **options) -> Rollout:
     data = simulated().data
     settings = RolloutOptions(stabilization=stabilization, **options)
-    return rollout(ANALYTICAL, arm(), data.q[0], data.qd[0], data.tau, seconds, options=settings)
+    return rollout(ANALYTICAL, arm(), data.q[0], data.qd[0], data, seconds, options=settings)
 
 
 def worst(found: Rollout) -> float:

@@ -72,14 +72,14 @@ def test_semi_implicit_euler_is_the_simulator() -> None:
     """Open loop under logged torques, the trajectory is PyBullet's own."""
     data = simulated().data
     n = 240
-    found = rollout(ANALYTICAL, arm(Baumgarte()), data.q[0], data.qd[0], data.tau, n / 240)
+    found = rollout(ANALYTICAL, arm(Baumgarte()), data.q[0], data.qd[0], data, n / 240)
     assert float((found.q[:n] - data.q[:n]).abs().max()) < PYBULLET_TOLERANCE
     assert float((found.multiplier[:n, 0] - data.multiplier["table"][:n]).abs().max()) < 1e-3
 
 
 def test_newtons_equation_holds_along_the_way() -> None:
     data, system = simulated().data, arm(Baumgarte())
-    found = rollout(ANALYTICAL, system, data.q[0], data.qd[0], data.tau, 0.2)
+    found = rollout(ANALYTICAL, system, data.q[0], data.qd[0], data, 0.2)
     eom = system.equations(found.q, found.qd)
     force = eom.Q_K + found.tau + (eom.A.mT @ found.multiplier[..., None])[..., 0]
     assert float(((eom.M @ found.qdd[..., None])[..., 0] - force).abs().max()) < 1e-9
@@ -91,10 +91,11 @@ def test_a_batch_is_its_members() -> None:
     rows = torch.tensor([0, 40, 80])
     q0, qd0 = data.q[rows].reshape(1, 3, 7), data.qd[rows].reshape(1, 3, 7)
     tau = torch.stack([data.tau[r : r + 50] for r in rows.tolist()])[None]
-    together = rollout(ANALYTICAL, system, q0, qd0, tau, 0.1)
+    options = RolloutOptions(dt=1.0 / 240.0)
+    together = rollout(ANALYTICAL, system, q0, qd0, tau, 0.1, options=options)
     assert together.q.shape == (1, 3, 25, 7)
     for i in range(3):
-        alone = rollout(ANALYTICAL, system, q0[0, i], qd0[0, i], tau[0, i], 0.1)
+        alone = rollout(ANALYTICAL, system, q0[0, i], qd0[0, i], tau[0, i], 0.1, options=options)
         assert torch.allclose(together.q[0, i], alone.q, atol=1e-10, rtol=0.0)
 
 

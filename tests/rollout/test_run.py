@@ -5,7 +5,8 @@ import torch
 
 from forcegp.constraints import Baumgarte
 from forcegp.control.plan import make_plan
-from forcegp.errors import ForceGPError, ShapeError, UnknownNameError
+from forcegp.data import Dataset
+from forcegp.errors import DataError, ForceGPError, ModelError, ShapeError, UnknownNameError
 from forcegp.rollout import DivergedError, Feedback, ForceLaw, RolloutOptions, TaskSpaceControl, rollout
 from forcegp.simulate import SimulationConfig
 from rollout_cases import ANALYTICAL, arm, simulated, slider
@@ -36,6 +37,25 @@ def test_torques_are_held_for_their_period_whatever_the_step(tmp_path) -> None:
     found = free_fall(tau, 0.4, tmp_path, dt=0.1, method="dop853")
     impulse = torch.cat([torch.zeros(1, dtype=torch.float64), (0.1 * tau[:, 0]).cumsum(0)])
     assert torch.allclose(found.qd[:, 0], impulse / 3.0, atol=1e-9)
+
+
+def test_the_period_of_the_torques_comes_from_the_log_or_is_required(tmp_path) -> None:
+    """A ramp logged at 500 Hz takes as long as it was logged, not as at 240 Hz."""
+    t = 0.002 * torch.arange(101, dtype=torch.float64)
+    tau = torch.stack([30.0 * t, torch.zeros_like(t)], dim=-1)
+    log = Dataset(t=t, q=0.0 * tau, qd=0.0 * tau, tau=tau, qdd=0.0 * tau, joint_names=("along", "up"))
+    found = free_fall(log, 0.2, tmp_path)
+    assert found.t.shape == (101,) and float(found.t[-1]) == pytest.approx(0.2)
+    assert torch.allclose(found.tau[:, 0], 30.0 * found.t, atol=1e-12)
+    coarse = free_fall(log, 0.2, tmp_path, dt=0.01)
+    assert torch.allclose(coarse.tau[:, 0], 30.0 * coarse.t, atol=1e-12), "the step is not the period"
+    with pytest.raises(ModelError, match=r"sampling period of an array of torques(.|\n)*RolloutOptions\(dt="):
+        free_fall(tau, 0.2, tmp_path)
+    constant = free_fall(tau[1:2], 0.1, tmp_path)
+    assert torch.equal(constant.tau, tau[1:2].expand_as(constant.tau))
+    for broken in (log[torch.tensor([0, 1, 2, 5, 6])], log[:1], log[torch.tensor([3, 1, 2])]):
+        with pytest.raises(DataError, match="cannot be replayed"):
+            free_fall(broken, 0.1, tmp_path)
 
 
 def test_a_diverging_run_keeps_what_was_computed(tmp_path) -> None:
@@ -138,7 +158,7 @@ def test_options_are_checked() -> None:
                 arm(),
                 data.q[0],
                 data.qd[0],
-                data.tau,
+                data,
                 0.1,
                 options=RolloutOptions(**{option: "?"}),
             )

@@ -1,19 +1,21 @@
 """Function samples along a trajectory, the probability of lost contact, and comparisons with a log."""
 
+import dataclasses
 import math
 from functools import cache
 
 import pytest
 import torch
 
-from forcegp.constraints import Baumgarte
+from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError
+from forcegp.forces.quantities import states
 from forcegp.forces.samples import draw_samples
-from forcegp.forces.states import states
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import Model
+from forcegp.models.registry import create
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.rollout_data import RolloutData, rollout_data
 from forcegp.report.rollouts import PAGE, animation_source, write_rollouts
@@ -47,7 +49,7 @@ def fitted(mean: str = "analytical") -> StructuredGP:
 
 def test_each_sample_obeys_the_constraint_and_newtons_equation() -> None:
     data = log()
-    found = fitted().rollout(data.q[0], data.qd[0], data.tau, 0.15, samples=5).need_samples()
+    found = fitted().rollout(data.q[0], data.qd[0], data, 0.15, samples=5).need_samples()
     assert found.q.shape == (5, 37, 7)
     assert float(found.drift.abs().max()) < DRIFT
     eom = found.system.equations(found.q, found.qd)
@@ -65,14 +67,14 @@ def test_a_seed_fixes_the_samples_and_a_sample_is_a_model_of_its_own() -> None:
     data, model = log(), fitted()
 
     def roll(seed: int) -> torch.Tensor:
-        path = model.rollout(data.q[0], data.qd[0], data.tau, 0.05, samples=3, seed=seed)
+        path = model.rollout(data.q[0], data.qd[0], data, 0.05, samples=3, seed=seed)
         return path.need_samples().q
 
     assert torch.equal(roll(1), roll(1))
     assert not torch.equal(roll(1), roll(2))
     force = model.force_samples(3, torch.Generator().manual_seed(1))
     start = data.q[0].expand(3, 7)
-    alone = rollout(ForceLaw(force), model.system, start, 0.0 * start + data.qd[0], data.tau, 0.05)
+    alone = rollout(ForceLaw(force), model.system, start, 0.0 * start + data.qd[0], data, 0.05)
     assert torch.equal(alone.q, roll(1))
 
 
@@ -80,10 +82,13 @@ def test_batches_of_states_and_samples_keep_their_order() -> None:
     data, model = log(), fitted()
     rows = torch.tensor([0, 60])
     tau = torch.stack([data.tau[r : r + 13] for r in rows.tolist()])
-    both = model.rollout(data.q[rows], data.qd[rows], tau, 0.05, samples=4, seed=3)
+    options = RolloutOptions(dt=1.0 / 240.0)
+    both = model.rollout(data.q[rows], data.qd[rows], tau, 0.05, samples=4, seed=3, options=options)
     assert both.need_samples().q.shape == (4, 2, 13, 7)
     for i in range(2):
-        alone = model.rollout(data.q[rows[i]], data.qd[rows[i]], tau[i], 0.05, samples=4, seed=3)
+        alone = model.rollout(
+            data.q[rows[i]], data.qd[rows[i]], tau[i], 0.05, samples=4, seed=3, options=options
+        )
         assert torch.allclose(both[i].q, alone.q, atol=1e-10, rtol=0.0)
         assert torch.allclose(both.need_samples().q[:, i], alone.need_samples().q, atol=1e-9, rtol=0.0)
 
@@ -91,7 +96,7 @@ def test_batches_of_states_and_samples_keep_their_order() -> None:
 def test_the_spread_of_samples_is_the_posterior_s() -> None:
     """Before any time has passed, sampled multipliers are draws from N(μ, σ²)."""
     data, model = log(), fitted("zero")
-    path = model.rollout(data.q[3], data.qd[3], data.tau[3:], 1.0 / 240.0, samples=400)
+    path = model.rollout(data.q[3], data.qd[3], data[3:], 1.0 / 240.0, samples=400)
     drawn = path.need_samples().multiplier[:, 0, 0]
     expected = model.predict(data.q[3], data.qd[3], data.tau[3], "multiplier")
     assert expected.std is not None
@@ -115,11 +120,32 @@ def test_probability_of_lost_contact_is_that_of_the_posterior_draws() -> None:
     assert torch.allclose(contact_loss_probability(model, q, qd, tau), share, atol=0.02)
 
 
+def test_a_contact_that_is_open_is_lost() -> None:
+    data, model = log(), fitted("zero")
+    q, qd, tau = data.q[:2], data.qd[:2], data.tau[:2]
+    active = torch.tensor([[True], [False]])
+    loss = contact_loss_probability(model, q, qd, tau, active=active)
+    alone = contact_loss_probability(model, q[:1], qd[:1], tau[:1])
+    assert torch.allclose(loss[:1], alone, atol=1e-6) and 0.0 < float(alone) < 1.0
+    assert float(loss[1]) == 1.0
+
+
+@pytest.mark.parametrize("name", ["gp", "nn"])
+def test_a_model_of_accelerations_stays_on_its_own_system(name: str) -> None:
+    data, model = log(), create(name, arm(Baumgarte()), noise_std=0.1)
+    model.fit(data[torch.arange(0, 288, 24)])
+    free = ConstrainedSystem(model.system.robot)
+    with pytest.raises(ModelError, match="predicts accelerations of the system that it was fitted on"):
+        model.rollout(data.q[0], data.qd[0], data, 0.02, system=free)
+    softer = dataclasses.replace(model.system, baumgarte=None)
+    assert torch.isfinite(model.rollout(data.q[0], data.qd[0], data, 0.02, system=softer).q).all()
+
+
 def test_a_learned_model_loses_no_contact_while_it_slides() -> None:
     """Neither its mean nor any sample opens a contact that stays closed in simulation."""
     data = log()
     options = RolloutOptions(unilateral=True)
-    path = fitted().rollout(data.q[0], data.qd[0], data.tau, 0.5, samples=8, options=options)
+    path = fitted().rollout(data.q[0], data.qd[0], data, 0.5, samples=8, options=options)
     for found in (path, path.need_samples()):
         assert not found.events and bool(found.active.all())
     assert float(contact_loss_probability(fitted(), data.q, data.qd, data.tau).max()) < 1e-3
@@ -130,9 +156,9 @@ def test_models_without_a_posterior_say_so() -> None:
     with pytest.raises(ModelError, match="no uncertainty of the multiplier"):
         contact_loss_probability(plain, data.q[0], data.qd[0], data.tau[0])
     with pytest.raises(ModelError, match="no function samples"):
-        plain.rollout(data.q[0], data.qd[0], data.tau, 0.02, samples=2)
+        plain.rollout(data.q[0], data.qd[0], data, 0.02, samples=2)
     with pytest.raises(ModelError, match="pass samples=100"):
-        plain.rollout(data.q[0], data.qd[0], data.tau, 0.02).need_samples()
+        plain.rollout(data.q[0], data.qd[0], data, 0.02).need_samples()
 
 
 class Freefloating(AnalyticalModel):
@@ -182,7 +208,7 @@ def test_comparison_tells_models_apart_and_the_page_holds_them(tmp_path, monkeyp
 
 def test_a_rollout_beside_its_log() -> None:
     data = log()[:61]
-    path = fitted().rollout(data.q[0], data.qd[0], data.tau, 0.25)
+    path = fitted().rollout(data.q[0], data.qd[0], data, 0.25)
     found = beside_log("sgp-mean", path, data, 1.0 / 240.0)
     expected = (path.tip(found.frame, found.point) - found.tip[0]).norm(dim=-1)
     assert torch.allclose(found.tip_error("sgp-mean")[0], expected)
@@ -202,5 +228,5 @@ def test_a_selected_log_cannot_be_compared_with() -> None:
 def test_projection_holds_every_sample_on_the_surface() -> None:
     data = log()
     options = RolloutOptions(stabilization="projection")
-    path = fitted().rollout(data.q[0], data.qd[0], data.tau, 0.1, samples=3, options=options)
+    path = fitted().rollout(data.q[0], data.qd[0], data, 0.1, samples=3, options=options)
     assert max(float(x.drift[..., 1:, :].abs().max()) for x in (path, path.need_samples())) < 1e-10

@@ -57,7 +57,7 @@ def test_a_surface_in_python_is_given_again() -> None:
     own = contact(forcegp.ImplicitSurface(lambda p: p[2] - 0.055), "hill")
     system = system_with(contact(SURFACES[0]), own)
     packed = through_text(system)
-    with pytest.raises(ModelError, match=r"'hill' is described by a ImplicitSurface.*\n.*load_model"):
+    with pytest.raises(ModelError, match=r"'hill' is a ImplicitSurface defined in Python.*\n.*load_model"):
         unpack_system(*packed, "here")
     assert unpack_system(*packed, "here", given=system).contacts == system.contacts
     with pytest.raises(ModelError, match="unknown contact 'hill'"):
@@ -80,6 +80,8 @@ def change(record: dict, place: str, value: object) -> None:
         ("robot.joint_names", ["only one"]),
         ("contacts.0.surface.normal", [0.0, 1.0]),
         ("contacts.0.surface.type", "cone"),
+        ("contacts.0.surface.offset", float("nan")),
+        ("contacts.0.surface.colour", "red"),
         ("contacts.0.colour", "red"),
         ("baumgarte.damping_ratio", None),
     ],
@@ -97,7 +99,7 @@ def test_a_changed_field_is_named(place: str, value: object) -> None:
 def test_a_valid_field_that_does_not_fit_is_named(place: str) -> None:
     record, tensors = through_text(system_with(contact(SURFACES[0])))
     change(record, place, [0.0, 0.0, 0.0] if place.endswith("normal") else "no_such_link")
-    with pytest.raises(ModelError, match=r"model\.json: field 'system'"):
+    with pytest.raises(ModelError, match=r"model\.json: field 'system.*': .*(direction|frame)"):
         unpack_system(record, tensors, "model.json")
 
 

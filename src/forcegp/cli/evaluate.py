@@ -39,8 +39,8 @@ def evaluate(
         result = run(regression, test, progress=progress)
     figures: dict[str, object] = dict(result.summary())
     if out is not None:
-        from forcegp.paper.window import opening, predicted_window
         from forcegp.report.evaluation import write_evaluation
+        from forcegp.report.window import opening, predicted_window
 
         write_json(out / "evaluation.json", result.to_dict())
         window = predicted_window(regression, opening(test, WINDOW_SECONDS), regression.kind)

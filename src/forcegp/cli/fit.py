@@ -59,5 +59,5 @@ def fit(
     regression.save(out)
     if not result.converged:
         typer.secho(f"warning: the fit did not converge: {result.message}", fg="yellow", err=True)
-    figures = {name: value for name, value in asdict(result).items() if name != "history"}
+    figures = {name: value for name, value in asdict(result.result).items() if name != "history"}
     show({"model": model, "training_points": len(training), **figures, "folder": str(out)}, as_json)

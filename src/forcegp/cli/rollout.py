@@ -56,19 +56,17 @@ def rollout(
     """
     from forcegp.models.load import load_model
     from forcegp.rollout import RolloutOptions
+    from forcegp.rollout.inputs import sampling_period
 
     regression = load_model(model)
     log = _stretch(data_of_robot(read_data(data), regression.system.robot), start, duration)
-    options = RolloutOptions(_period(log), method, stabilization, unilateral, on_divergence="keep")
+    dt = sampling_period(log)
+    options = RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
     path = _roll(regression, log, options, samples, seed)
-    rolled, file = _as_data(path, log, options.dt), out / "rollout.parquet"
+    rolled, file = _as_data(path, log, dt), out / "rollout.parquet"
     rolled.with_step(f"rolled out by the model in {model} from row {start}").write(file)
-    page = _write_page(out, f"Model {model} rolled out on {data}", regression.kind, path, log, options.dt)
-    show({**_figures(path, rolled, options.dt), "page": str(page), "file": str(file)}, as_json)
-
-
-def _period(log: Dataset) -> float:
-    return float((log.t[-1] - log.t[0]) / (len(log) - 1))
+    page = _write_page(out, f"Model {model} rolled out on {data}", regression.kind, path, log, dt)
+    show({**_figures(path, rolled, dt), "page": str(page), "file": str(file)}, as_json)
 
 
 def _roll(regression: Model, log: Dataset, options: RolloutOptions, samples: int, seed: int) -> Rollout:
@@ -78,8 +76,8 @@ def _roll(regression: Model, log: Dataset, options: RolloutOptions, samples: int
         return regression.rollout(
             log.q[0],
             log.qd[0],
-            log.tau,
-            duration=options.dt * steps,
+            log,
+            duration=float(log.t[-1] - log.t[0]),
             samples=samples,
             seed=seed,
             active=log.active(regression.system.contact_names)[0],

@@ -14,9 +14,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from forcegp.compiled import cache
 from forcegp.compiled.source import CUDA_THREADS
 from forcegp.errors import MissingDependencyError
-from forcegp.files import atomic_file
+from forcegp.temporary import Temporary, discard, sweep
 
 Kernel = Callable[[Sequence[Tensor], Tensor], None]
 """Reads contiguous arrays `(B, nq)` and fills the contiguous result `(B, …)`."""
@@ -33,14 +34,6 @@ FLAGS = (
 )
 SAMPLES_PER_THREAD = 512
 """A thread is started for no fewer samples than take longer than starting it."""
-
-
-def cache_directory() -> Path:
-    """Where compiled kernels are kept: `$FORCEGP_CACHE`, or `forcegp` in the user's cache folder."""
-    chosen = os.environ.get("FORCEGP_CACHE")
-    if chosen:
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "forcegp"
 
 
 def find_compiler() -> str:
@@ -70,29 +63,45 @@ def _machine() -> str:
     return "\n".join(sorted({line for line in text.splitlines() if line.startswith(keys)}))
 
 
-def _compile(text: str) -> Path:
+def _load(text: str) -> ctypes.CDLL:
     """The shared library of a source text, compiled unless the cache has it.
 
     Raises:
-        MissingDependencyError: no compiler, it failed, or the cache cannot be written.
+        MissingDependencyError: no compiler, it failed, or the cache cannot be written or trusted.
     """
     compiler = find_compiler()
     version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
     key = hashlib.sha256("\0".join([text, version, _machine(), *FLAGS]).encode()).hexdigest()[:32]
-    library = cache_directory() / f"{key}.so"
-    if library.exists():
-        return library
+    place = cache.cache_directory()
     try:
-        library.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with atomic_file(library) as temporary:
-            _run_compiler(compiler, text, temporary)
+        folder = cache.private_folder(place)
+        kept = cache.find(folder, key)
+        if kept is not None:
+            try:
+                return ctypes.CDLL(str(kept))
+            except OSError:  # of another machine that shares the folder: build it anew
+                discard(kept)
+        return ctypes.CDLL(str(cache.store(folder, key, _compiled(compiler, text, folder))))
     except OSError as cause:
         raise MissingDependencyError(
-            f"the kernel cannot be written to {library.parent}",
+            f"the kernel cannot be written to {place}",
             got=str(cause),
             hint="set FORCEGP_CACHE to a folder that can be written",
         ) from cause
-    return library
+
+
+def _compiled(compiler: str, text: str, folder: Path) -> bytes:
+    """The content of the shared library; what a killed compiler left in the folder is removed."""
+    target = folder / "build"
+    sweep(target)
+    build = Temporary(target, folder=True, mode=0o700)
+    try:
+        build.path.chmod(0o700)
+        library = build.path / "kernel.so"
+        _run_compiler(compiler, text, library)
+        return library.read_bytes()
+    finally:
+        build.close()
 
 
 def _run_compiler(compiler: str, text: str, library: Path) -> None:
@@ -108,7 +117,7 @@ def _run_compiler(compiler: str, text: str, library: Path) -> None:
 
 def cpu_kernel(text: str) -> Kernel:
     """The kernel of a `cpu_source`, run on as many threads as `torch.get_num_threads()`."""
-    function = ctypes.CDLL(str(_compile(text))).kernel
+    function = _load(text).kernel
     function.restype = None
     function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_long, ctypes.c_long]
 

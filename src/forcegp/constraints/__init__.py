@@ -2,8 +2,9 @@
 
 from forcegp.constraints.baumgarte import Baumgarte
 from forcegp.constraints.contact import Constraint, PointConnection, SurfaceContact
-from forcegp.constraints.gauss import ConstrainedSystem, Equations
-from forcegp.constraints.surface import Cylinder, ImplicitSurface, Plane, Sphere, Surface
+from forcegp.constraints.gauss import Equations
+from forcegp.constraints.surface import Cylinder, ImplicitSurface, Plane, Sphere, Surface, SurfaceSchema
+from forcegp.constraints.system import ConstrainedSystem
 
 __all__ = [
     "Baumgarte",
@@ -17,4 +18,5 @@ __all__ = [
     "Sphere",
     "Surface",
     "SurfaceContact",
+    "SurfaceSchema",
 ]

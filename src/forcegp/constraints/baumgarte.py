@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from forcegp.errors import ForceGPError
+from forcegp.errors import ParameterError
 from forcegp.types import ConstraintVector
 
 
@@ -20,7 +20,7 @@ class Baumgarte:
         damping_ratio: ξ > 0; 1 is critical damping.
 
     Raises:
-        ForceGPError: a parameter is not positive.
+        ParameterError: a parameter is not positive.
     """
 
     natural_frequency: float = 10.0
@@ -30,7 +30,7 @@ class Baumgarte:
         for name in ("natural_frequency", "damping_ratio"):
             value = getattr(self, name)
             if not 0.0 < value < float("inf"):
-                raise ForceGPError(
+                raise ParameterError(
                     f"Baumgarte's {name} must be positive",
                     expected="a positive finite number",
                     got=value,

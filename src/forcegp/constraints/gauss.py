@@ -1,28 +1,34 @@
 """Equations of motion under implicit constraints (Gauss; Udwadia and Kalaba): A, b → L, T, P, H, λ.
 
-From M q̈ = Q̄ + Aᵀλ and A q̈ = b follow q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄).
+From M q̈ = Q̄ + Aᵀλ and A q̈ = b follow q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄). With the
+Cholesky factor M = G Gᵀ and W = A G⁻ᵀ these are L = G⁻ᵀ W⁺ and (A M⁻¹ Aᵀ)⁺ = W⁺ᵀ W⁺. The rank is decided on
+the singular values of W: those of A M⁻¹ Aᵀ are their squares, which in single precision leaves no room
+between redundant constraints and rounding.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from forcegp import dynamics, kinematics
-from forcegp.constraints.baumgarte import Baumgarte
-from forcegp.constraints.contact import Constraint, ContactPoint
-from forcegp.errors import ForceGPError, ShapeError, UnknownNameError
+from forcegp.constraints.contact import ContactPoint
 from forcegp.kinematics import LinkMotion, LinkPoses
-from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector, JointMatrix, JointVector
 
-RANK_TOLERANCE = 1e-10
-"""Eigenvalues of A M⁻¹ Aᵀ below this fraction of the largest count as redundant constraints."""
+RANK_TOLERANCE = 1e-5
+"""Singular values of A G⁻ᵀ, M = G Gᵀ, below this fraction of the largest count as redundant constraints."""
+ROUNDING = 1e4
+"""The same fraction in units of the precision's ε, where that is larger: in single precision, 1.2e-3.
+
+The triangular solve with G loses up to √cond(M) digits, a factor of some hundreds for an arm."""
+
+
+def rank_tolerance(dtype: torch.dtype) -> float:
+    """Smallest ratio of singular values of A G⁻ᵀ that counts as an independent constraint."""
+    return max(RANK_TOLERANCE, ROUNDING * torch.finfo(dtype).eps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,28 +74,39 @@ class Equations:
         return torch.cholesky_solve(eye.expand_as(self.M), self.M_cholesky)
 
     @cached_property
+    def scaled_jacobian(self) -> ConstraintMatrix:
+        """W = A G⁻ᵀ `(*batch, m, nq)` with M = G Gᵀ, so that A M⁻¹ Aᵀ = W Wᵀ."""
+        return torch.linalg.solve_triangular(self.M_cholesky, self.A.mT, upper=False).mT
+
+    @cached_property
+    def scaled_inverse(self) -> ConstraintInverse:
+        """W⁺ `(*batch, nq, m)`; the pseudo-inverse handles redundant and inactive rows."""
+        W = self.scaled_jacobian
+        if W.shape[-2] == 0:
+            return W.mT
+        if W.shape[-2] == 1:
+            square = W.square().sum(-1, keepdim=True)
+            inactive = square == 0.0
+            return torch.where(inactive, 0.0, W / torch.where(inactive, 1.0, square)).mT
+        return torch.linalg.pinv(W, rtol=rank_tolerance(W.dtype))
+
+    @cached_property
     def constraint_inertia(self) -> Tensor:
-        """(A M⁻¹ Aᵀ)⁺ `(*batch, m, m)`; the pseudo-inverse serves redundant and inactive rows."""
-        S = self.A @ self.M_inv_At
-        if S.shape[-1] == 0:
-            return S
-        if S.shape[-1] == 1:
-            inactive = S == 0.0
-            return torch.where(inactive, 0.0, 1.0 / torch.where(inactive, 1.0, S))
-        return torch.linalg.pinv(S, hermitian=True, rtol=RANK_TOLERANCE)
+        """(A M⁻¹ Aᵀ)⁺ = W⁺ᵀ W⁺ `(*batch, m, m)`."""
+        return self.scaled_inverse.mT @ self.scaled_inverse
 
     @cached_property
     def rank(self) -> Tensor:
         """`(*batch,)` number of independent active constraint rows."""
-        if self.A.shape[-2] == 0:
-            return torch.zeros(self.A.shape[:-2], dtype=torch.int64, device=self.A.device)
-        S = self.A @ self.M_inv_At
-        return torch.linalg.matrix_rank(S, hermitian=True, rtol=RANK_TOLERANCE)
+        W = self.scaled_jacobian
+        if W.shape[-2] == 0:
+            return torch.zeros(W.shape[:-2], dtype=torch.int64, device=W.device)
+        return torch.linalg.matrix_rank(W, rtol=rank_tolerance(W.dtype))
 
     @cached_property
     def L(self) -> ConstraintInverse:
-        """L = M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ `(*batch, nq, m)` (remark 1.1)."""
-        return self.M_inv_At @ self.constraint_inertia
+        """L = M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ = G⁻ᵀ W⁺ `(*batch, nq, m)` (remark 1.1)."""
+        return torch.linalg.solve_triangular(self.M_cholesky.mT, self.scaled_inverse, upper=True)
 
     @cached_property
     def T(self) -> JointMatrix:
@@ -132,125 +149,3 @@ class Equations:
     def constraint_force(self, Q_bar: JointVector) -> JointVector:
         """Q_I = Aᵀ λ (eq. 17), `(*batch, nq)` [N m, N]."""
         return (self.A.mT @ self.multiplier(Q_bar)[..., None])[..., 0]
-
-
-@dataclass(frozen=True, eq=False)
-class ConstrainedSystem:
-    """A robot with its constraints.
-
-    Args:
-        robot: the robot.
-        contacts: the constraints; an empty sequence is free motion.
-        baumgarte: stabilization of the constraint error, or `None`.
-
-    Raises:
-        UnknownNameError: a contact names a frame that the robot has not.
-        ForceGPError: two contacts share a name.
-    """
-
-    robot: RobotModel
-    contacts: Sequence[Constraint] = ()
-    baumgarte: Baumgarte | None = None
-
-    def __post_init__(self) -> None:
-        names = [contact.name for contact in self.contacts]
-        for name in names:
-            if names.count(name) > 1:
-                raise ForceGPError(f"two contacts are named {name!r}", hint="give each contact its own name")
-        for contact in self.contacts:
-            contact.check(self.robot)
-
-    @property
-    def contact_names(self) -> tuple[str, ...]:
-        """Names of the constraints, in order."""
-        return tuple(contact.name for contact in self.contacts)
-
-    @property
-    def m(self) -> int:
-        """Number of constraint rows."""
-        return sum(contact.rows for contact in self.contacts)
-
-    def contact(self, name: str) -> Constraint:
-        """A constraint by name.
-
-        Raises:
-            UnknownNameError: no such contact.
-        """
-        for contact in self.contacts:
-            if contact.name == name:
-                return contact
-        raise UnknownNameError("contact", name, self.contact_names)
-
-    def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
-        """The same constraints on a robot with other parameters."""
-        return dataclasses.replace(self, robot=robot)
-
-    def active_rows(self, active: Tensor | None, batch: torch.Size) -> Tensor:
-        """`(*batch, m)` bool from `(*batch, n_contacts)` bool, all active for `None`.
-
-        Raises:
-            ShapeError: not boolean, or a shape that does not fit the contacts and the batch.
-        """
-        n, device = len(self.contacts), self.robot.device
-        if active is None:
-            return torch.ones(*batch, self.m, dtype=torch.bool, device=device)
-        sizes = zip(reversed(active.shape), reversed((*batch, n)), strict=False)
-        fits = (
-            0 < active.ndim <= len(batch) + 1 and active.shape[-1] == n and all(a in (1, b) for a, b in sizes)
-        )
-        if not fits or active.dtype != torch.bool:
-            raise ShapeError(
-                f"active does not fit the contacts {', '.join(self.contact_names) or '(none)'}",
-                expected=f"bool of shape {(*batch, n)}",
-                got=f"{str(active.dtype).removeprefix('torch.')} of shape {tuple(active.shape)}",
-            )
-        repeats = torch.tensor([contact.rows for contact in self.contacts], dtype=torch.int64, device=device)
-        return active.repeat_interleave(repeats, dim=-1).expand(*batch, self.m)
-
-    def equations(self, q: JointVector, qd: JointVector, active: Tensor | None = None) -> Equations:
-        """The equations of motion at states (q, q̇).
-
-        Args:
-            q, qd: `(*batch, nq)` joint positions and velocities.
-            active: `(*batch, n_contacts)` bool, which contacts are closed in each sample; default all.
-
-        Raises:
-            ShapeError: an argument does not fit.
-        """
-        robot = self.robot
-        robot.check_state(q=q, qd=qd)
-        if q.shape != qd.shape:
-            raise ShapeError("q and qd are not one batch", expected=tuple(q.shape), got=tuple(qd.shape))
-        poses = kinematics.link_poses(robot, q)
-        motion = kinematics.link_motion(robot, poses, qd)
-        links = dynamics.link_inertia(robot, poses)
-        terms = {contact.name: contact.terms(robot, poses, motion, qd) for contact in self.contacts}
-        c, A, b = self._stack(q, list(terms.values()))
-        cd = (A @ qd[..., None])[..., 0]
-        if self.baumgarte is not None:
-            b = self.baumgarte.stabilized(b, c, cd)
-        rows = self.active_rows(active, q.shape[:-1])
-        return Equations(
-            M=dynamics.mass_matrix_of_poses(robot, poses, links),
-            A=torch.where(rows[..., None], A, 0.0),
-            b=torch.where(rows, b, 0.0),
-            c=c,
-            cd=cd,
-            Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
-            Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
-            Q_D=dynamics.damping_force(robot, qd),
-            contact_points={name: term.point for name, term in terms.items() if term.point is not None},
-            poses=poses,
-            motion=motion,
-        )
-
-    def _stack(self, q: Tensor, terms: list) -> tuple[Tensor, Tensor, Tensor]:
-        """c, A, b of all contacts, concatenated over rows."""
-        if not terms:
-            empty = q.new_zeros(*q.shape[:-1], 0)
-            return empty, q.new_zeros(*q.shape[:-1], 0, q.shape[-1]), empty
-        return (
-            torch.cat([t.c for t in terms], dim=-1),
-            torch.cat([t.A for t in terms], dim=-2),
-            torch.cat([t.b for t in terms], dim=-1),
-        )

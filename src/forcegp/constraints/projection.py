@@ -10,7 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from forcegp.constraints.gauss import ConstrainedSystem, Equations
+from forcegp.constraints.gauss import Equations
+from forcegp.constraints.system import ConstrainedSystem
 from forcegp.errors import NumericalError
 from forcegp.types import ActiveContacts, JointVector
 

@@ -2,6 +2,9 @@
 
 The gradient points out of the solid, so a contact that presses has a multiplier λ ≥ 0. For the surfaces
 of this file but `ImplicitSurface`, c is the signed distance and the gradient the unit normal.
+
+`SurfaceSchema` is the one description of surfaces in files: scene files and saved models are validated
+against these classes, which a field `type` tells apart.
 """
 
 from __future__ import annotations
@@ -9,12 +12,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from forcegp.errors import ForceGPError
+from forcegp.errors import ParameterError
 from forcegp.types import Scalars, Vector3
 
 
@@ -41,8 +46,8 @@ def _vector(values: Sequence[float], like: Tensor) -> Tensor:
 def _unit(values: Sequence[float], what: str) -> tuple[float, ...]:
     length = sum(float(x) ** 2 for x in values) ** 0.5
     if len(values) != 3 or not 0.0 < length < float("inf"):
-        raise ForceGPError(
-            f"{what} gives no direction", expected="three finite numbers, not all zero", got=values
+        raise ParameterError(
+            f"{what} has no direction", expected="three finite numbers, not all zero", got=values
         )
     # A unit vector is kept as it is, so that a surface that was saved is read back bit for bit.
     scale = 1.0 if abs(length - 1.0) <= 1e-15 else length
@@ -50,14 +55,21 @@ def _unit(values: Sequence[float], what: str) -> tuple[float, ...]:
 
 
 def check_point(values: Sequence[float], what: str) -> None:
-    """Raise `ForceGPError` unless the values are three finite coordinates."""
+    """Raise `ParameterError` unless the values are three finite coordinates."""
     if len(values) != 3 or not all(math.isfinite(x) for x in values):
-        raise ForceGPError(f"{what} is no point", expected="three finite coordinates [m]", got=values)
+        raise ParameterError(f"{what} is not a point", expected="three finite coordinates [m]", got=values)
+
+
+def _point(values: Sequence[float], what: str) -> tuple[float, ...]:
+    check_point(values, what)
+    return tuple(float(x) for x in values)
 
 
 def _positive(value: float, what: str) -> None:
     if not 0.0 < value < float("inf"):
-        raise ForceGPError(f"{what} is not a length", expected="a positive finite number [m]", got=value)
+        raise ParameterError(
+            f"{what} is not a valid length", expected="a positive finite number [m]", got=value
+        )
 
 
 @dataclass(frozen=True)
@@ -69,17 +81,18 @@ class Plane(Surface):
         offset: distance from the world origin along the normal [m].
 
     Raises:
-        ForceGPError: the normal has no direction, or the offset is not finite.
+        ParameterError: the normal has no direction, or the offset is not finite.
     """
 
     normal: Sequence[float] = (0.0, 0.0, 1.0)
     offset: float = 0.0
+    type: Literal["plane"] = field(default="plane", kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "normal", _unit(self.normal, "the plane's normal"))
         if not math.isfinite(self.offset):
-            raise ForceGPError(
-                "the plane's offset is no distance", expected="a finite number [m]", got=self.offset
+            raise ParameterError(
+                "the plane's offset is not a distance", expected="a finite number [m]", got=self.offset
             )
 
     def value(self, p: Vector3) -> Scalars:
@@ -96,15 +109,20 @@ class Plane(Surface):
 class Sphere(Surface):
     """The sphere c(p) = |p − center| − radius, touched from outside.
 
+    Args:
+        center: [m].
+        radius: [m].
+
     Raises:
-        ForceGPError: the radius is not positive, or the center is no point.
+        ParameterError: the radius is not positive, or the center is not a point.
     """
 
     center: Sequence[float]
     radius: float
+    type: Literal["sphere"] = field(default="sphere", kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
-        check_point(self.center, "the sphere's center")
+        object.__setattr__(self, "center", _point(self.center, "the sphere's center"))
         _positive(self.radius, "the sphere's radius")
 
     def value(self, p: Vector3) -> Scalars:
@@ -130,15 +148,16 @@ class Cylinder(Surface):
         radius: [m].
 
     Raises:
-        ForceGPError: the axis has no direction, the radius is not positive, or the center is no point.
+        ParameterError: the axis has no direction, the radius is not positive, or the center is not a point.
     """
 
     center: Sequence[float]
     axis: Sequence[float]
     radius: float
+    type: Literal["cylinder"] = field(default="cylinder", kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
-        check_point(self.center, "the cylinder's center")
+        object.__setattr__(self, "center", _point(self.center, "the cylinder's center"))
         _positive(self.radius, "the cylinder's radius")
         object.__setattr__(self, "axis", _unit(self.axis, "the cylinder's axis"))
 
@@ -158,6 +177,10 @@ class Cylinder(Surface):
         distance = torch.linalg.vector_norm(r, dim=-1)
         along = (r * across).sum(-1) / distance
         return ((across * across).sum(-1) - along**2) / distance
+
+
+SurfaceSchema = Annotated[Plane | Sphere | Cylinder, Field(discriminator="type")]
+"""The surfaces that a file can describe; a file says `type = "plane"`, `"sphere"` or `"cylinder"`."""
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from forcegp import kinematics
+from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.constraints.gauss import ConstrainedSystem
-from forcegp.control.config import SimulationConfig
+from forcegp.constraints.gauss import Equations
+from forcegp.control.motion import MotionConfig
 from forcegp.control.placement import inverse_kinematics, tool_rotation
 from forcegp.control.task_space import Target
 from forcegp.control.trajectory import Chart, Reference, draw_waypoints, straight_lines
@@ -27,13 +28,13 @@ STARTS = 64
 
 @dataclass(frozen=True)
 class Plan:
-    """All that the controller is to follow.
+    """What the controller follows.
 
     Attributes:
-        contact: name of the contact that the tool has, `None` in free space.
+        contact: name of the tool's contact, `None` in free space.
         frame, point: the tool point.
         reference: the motion of the tool point.
-        targets: the controller's targets, `(n, …)`, one a sample.
+        targets: the controller's targets, `(n, …)`, one per sample.
         start: `(nq,)` joint positions at the first waypoint.
     """
 
@@ -48,8 +49,14 @@ class Plan:
         """The target of sample k."""
         return Target(*(values[k] for values in self.targets))
 
+    def normal(self, eom: Equations) -> Tensor:
+        """Unit normal of the surface under the tool `(*batch, 3)`; zero in free space."""
+        if self.contact is None:
+            return eom.Q_C.new_zeros(*eom.Q_C.shape[:-1], 3)
+        return torch.nn.functional.normalize(eom.contact_points[self.contact].normal, dim=-1)
 
-def make_plan(system: ConstrainedSystem, config: SimulationConfig, generator: torch.Generator) -> Plan:
+
+def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.Generator) -> Plan:
     """Draw a motion of the tool over the surface of the system's first contact, or in free space.
 
     Args:
@@ -103,7 +110,7 @@ def _tool_axis(point: Tensor) -> Tensor:
     return torch.nn.functional.normalize(point, dim=-1)
 
 
-def _draw_reference(chart: Chart, config: SimulationConfig, generator: torch.Generator) -> Reference:
+def _draw_reference(chart: Chart, config: MotionConfig, generator: torch.Generator) -> Reference:
     lines = math.ceil(config.duration / config.travel_time)
     waypoints = draw_waypoints(
         lines + 1, config.size, config.lift_height, config.lift_probability, generator
@@ -118,7 +125,7 @@ def _draw_postures(
     frame: str,
     point: Sequence[float],
     segments: int,
-    config: SimulationConfig,
+    config: MotionConfig,
     generator: torch.Generator,
 ) -> Tensor:
     """`(segments, nq)` postures off the home posture along the null space, where the elbow swings."""
@@ -128,8 +135,8 @@ def _draw_postures(
     return home + config.elbow_swing * swing.to(robot.dtype) @ free
 
 
-def _draw_push(reference: Reference, config: SimulationConfig, generator: torch.Generator) -> Tensor:
-    """`(n,)` force into the surface, one draw a line, none on lines off the surface."""
+def _draw_push(reference: Reference, config: MotionConfig, generator: torch.Generator) -> Tensor:
+    """`(n,)` force into the surface, one draw per line, zero on lines off the surface."""
     low, high = config.pressing_force
     draws = torch.rand(len(reference.travel_time), dtype=torch.float64, generator=generator)
     return (low + (high - low) * draws).to(reference.t.dtype)[reference.segment] * reference.on_surface

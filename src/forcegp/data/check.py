@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,7 +11,8 @@ from torch import Tensor
 
 from forcegp.data.columns import JOINT_VECTORS, component_names
 from forcegp.data.header import DataHeader
-from forcegp.errors import DataError
+from forcegp.errors import DataError, near_names
+from forcegp.limits import LOGGED_VALUE
 
 if TYPE_CHECKING:
     from forcegp.data.dataset import Dataset
@@ -24,6 +24,31 @@ def _named_columns(data: Dataset) -> list[tuple[str, Tensor]]:
     for name, group in data.contact_extras.items():
         pairs += [(f"{name}.{contact}", value) for contact, value in group.items()]
     return pairs
+
+
+def check_tensors(data: Dataset) -> None:
+    """Check that every column is a tensor, and every group of columns a mapping, before they are used."""
+    for name in ("contact", "extras", "contact_extras"):
+        _check_kind(name, getattr(data, name), Mapping, "a mapping of names to tensors")
+    named = {"t": data.t, **{name: getattr(data, name) for name in JOINT_VECTORS}, **data.extras}
+    named |= {f"contact.{name}": value for name, value in data.contact.items()}
+    if data.segment is not None:
+        named["segment"] = data.segment
+    for name, group in data.contact_extras.items():
+        _check_kind(name, group, Mapping, "a mapping of contacts to tensors")
+        named |= {f"{name}.{contact}": value for contact, value in group.items()}
+    for name, value in named.items():
+        _check_kind(name, value, Tensor, "a tensor", f"call torch.tensor({name}, dtype=torch.float64)")
+
+
+def _check_kind(name: str, value: object, kind: type, expected: str, hint: str | None = None) -> None:
+    if not isinstance(value, kind):
+        raise DataError(
+            f"column {name!r} is no tensor" if kind is Tensor else f"{name!r} is no mapping",
+            expected=expected,
+            got=type(value).__name__,
+            hint=hint,
+        )
 
 
 def check_layout(data: Dataset) -> None:
@@ -95,19 +120,19 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 def check_values(data: Dataset) -> None:
     """Check that every number is finite, and that time increases within each segment."""
     for name, value in (("t", data.t), *_named_columns(data)):
-        if not bool(torch.isfinite(value).all()):
+        if not bool((value.abs() <= LOGGED_VALUE).all()):
             _report_not_finite(data, name, value)
     if data.header.ordered:
         check_time(data)
 
 
 def _report_not_finite(data: Dataset, name: str, value: Tensor) -> None:
-    place = torch.nonzero(~torch.isfinite(value))[0].tolist()
-    count = int((~torch.isfinite(value)).sum())
+    wrong = ~(value.abs() <= LOGGED_VALUE)
+    place, count = torch.nonzero(wrong)[0].tolist(), int(wrong.sum())
     column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]
     raise DataError(
         f"column {column!r} holds {value[tuple(place)].item()} in row {place[0]}",
-        expected="a finite number in every row",
+        expected=f"a finite number in every row, up to ±{LOGGED_VALUE:g}",
         got=f"{count} values in {name!r} that are not",
         hint="drop or repair these rows before using the log",
     )
@@ -175,7 +200,7 @@ def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
             got=", ".join(have),
             hint="call data.select(robot.joint_names)",
         )
-    near = get_close_matches(missing[0], [joint for joint in have if joint not in want], n=1)
+    near = near_names(missing[0], (joint for joint in have if joint not in want))
     raise DataError(
         f"joint {missing[0]!r} of robot {robot!r} is not in the data",
         expected=", ".join(want),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +14,8 @@ from torch import Tensor
 from forcegp.data.derivative import SavitzkyGolay, differentiate
 from forcegp.data.header import DataHeader
 from forcegp.data.table import Columns, IgnoredColumnsWarning
-from forcegp.errors import DataError
+from forcegp.errors import DataError, near_names
+from forcegp.limits import JOINTS, SEGMENT_NUMBER
 
 if TYPE_CHECKING:
     from forcegp.data.dataset import Dataset
@@ -59,7 +59,9 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
     """
     joints = header.joint_names or tuple(name[2:] for name in raw if name.startswith("q."))
     if not joints:
-        raise DataError(f"{source}: no column 'q.<joint>'", expected="one a joint", got=_listing(raw))
+        raise DataError(f"{source}: no column 'q.<joint>'", expected="one per joint", got=_listing(raw))
+    if len(joints) > JOINTS:
+        raise DataError(f"{source}: too many joints", expected=f"at most {JOINTS}", got=len(joints))
     contacts = header.contact_names or tuple(name[8:] for name in raw if name.startswith("contact."))
     left = dict(raw)
     fields: Fields = {"t": _take(source, left, "t").astype(float), "joint_names": joints}
@@ -106,7 +108,7 @@ def _take(source: str, left: Columns, name: str, remedy: str | None = None) -> N
     if name in left:
         return left.pop(name)
     kin = [other for other in left if other.split(".", 1)[0] == name.split(".", 1)[0]]
-    near = get_close_matches(name, kin or list(left), n=1, cutoff=0.75)
+    near = near_names(name, kin or left, cutoff=0.75)
     raise DataError(
         f"{source}: column {name!r} is missing",
         expected=name,
@@ -137,11 +139,12 @@ def _contact(source: str, left: Columns, name: str) -> NDArray[np.bool_]:
 
 def _segment(source: str, left: Columns, n: int) -> NDArray[np.int64]:
     values = left.pop("segment", np.zeros(n, np.int64))
-    wrong = np.flatnonzero(~(np.asarray(values, float) % 1 == 0))
+    numbers = np.asarray(values, float)
+    wrong = np.flatnonzero(~(np.abs(numbers) <= SEGMENT_NUMBER) | (numbers != np.floor(numbers)))
     if len(wrong):
         raise DataError(
             f"{source}: column 'segment' is no number of a trajectory in row {wrong[0]}",
-            expected="an integer",
+            expected=f"an integer between ±{SEGMENT_NUMBER}",
             got=values[wrong[0]],
         )
     return values.astype(np.int64)

@@ -62,6 +62,7 @@ class Dataset:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
+        check.check_tensors(self)
         if self.segment is None:
             zero = torch.zeros(self.t.shape, dtype=torch.int64, device=self.t.device)
             object.__setattr__(self, "segment", zero)

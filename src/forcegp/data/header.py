@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from pydantic import NonNegativeFloat, PositiveFloat
+
 from forcegp.files import Header
 
 
@@ -24,8 +26,8 @@ class DataHeader(Header):
     FORMAT: ClassVar[str] = "forcegp-dataset"
     VERSION: ClassVar[int] = 1
 
-    dt: float | None = None
-    noise_std: float | None = None
+    dt: PositiveFloat | None = None
+    noise_std: NonNegativeFloat | None = None
     robot: str | None = None
     robot_fingerprint: str | None = None
     seed: int | None = None

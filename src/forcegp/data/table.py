@@ -6,15 +6,18 @@ This file knows files and columns; what the columns mean is in `columns.py`.
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from forcegp import limits
 from forcegp.data.header import DataHeader
-from forcegp.errors import DataError
-from forcegp.files import MAX_HEADER_BYTES, atomic_file
+from forcegp.errors import DataError, near_names
+from forcegp.files import atomic_file
+from forcegp.memory import announce_memory
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -22,8 +25,8 @@ if TYPE_CHECKING:
 Columns = dict[str, NDArray[np.generic]]
 
 HEADER_KEY = b"forcegp"
-MAX_BYTES = 8 << 30
-"""Largest table, in bytes of float64: a small compressed file can claim to hold more than memory does."""
+COPIES = 4
+"""A table is in memory as the reader's columns, as arrays, side by side, and as tensors."""
 
 GROUP_ROWS = 1 << 18
 """Rows that are written at a time, so that memory holds one copy of a long log and not two."""
@@ -51,8 +54,14 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
             writer.write_table(pa.table(group, schema=schema))
 
 
-def read_table(path: str | Path) -> tuple[Columns, DataHeader]:
+def read_table(
+    path: str | Path, *, missing: Literal["refuse", "nan"] = "refuse"
+) -> tuple[Columns, DataHeader]:
     """Read the numeric columns of a Parquet or CSV file, and its header (defaults where it has none).
+
+    Args:
+        path: the file.
+        missing: whether an empty value is an error or becomes a NaN.
 
     Raises:
         DataError: no such file, a kind of file that is not read, or one that is damaged or too large.
@@ -66,15 +75,14 @@ def read_table(path: str | Path) -> tuple[Columns, DataHeader]:
             f"{file}: not a kind of data file that is read", expected=" or ".join(readers), got=file.suffix
         )
     table, header = readers[file.suffix.lower()](file)
-    return {name: _numeric(file, name, table.column(name)) for name in _usable(file, table)}, header
+    pairs = zip(table.column_names, table.columns, strict=True)
+    return {name: _numeric(file, name, column, missing) for name, column in pairs}, header
 
 
 def _files_beside(file: Path) -> str | None:
-    from difflib import get_close_matches
-
     if not file.parent.is_dir():
         return f"the folder {file.parent} does not exist"
-    near = get_close_matches(file.name, [other.name for other in file.parent.iterdir()], n=1)
+    near = near_names(file.name, (other.name for other in file.parent.iterdir()))
     return f"did you mean {file.with_name(near[0])}?" if near else None
 
 
@@ -85,10 +93,13 @@ def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
     try:
         with pq.ParquetFile(file) as parquet:
             shape = parquet.metadata
-            _check_size(file, shape.num_rows, shape.num_columns)
+            _check_count(file, shape.num_columns)
             header = _header(file, parquet.schema_arrow.metadata or {})
+            usable = _usable(file, parquet.schema_arrow)
+            _check_flat(file, usable, [parquet.schema.column(i).path for i in range(shape.num_columns)])
+            _check_size(file, shape.num_rows, len(usable))
             # pre_buffer off: a damaged offset must not make the reader ask for the whole address space.
-            return parquet.read(use_threads=False), header
+            return parquet.read(columns=usable, use_threads=False), header
     except (pa.ArrowException, OSError, MemoryError, OverflowError, UnicodeDecodeError) as cause:
         raise DataError(
             f"{file}: the file is damaged, truncated or not Parquet",
@@ -97,23 +108,48 @@ def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
         ) from cause
 
 
+def _check_count(file: Path, columns: int) -> None:
+    if columns > limits.COLUMNS:
+        raise DataError(
+            f"{file}: too many columns",
+            expected=f"at most {limits.COLUMNS}",
+            got=columns,
+            hint="write only the columns of the robot",
+        )
+
+
+def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
+    """Check that no list or struct lies inside a column of numbers: a name also selects what is inside it."""
+    known = set(usable)
+    for path in paths:
+        parts = path.split(".") if path not in known else []
+        for n in range(1, len(parts)):
+            if ".".join(parts[:n]) in known:
+                outer = ".".join(parts[:n])
+                raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
+
+
 def _check_size(file: Path, rows: int, columns: int) -> None:
-    if rows * columns * 8 > MAX_BYTES:
+    """Check the size in memory before anything is unpacked: a small file can claim to hold more than fits."""
+    size = rows * columns * 8
+    allowed = max(limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file.stat().st_size)
+    if size > min(allowed, limits.TABLE_BYTES):
         raise DataError(
             f"{file}: the file claims to be larger than what is read at once",
-            expected=f"at most {MAX_BYTES // 8:,} numbers",
+            expected=f"at most {min(allowed, limits.TABLE_BYTES) // 8:,} numbers in a file of this size",
             got=f"{rows:,} rows × {columns} columns",
             hint="split the log into several files",
         )
+    announce_memory(COPIES * size, f"reading {file}")
 
 
 def _header(file: Path, metadata: dict[bytes, bytes]) -> DataHeader:
     if HEADER_KEY not in metadata:
         return DataHeader()
     text = metadata[HEADER_KEY]
-    if len(text) > MAX_HEADER_BYTES:
+    if len(text) > limits.HEADER_BYTES:
         raise DataError(
-            f"{file}: the header is too large", expected=f"at most {MAX_HEADER_BYTES} bytes", got=len(text)
+            f"{file}: the header is too large", expected=f"at most {limits.HEADER_BYTES} bytes", got=len(text)
         )
     return DataHeader.from_json(text, str(file), DataError)
 
@@ -122,42 +158,57 @@ def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:
     import pyarrow as pa
     from pyarrow import csv
 
+    with file.open("rb") as opened:
+        first, second = (opened.readline(limits.HEADER_BYTES + 1) for _ in range(2))
+    if len(first) > limits.HEADER_BYTES:
+        raise DataError(
+            f"{file}: the first line is too long",
+            expected=f"at most {limits.HEADER_BYTES} bytes of column names",
+        )
+    columns = first.count(b",") + 1
+    _check_count(file, columns)
+    rows = file.stat().st_size // max(len(second), 2 * columns)
+    announce_memory(COPIES * 8 * rows * columns, f"reading {file}")
     try:
-        return csv.read_csv(file, read_options=csv.ReadOptions(use_threads=False)), DataHeader()
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as cause:
+        table = csv.read_csv(file, read_options=csv.ReadOptions(use_threads=False))
+        return table.select(_usable(file, table.schema)), DataHeader()
+    except (pa.ArrowException, OSError, MemoryError, UnicodeDecodeError) as cause:
         raise DataError(
             f"{file}: the file cannot be read as CSV",
-            expected="a first line of column names, and the same number of commas in every line",
-            got=str(cause).splitlines()[0],
+            expected="a first line of column names in UTF-8, and the same number of commas in every line",
+            got=str(cause).splitlines()[0] if str(cause) else type(cause).__name__,
         ) from cause
 
 
-def _usable(file: Path, table: pa.Table) -> list[str]:
+def _usable(file: Path, schema: pa.Schema) -> list[str]:
     """Names of the numeric columns; the others are reported, a name that occurs twice is an error."""
     import pyarrow.types as kinds
 
-    names = table.column_names
-    twice = sorted({name for name in names if names.count(name) > 1})
+    names = schema.names
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
         raise DataError(f"{file}: column {twice[0]!r} occurs more than once")
+    if any(len(name) > limits.COLUMN_NAME for name in names):
+        raise DataError(f"{file}: a column's name is longer than {limits.COLUMN_NAME} characters")
     numeric = [
         field.name
-        for field in table.schema
+        for field in schema
         if kinds.is_floating(field.type) or kinds.is_integer(field.type) or kinds.is_boolean(field.type)
     ]
-    left_out = [name for name in names if name not in numeric]
+    known = set(numeric)
+    left_out = [name for name in names if name not in known]
     # A text column that should be numbers is reported by name once it is missed; the rest is harmless.
     if left_out:
         warnings.warn(
             f"{file}: columns that hold no numbers are left out: {', '.join(left_out)}",
             IgnoredColumnsWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
     return numeric
 
 
-def _numeric(file: Path, name: str, column: pa.ChunkedArray) -> NDArray[np.generic]:
-    if column.null_count:
+def _numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
+    if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(
             f"{file}: column {name!r} has {column.null_count} missing values, the first in row {row}",

@@ -1,8 +1,9 @@
-"""How far data tell apart the joint force Q and the contact's dissipative force Q_z (remark 3.3).
+"""How well data separate the joint force Q from the contact's dissipative force Q_z (remark 3.3).
 
-Accelerations in contact depend on Q + Q_z alone. What separates the two is where they act (Q_z only in
-contact, along the tangent), on what they depend, and measurements of either. Their posterior correlation
-says how far that goes: at −1 only the sum is known, at 0 each is known as well as the data allow.
+Accelerations in contact depend on Q + Q_z alone. The two are told apart by where they act (Q_z only in
+contact, along the tangent), by their inputs, and by measurements of either. Their posterior correlation
+measures the
+separation: at −1 only the sum is identifiable, at 0 each is known as well as the data allow.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.quantities import affine_map
-from forcegp.forces.states import States
+from forcegp.forces.priors.base import CONSTRAINT
+from forcegp.forces.quantities import States, affine_map
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
-    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 where one is certain.
+    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 where one of them is certain.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i).
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which accelerations
+    never show, is left out.
 
     Args:
         posterior: over latent forces.
@@ -27,7 +29,7 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
         at: n states.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
-    covariance = posterior.read_covariance(system, at, z)
+    covariance = posterior.read_covariance(system, at, z, without=(CONSTRAINT,))
     nq = system.robot.nq
     cross = covariance[:, :nq, nq:].diagonal(dim1=-2, dim2=-1)
     own = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.states import States
+from forcegp.forces.quantities import States
 
 TERMS = ("bias", "gravity", "friction", "actuation")
 """Q_C, Q_G, Q_D and Q_u: the known parts of Q."""

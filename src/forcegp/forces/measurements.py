@@ -1,7 +1,9 @@
-"""Which columns of a data set are measurements of which quantity."""
+"""Which columns of a data set measure which quantity, and what a posterior is conditioned on."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -9,12 +11,15 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.data import Dataset
+from forcegp.data import Dataset, farthest_points, standardized
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.projection import Measurement
-from forcegp.forces.quantities import QUANTITIES
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.quantities import QUANTITIES, States, states
+from forcegp.gp.features import Standardization
 
-NoiseStd = float | Sequence[float]
+NoiseStd = float | Sequence[float] | Tensor
+DEFAULT_NOISE_STD = 0.1
+"""Noise of accelerations where neither the caller nor the log states it, as in the paper [rad/s², m/s²]."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +30,57 @@ class Observation:
         data: states, contacts and measured values.
         quantity: what is measured: `qdd` (in contact or free), `multiplier`, `contact_force`,
             `constraint_force`, `joint_force`, `contact_friction` or `total_force`.
-        noise_std: standard deviation of the measurement, one number or one a component; the model's
-            own for `qdd` by default.
+        noise_std: standard deviation of the measurement: one number, one per component, or `(n, d)`. For
+            `qdd`, the default is that of the model, else the `qdd_std` of the log, else that of its header.
     """
 
     data: Dataset
     quantity: str = "qdd"
     noise_std: NoiseStd | None = None
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Values of one quantity at states.
+
+    Attributes:
+        quantity: name, as in `QUANTITIES`.
+        q, qd, tau: `(n, nq)` states.
+        active: `(n, n_contacts)` bool.
+        values: `(n, d)`.
+        segment: `(n,)` trajectory of each sample; one trajectory by default.
+    """
+
+    quantity: str
+    q: Tensor
+    qd: Tensor
+    tau: Tensor
+    active: Tensor
+    values: Tensor
+    segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
+
+    def __post_init__(self) -> None:
+        if self.segment is None:
+            zero = torch.zeros(len(self.q), dtype=torch.int64, device=self.q.device)
+            object.__setattr__(self, "segment", zero)
+
+    @property
+    def states(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """q, q̇, τ, and which contacts are closed."""
+        return self.q, self.qd, self.tau, self.active
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """q, q̇, τ, which contacts are closed, and the values."""
+        return (*self.states, self.values)
+
+    def at(self, system: ConstrainedSystem) -> States:
+        """The equations of motion at the states, with the acceleration where it was measured."""
+        return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None)
+
+    def __getitem__(self, rows: Tensor) -> Measurement:
+        """The values at some of the states."""
+        return Measurement(self.quantity, *(part[rows] for part in (*self.tensors, self.segment)))
 
 
 def _by_contact(name: str) -> Callable[[Dataset, ConstrainedSystem], Tensor]:
@@ -59,9 +108,9 @@ COLUMNS: Mapping[str, Callable[[Dataset, ConstrainedSystem], Tensor]] = {
 
 
 def measurement_of(
-    observation: Observation, system: ConstrainedSystem, default_noise: NoiseStd
+    observation: Observation, system: ConstrainedSystem, default_noise: NoiseStd | None = None
 ) -> tuple[Measurement, Tensor]:
-    """The measurement that an observation makes, and the noise of its components `(d,)`.
+    """The measurement that an observation makes, and its noise `(d,)` or `(n, d)`.
 
     Raises:
         UnknownNameError: the quantity cannot be measured, or a contact is not logged.
@@ -73,23 +122,134 @@ def measurement_of(
         raise UnknownNameError("measured quantity", quantity, COLUMNS)
     data.check_robot(system.robot)
     if len(data) == 0:
-        raise ModelError("there is nothing to learn from", expected="at least one sample", got="none")
+        raise ModelError("there are no samples to learn from", expected="at least one sample", got="none")
     values = COLUMNS[quantity](data, system)
-    noise = observation.noise_std if observation.noise_std is not None else default_noise
-    if observation.noise_std is None and quantity != "qdd":
+    std = _checked_noise(_noise_of(observation, default_noise), quantity, values)
+    active = data.active(system.contact_names)
+    return Measurement(quantity, data.q, data.qd, data.tau, active, values, data.segment), std
+
+
+def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
+    """The noise stated by the observation, the model, the log (`qdd_std`), or the header, in this order."""
+    data = observation.data
+    if observation.noise_std is not None:
+        return observation.noise_std
+    if observation.quantity != "qdd":
         raise ModelError(
-            f"the noise of {quantity!r} is not known",
-            hint=f"pass Observation(data, {quantity!r}, noise_std=…) in the quantity's unit",
+            f"the noise of {observation.quantity!r} is unknown",
+            hint=f"pass Observation(data, {observation.quantity!r}, noise_std=…) in the quantity's unit",
         )
-    std = torch.as_tensor(noise, dtype=data.dtype, device=data.device)
-    if std.shape not in ((), (1,), values.shape[-1:]):
+    stated = (default, data.extras.get("qdd_std"), data.header.noise_std)
+    return next((noise for noise in stated if noise is not None), DEFAULT_NOISE_STD)
+
+
+def _checked_noise(noise: NoiseStd, quantity: str, values: Tensor) -> Tensor:
+    """A noise as a tensor `(d,)` or `(n, d)`."""
+    std = torch.as_tensor(noise, dtype=values.dtype, device=values.device)
+    if std.shape not in ((), (1,), values.shape[-1:], values.shape):
         raise ModelError(
-            f"the noise of {quantity!r} does not fit its components",
-            expected=f"one number, or {values.shape[-1]}",
+            f"the noise of {quantity!r} does not match its components",
+            expected=f"one number, {values.shape[-1]}, or {tuple(values.shape)}",
             got=f"shape {tuple(std.shape)}",
         )
-    std = std.expand(values.shape[-1]).clone()
     if not bool((std > 0.0).all()) or not bool(torch.isfinite(std).all()):
         raise ModelError("a noise standard deviation must be positive and finite", got=noise)
-    active = data.active(system.contact_names)
-    return Measurement(quantity, data.q, data.qd, data.tau, active, values), std
+    return std.clone() if std.ndim == 2 else std.expand(values.shape[-1]).clone()
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a posterior is conditioned on.
+
+    Attributes:
+        measurements: the values.
+        noise_std: of each measurement, `(d,)` or `(n, d)`.
+        scales: standardization of the inputs of each prior.
+    """
+
+    measurements: tuple[Measurement, ...]
+    noise_std: tuple[Tensor, ...]
+    scales: tuple[Standardization, ...]
+
+    @property
+    def samples(self) -> int:
+        """Number of samples in all measurements."""
+        return sum(len(m.q) for m in self.measurements)
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What was measured."""
+        return tuple(m.quantity for m in self.measurements)
+
+    def thinned(self, samples: int) -> Training:
+        """About this many samples: the farthest points among the distinct states of each measurement."""
+        share = samples / self.samples
+        return self.of_rows([_spread(m, math.ceil(share * len(m.q))) for m in self.measurements])
+
+    def evenly(self, samples: int) -> Training:
+        """At most this many samples, evenly spaced in each measurement."""
+        step = max(1, math.ceil(self.samples / samples))
+        return self.of_rows([torch.arange(0, len(m.q), step, device=m.q.device) for m in self.measurements])
+
+    def without(self, measurement: int, rows: Tensor) -> Training:
+        """All samples but some rows of one measurement."""
+        kept = [torch.ones(len(m.q), dtype=torch.bool, device=m.q.device) for m in self.measurements]
+        kept[measurement][rows] = False
+        return self.of_rows([own.nonzero()[:, 0] for own in kept])
+
+    def of_rows(self, rows: Sequence[Tensor]) -> Training:
+        """Some rows of each measurement."""
+        return dataclasses.replace(
+            self,
+            measurements=tuple(m[own] for m, own in zip(self.measurements, rows, strict=True)),
+            noise_std=tuple(
+                std[own] if std.ndim == 2 else std for std, own in zip(self.noise_std, rows, strict=True)
+            ),
+        )
+
+    def moving(self, speed: float) -> Training:
+        """The samples in which a joint moves faster than a speed [rad/s, m/s]."""
+        fast = [(m.qd.abs().amax(-1) > speed).nonzero()[:, 0] for m in self.measurements]
+        return self.of_rows(fast)
+
+
+def _spread(m: Measurement, count: int) -> Tensor:
+    """Rows of distinct states that are far from each other, at most `count`."""
+    x = standardized(torch.cat([m.q, m.qd, m.tau], dim=-1))
+    return farthest_points(x, min(count, len(x.unique(dim=0))))
+
+
+def training_of(
+    data: Dataset | Sequence[Observation],
+    system: ConstrainedSystem,
+    priors: Sequence[ForcePrior],
+    noise_std: NoiseStd | None,
+    kept: Mapping[str, Standardization],
+) -> Training:
+    """Measurements with their noise and input scales.
+
+    Args:
+        data: measured accelerations, or any mixture of measurements.
+        system: robot and contacts.
+        priors: the force priors.
+        noise_std: of accelerations whose noise is not stated.
+        kept: scales of priors, by name, that keep earlier ones.
+
+    Raises:
+        ModelError, DataError: there are no data, or they do not fit the system.
+    """
+    observations = [Observation(data)] if isinstance(data, Dataset) else list(data)
+    if not observations:
+        raise ModelError(
+            "there are no samples to learn from", expected="at least one observation", got="none"
+        )
+    pairs = [measurement_of(o, system, noise_std) for o in observations]
+    at = [m.at(system) for m, _ in pairs]
+    scales = []
+    for prior in priors:
+        if prior.name in kept:
+            scales.append(kept[prior.name])
+            continue
+        features = [prior.features(system, a) for a in at]
+        scales.append(Standardization.of({k: torch.cat([f[k] for f in features]) for k in features[0]}))
+    return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -12,90 +12,71 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.projection import ForceMean, prior_mean, prior_operators
-from forcegp.forces.quantities import AffineMap
-from forcegp.forces.states import States
-from forcegp.gp.kernels import Features, sub
-from forcegp.gp.likelihood import Conditioned, condition
-from forcegp.gp.standardization import Standardization
-from forcegp.gp.structured_covariance import Block, cross_gram
+from forcegp.forces.quantities import AffineMap, States
+from forcegp.gp.features import Features, Standardization
+from forcegp.gp.pathwise import FunctionSamples
+from forcegp.gp.structured_covariance import Block
 
 CHUNK_COLUMNS = 700
 """Columns of the triangular solve that are held at a time."""
 
 
+@runtime_checkable
+class LatentPosterior(Protocol):
+    """Latent processes conditioned on rows, exactly or through inducing points."""
+
+    def is_measured(self, p: int) -> bool:
+        """Whether any row depends on process p; where none does, its posterior is its prior."""
+        ...
+
+    def latent_mean(self, p: int, features: Features) -> Tensor:
+        """Posterior mean of process p, `(n, components)`."""
+        ...
+
+    def covariance(self, block: Block) -> Tensor:
+        """Posterior covariance of the rows of each sample of a block, `(n, r, r)`."""
+        ...
+
+    def draw(self, count: int, generator: torch.Generator, features: int) -> FunctionSamples:
+        """Functions from the posterior."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class ForcePosterior:
-    """Latent forces conditioned on whitened rows; independent of the constraint that it is read on.
+    """Latent forces conditioned on data; independent of the constraint under which it is read.
 
     Attributes:
         priors, scales: the force priors and the standardization of their inputs.
-        params: log-hyperparameters.
-        blocks: the rows conditioned on.
         mean: prior mean of Q.
-        alpha: (K + I)⁻¹ y `(rows,)`.
+        latent: the conditioned processes.
+        offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
     """
 
     priors: tuple[ForcePrior, ...]
     scales: tuple[Standardization, ...]
-    params: dict[str, Tensor]
-    blocks: list[Block]
     mean: ForceMean
-    alpha: Tensor
+    latent: LatentPosterior
+    offsets: Mapping[str, Tensor] = field(default_factory=dict)
 
-    @cached_property
-    def conditioned(self) -> Conditioned:
-        """Factorisation of the rows' covariance, computed when a covariance is first asked for."""
-        return condition(self.priors, self.params, self.blocks)
-
-    @cached_property
-    def weights(self) -> list[list[Tensor]]:
-        """By prior and block, `(components, n)`: the latent mean is k(x, X) times these weights."""
-        weights: list[list[Tensor]] = [[] for _ in self.priors]
-        first = 0
-        for block in self.blocks:
-            alpha = self.alpha[first : first + block.rows].reshape(block.target.shape)
-            first += block.rows
-            for p, W in enumerate(block.operators):
-                weights[p].append(torch.einsum("nak,na->kn", W, alpha))
-        return weights
-
-    @cached_property
-    def kernels_to_data(self) -> list[list[Callable[[Features], Tensor]]]:
-        """By prior and block, x ↦ k(x, X)."""
-        return [
-            [prior.kernel.towards(sub(self.params, prior.prefix), block.features[p]) for block in self.blocks]
-            for p, prior in enumerate(self.priors)
-        ]
-
-    def features(self, system: ConstrainedSystem, at: States) -> tuple[dict[str, Tensor], ...]:
-        """Standardized kernel inputs of each prior at states."""
-        return tuple(self.features_of(p, system, at) for p in range(len(self.priors)))
+    def latent_mean(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | None:
+        """Posterior mean of the force of prior p, `(n, components)`; `None` where it is zero."""
+        offset = self.offsets.get(self.priors[p].name)
+        if not self.latent.is_measured(p):
+            return None if offset is None else offset.expand(len(at.q), -1)
+        mean = self.latent.latent_mean(p, self.features_of(p, system, at))
+        return mean if offset is None else mean + offset
 
     def features_of(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         """Standardized kernel inputs of prior p at states."""
         return self.scales[p].apply(self.priors[p].features(system, at))
 
-    @cached_property
-    def measured(self) -> tuple[bool, ...]:
-        """Of each prior, whether any row shows its force; the data change nothing about the others."""
-        return tuple(
-            any(bool(block.operators[p].any()) for block in self.blocks) for p in range(len(self.priors))
-        )
-
-    def latent_mean(self, p: int, features: Features) -> Tensor:
-        """Posterior mean of the force of prior p, without its prior mean, `(n, components)`."""
-        parts = [
-            (kernel(features) @ w[..., None])[..., 0]
-            for kernel, w in zip(self.kernels_to_data[p], self.weights[p], strict=True)
-        ]
-        return sum(parts[1:], start=parts[0]).mT
-
     def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Posterior mean of Q̄ = m + Σ E f, `(n, nq)`: the force field of a rollout."""
         force = self.mean(system, at)
         for p, prior in enumerate(self.priors):
-            if self.measured[p]:
-                latent = self.latent_mean(p, self.features_of(p, system, at))
+            latent = self.latent_mean(p, system, at)
+            if latent is not None:
                 force = force + (prior.operator(system, at) @ latent[..., None])[..., 0]
         return force
 
@@ -103,19 +84,35 @@ class ForcePosterior:
         """Posterior mean of a quantity, o + B(m + Σ E f), `(n, d)`."""
         mean = prior_mean(system, at, z, self.mean)
         for p, prior in enumerate(self.priors):
-            if self.measured[p]:
+            latent = self.latent_mean(p, system, at)
+            if latent is not None:
                 (W,) = prior_operators([prior], system, at, z)
-                latent = self.latent_mean(p, self.features_of(p, system, at))
                 mean = mean + (W @ latent[..., None])[..., 0]
         return mean
 
-    def read_covariance(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
-        """Posterior covariance of a quantity at each state, `(n, d, d)`, without measurement noise."""
-        operators = prior_operators(self.priors, system, at, z)
-        features = self.features(system, at)
+    def read_covariance(
+        self,
+        system: ConstrainedSystem,
+        at: States,
+        z: AffineMap,
+        without: Sequence[str] = (),
+    ) -> Tensor:
+        """Posterior covariance of a quantity at each state, `(n, d, d)`, without measurement noise.
+
+        Args:
+            system: robot and contacts.
+            at: n states.
+            z: the quantity.
+            without: targets of priors that are left out.
+        """
+        operators = [
+            torch.zeros_like(W) if prior.target in without else W
+            for prior, W in zip(self.priors, prior_operators(self.priors, system, at, z), strict=True)
+        ]
+        features = [self.features_of(p, system, at) for p in range(len(self.priors))]
         n, d = z.o.shape
-        parts = []
         step = max(1, CHUNK_COLUMNS // max(d, 1))
+        parts = []
         for i in range(0, n, step):
             rows = slice(i, i + step)
             block = Block(
@@ -123,38 +120,5 @@ class ForcePosterior:
                 tuple(W[rows] for W in operators),
                 z.o[rows],
             )
-            parts.append(self._block_covariance(block))
+            parts.append(self.latent.covariance(block))
         return torch.cat(parts) if parts else z.o.new_zeros(0, d, d)
-
-    def _block_covariance(self, block: Block) -> Tensor:
-        n, d = block.target.shape
-        prior = sum(
-            torch.einsum("nak,kn,nbk->nab", W, self._prior_variance(p, block.features[p]), W)
-            for p, W in enumerate(block.operators)
-        )
-        cross = cross_gram(self.priors, self.params, self.blocks, [block])
-        V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
-        V = V.reshape(len(V), n, d).transpose(0, 1)
-        covariance = prior - V.mT @ V
-        return 0.5 * (covariance + covariance.mT)
-
-    def _prior_variance(self, p: int, features: Features) -> Tensor:
-        return self.priors[p].kernel.diagonal(sub(self.params, self.priors[p].prefix), features)
-
-
-def posterior(
-    priors: Sequence[ForcePrior],
-    scales: Sequence[Standardization],
-    params: dict[str, Tensor],
-    blocks: list[Block],
-    mean: ForceMean,
-) -> ForcePosterior:
-    """Condition latent forces on whitened rows.
-
-    Raises:
-        NumericalError: the covariance of the rows is not positive definite.
-    """
-    fit = condition(priors, params, blocks)
-    result = ForcePosterior(tuple(priors), tuple(scales), params, blocks, mean, fit.alpha)
-    result.__dict__["conditioned"] = fit
-    return result

@@ -1,90 +1,70 @@
-"""Measurements as rows with unit white noise, the noise-free constraint directions projected out.
+"""Measurements as rows with unit white noise, with the directions that the constraint fixes projected out.
 
-Where q̈ is measured in contact, A q̈ = b leaves the part of q̈ in the range of Aᵀ without any unknown
-force: it is prior mean plus white noise. With an orthonormal basis U of the null space of A (after
-scaling by the noise), Uᵀ q̈ carries the whole Gaussian process, in nq − rank A rows a sample, and the
-likelihood splits exactly into the two parts.
+Where q̈ is measured in contact, A q̈ = b fixes the part of q̈ in the range of Aᵀ: it is prior mean plus white
+noise. With an orthonormal basis U of the null space of A (after scaling by the noise), Uᵀ q̈ carries the
+whole Gaussian process in nq − rank A rows per sample, and the likelihood splits exactly into the two parts.
+
+Noise of the motor torque is white noise on the joint force. It reaches a sample's rows through the same
+operator as the force, so they have the covariance I + N Σ_τ Nᵀ, whose Cholesky factor whitens them sample by
+sample.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.quantities import AffineMap, affine_map
-from forcegp.forces.states import States, states
-from forcegp.gp.standardization import Standardization
+from forcegp.forces.measurements import Measurement
+from forcegp.forces.priors.base import CONSTRAINT, CONTACT, ForcePrior
+from forcegp.forces.quantities import AffineMap, States, affine_map
+from forcegp.gp.features import Standardization
 from forcegp.gp.structured_covariance import Block
 from forcegp.linalg import null_space_basis
-
-VANISHING = 1e-12
-"""Products of two operators below this fraction of their largest entries are zero in exact arithmetic."""
 
 ForceMean = Callable[[ConstrainedSystem, States], Tensor]
 """Prior mean of the joint force Q at states, `(n, nq)`."""
 
-
-@dataclass(frozen=True)
-class Measurement:
-    """Values of one quantity at states.
-
-    Attributes:
-        quantity: name, as in `QUANTITIES`.
-        q, qd, tau: `(n, nq)` states.
-        active: `(n, n_contacts)` bool.
-        values: `(n, d)`.
-    """
-
-    quantity: str
-    q: Tensor
-    qd: Tensor
-    tau: Tensor
-    active: Tensor
-    values: Tensor
-
-    @property
-    def tensors(self) -> tuple[Tensor, ...]:
-        """q, q̇, τ, which contacts are closed, and the values."""
-        return self.q, self.qd, self.tau, self.active, self.values
-
-    def __getitem__(self, rows: Tensor) -> Measurement:
-        """The values at some of the states."""
-        return Measurement(self.quantity, *(part[rows] for part in self.tensors))
+ForceNoise = Callable[[States], Tensor]
+"""Variance of the white noise on the joint force at states, `(n, nq)`."""
 
 
 @dataclass(frozen=True)
 class WhitenedRows:
-    """The rows of all measurements, and the part of the likelihood that no latent force touches.
+    """The rows of all measurements, and the part of the likelihood that no latent force changes.
 
     Attributes:
         blocks: rows that the latent forces explain.
-        constant: negative log likelihood of the rest, with the noise's normalisation.
+        constant: negative log likelihood of the rest, with the normalisation of the noise.
     """
 
     blocks: list[Block]
     constant: Tensor
 
+    def tempered(self, power: float) -> WhitenedRows:
+        """The rows of the likelihood to a power κ: noise variances over κ, normalisations times κ.
+
+        Noise that is correlated over τ samples makes n of them worth n/τ; κ = 1/τ accounts for it.
+        """
+        if power == 1.0:
+            return self
+        root = math.sqrt(power)
+        blocks = [
+            Block(b.features, tuple(root * W for W in b.operators), root * b.target) for b in self.blocks
+        ]
+        return WhitenedRows(blocks, power * self.constant)
+
 
 def prior_operators(
     priors: Sequence[ForcePrior], system: ConstrainedSystem, at: States, z: AffineMap
 ) -> list[Tensor]:
-    """B(x) E(x) of each prior, from its components to the quantity, `(n, d, components)`.
-
-    What is zero but for rounding (H Aᵀ) is made exactly zero, so that it costs nothing.
-    """
-    operators = []
-    for prior in priors:
-        B, E = z.B_z if prior.in_contact_only else z.B_Q, prior.operator(system, at)
-        W = B @ E
-        bound = VANISHING * B.abs().amax() * E.abs().amax() if W.numel() else 0.0
-        operators.append(torch.where(W.abs().amax() > bound, W, 0.0) if W.numel() else W)
-    return operators
+    """B(x) E(x) of each prior, from its components to the quantity, `(n, d, components)`."""
+    by_target = {CONTACT: z.B_z, CONSTRAINT: z.B_N}
+    return [by_target.get(prior.target, z.B_Q) @ prior.operator(system, at) for prior in priors]
 
 
 def prior_mean(system: ConstrainedSystem, at: States, z: AffineMap, mean: ForceMean) -> Tensor:
@@ -95,7 +75,7 @@ def prior_mean(system: ConstrainedSystem, at: States, z: AffineMap, mean: ForceM
 def _split(A: Tensor, rank: int) -> tuple[Tensor, Tensor]:
     """Null-space basis of A, and A⁺, both with the rank that the equations of motion count.
 
-    Of nearly redundant rows, A⁺ with another rank would magnify what they contradict each other.
+    With another rank, A⁺ would magnify the contradictions of nearly redundant rows.
     """
     if rank == A.shape[-2]:
         return null_space_basis(A, rank), torch.linalg.pinv(A)
@@ -105,6 +85,40 @@ def _split(A: Tensor, rank: int) -> tuple[Tensor, Tensor]:
     return null_space_basis(rows, rank), torch.linalg.pinv(rows) @ W.mT
 
 
+@dataclass(frozen=True)
+class _Rows:
+    """Samples with a common number of rows: residual `(n, r)`, operators `(n, r, ·)` and the torque's `(n,
+    r, nq)`."""
+
+    features: tuple[dict[str, Tensor], ...]
+    operators: tuple[Tensor, ...]
+    residual: Tensor
+    torque: Tensor
+
+    def of(self, own: Tensor, U: Tensor) -> _Rows:
+        """Uᵀ times the rows of some samples."""
+        return _Rows(
+            tuple({name: x[own] for name, x in f.items()} for f in self.features),
+            tuple(U.mT @ W[own] for W in self.operators),
+            (U.mT @ self.residual[own][..., None])[..., 0],
+            U.mT @ self.torque[own],
+        )
+
+    def whitened(self, variance: Tensor | None) -> tuple[Block, Tensor]:
+        """The rows divided by the factor of I + N Σ_τ Nᵀ, and the log determinant of the factors."""
+        if variance is None:
+            return Block(self.features, self.operators, self.residual), self.residual.new_zeros(())
+        # QR of (1, N Σ½)ᵀ instead of Cholesky of 1 + N Σ Nᵀ: noise of 0.05 N m at a wrist of 10⁻³ kg m² is
+        # 50 rad/s², and squares of such ratios lose all digits.
+        N = self.torque * variance.sqrt()[:, None, :]
+        eye = torch.eye(N.shape[1], dtype=N.dtype, device=N.device).expand(len(N), -1, -1)
+        C = torch.linalg.qr(torch.cat([eye, N.mT], dim=1)).R.mT
+        operators = tuple(torch.linalg.solve_triangular(C, W, upper=False) for W in self.operators)
+        residual = torch.linalg.solve_triangular(C, self.residual[..., None], upper=False)[..., 0]
+        log_determinant = C.diagonal(dim1=-2, dim2=-1).abs().log().sum()
+        return Block(self.features, operators, residual), log_determinant
+
+
 def whiten(
     system: ConstrainedSystem,
     priors: Sequence[ForcePrior],
@@ -112,41 +126,49 @@ def whiten(
     mean: ForceMean,
     measurement: Measurement,
     noise_std: Tensor,
+    force_noise: ForceNoise | None = None,
+    offsets: Mapping[str, Tensor] | None = None,
 ) -> WhitenedRows:
-    """Rows of one measurement, divided by its noise, without noise-free directions.
+    """Rows of one measurement with unit white noise, without noise-free directions.
 
     Args:
         system: robot and contacts.
         priors, scales: the force priors and the standardization of their inputs.
         mean: prior mean of Q.
         measurement: what was measured.
-        noise_std: `(d,)` standard deviation of each component.
+        noise_std: `(d,)` or `(n, d)` standard deviation of each component.
+        force_noise: variance of the white noise on the joint force.
+        offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
     """
-    at = states(system, measurement.q, measurement.qd, measurement.tau, measurement.active)
+    at = measurement.at(system)
     z = affine_map(system, at, measurement.quantity)
-    residual = (measurement.values - prior_mean(system, at, z, mean)) / noise_std
-    operators = [W / noise_std[:, None] for W in prior_operators(priors, system, at, z)]
-    features = [scale.apply(prior.features(system, at)) for prior, scale in zip(priors, scales, strict=True)]
-    constant = len(residual) * noise_std.log().sum()
+    std = noise_std.expand_as(measurement.values)
+    operators = prior_operators(priors, system, at, z)
+    expected = prior_mean(system, at, z, mean)
+    for prior, W in zip(priors, operators, strict=True):
+        if offsets and prior.name in offsets:
+            expected = expected + W @ offsets[prior.name]
+    everything = _Rows(
+        tuple(scale.apply(prior.features(system, at)) for prior, scale in zip(priors, scales, strict=True)),
+        tuple(W / std[..., None] for W in operators),
+        (measurement.values - expected) / std,
+        z.B_Q / std[..., None],
+    )
+    variance = None if force_noise is None else force_noise(at)
+    constant = std.log().sum()
     if measurement.quantity != "qdd" or system.m == 0:
-        return WhitenedRows([Block(tuple(features), tuple(operators), residual)], constant)
-    A = at.eom.A * noise_std
+        block, log_det = everything.whitened(variance)
+        return WhitenedRows([block], constant + log_det)
+    A, rank = at.eom.A * std[:, None, :], at.eom.rank
+    violated = (at.eom.A @ measurement.values[..., None])[..., 0] - at.eom.b
     blocks = []
-    rank = at.eom.rank
     for value in rank.unique().tolist():
         own = (rank == value).nonzero()[:, 0]
         U, pinv = _split(A[own], value)
-        violated = ((at.eom.A[own] @ measurement.values[own][..., None])[..., 0] - at.eom.b[own])[..., None]
-        constant = (
-            constant + 0.5 * ((pinv @ violated) ** 2).sum() + 0.5 * value * len(own) * math.log(2 * math.pi)
-        )
-        blocks.append(
-            Block(
-                tuple({name: x[own] for name, x in f.items()} for f in features),
-                tuple(U.mT @ W[own] for W in operators),
-                (U.mT @ residual[own][..., None])[..., 0],
-            )
-        )
+        block, log_det = everything.of(own, U).whitened(None if variance is None else variance[own])
+        fixed = 0.5 * ((pinv @ violated[own][..., None]) ** 2).sum()
+        constant = constant + fixed + log_det + 0.5 * value * len(own) * math.log(2 * math.pi)
+        blocks.append(block)
     return WhitenedRows(blocks, constant)
 
 

@@ -1,32 +1,120 @@
-"""Every measured or predicted quantity as an affine map of the forces, z = B_Q Q + B_z Q_z + o.
+"""Every quantity as an affine map of the forces, z = B_Q Q + B_z Q_z + o; the home of λ's operator −Lᵀ.
 
-The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b (eqs. 19 to 25, with the signs put right: the
-operator from force to λ is −Lᵀ, and λ answers to all impressed forces Q + Q_z).
+The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b (eqs. 19 to 25 with two corrections: the operator
+from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.states import States
+from forcegp.constraints import ConstrainedSystem, Equations
+from forcegp.errors import ModelError, ShapeError, UnknownNameError
+
+
+@dataclass(frozen=True)
+class States:
+    """A batch of robot states with what the equations of motion say there.
+
+    Attributes:
+        q, qd, tau: `(n, nq)`.
+        active: `(n, n_contacts)` bool.
+        eom: the equations of motion at these states.
+        qdd: `(n, nq)` measured acceleration, where one is known.
+    """
+
+    q: Tensor
+    qd: Tensor
+    tau: Tensor
+    active: Tensor
+    eom: Equations
+    qdd: Tensor | None = None
+
+
+def states(
+    system: ConstrainedSystem,
+    q: Tensor,
+    qd: Tensor,
+    tau: Tensor,
+    active: Tensor,
+    qdd: Tensor | None = None,
+) -> States:
+    """Evaluate the equations of motion at a batch of states."""
+    return States(q, qd, tau, active, system.equations(q, qd, active), qdd)
+
+
+class FlatStates(NamedTuple):
+    """States of any batch shape as a list.
+
+    Attributes:
+        q, qd, tau: `(n, nq)`.
+        active: `(n, n_contacts)` bool.
+        batch: shape whose product is n.
+    """
+
+    q: Tensor
+    qd: Tensor
+    tau: Tensor
+    active: Tensor
+    batch: torch.Size
+
+    def rows(self, own: slice) -> FlatStates:
+        """Some of the states."""
+        return FlatStates(self.q[own], self.qd[own], self.tau[own], self.active[own], self.batch)
+
+    def at(self, system: ConstrainedSystem) -> States:
+        """The equations of motion at the states."""
+        return states(system, self.q, self.qd, self.tau, self.active)
+
+
+def flat_states(
+    system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
+) -> FlatStates:
+    """Broadcast states `(*batch, nq)` against each other and flatten them; all contacts closed by default.
+
+    Raises:
+        ShapeError: an argument does not fit the system, or is not finite.
+    """
+    given = {"q": q, "qd": qd, "tau": tau}
+    system.robot.check_state(**given)
+    for name, x in given.items():
+        if not bool(torch.isfinite(x).all()):
+            raise ShapeError(f"{name} holds values that are not finite", expected="finite numbers")
+    try:
+        batch = torch.broadcast_shapes(*(x.shape[:-1] for x in given.values()))
+    except RuntimeError as cause:
+        got = {name: tuple(x.shape) for name, x in given.items()}
+        raise ShapeError(
+            "q, qd and tau do not broadcast", expected="shapes that broadcast to one batch", got=got
+        ) from cause
+    contacts = len(system.contacts)
+    if active is None:
+        active = torch.ones(contacts, dtype=torch.bool, device=q.device)
+    system.active_rows(active, batch)
+    rows = batch.numel()
+    q, qd, tau = (x.expand(*batch, x.shape[-1]).reshape(rows, x.shape[-1]) for x in given.values())
+    return FlatStates(q, qd, tau, active.expand(*batch, contacts).reshape(rows, contacts), batch)
 
 
 class AffineMap(NamedTuple):
     """z = B_Q Q + B_z Q_z + o at each state.
 
     Attributes:
-        B_Q, B_z: `(n, d, nq)` operators on the joint force Q and the contact's dissipative force Q_z.
+        B_Q: `(n, d, nq)` operator on the joint force Q.
+        B_z: `(n, d, nq)` operator on the contact's dissipative force Q_z.
+        B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ: B_Q, but exactly 0 for q̈, since H Aᵀ
+            = 0.
         o: `(n, d)` offset.
     """
 
     B_Q: Tensor
     B_z: Tensor
+    B_N: Tensor
     o: Tensor
 
 
@@ -36,33 +124,38 @@ def _identity(at: States) -> tuple[Tensor, Tensor, Tensor]:
     return eye, torch.zeros_like(eye), torch.zeros_like(at.q)
 
 
+def _left(C: Tensor, z: AffineMap) -> AffineMap:
+    """C z for matrices C `(n, c, d)`."""
+    B = C @ z.B_Q
+    return AffineMap(B, C @ z.B_z, B, (C @ z.o[..., None])[..., 0])
+
+
 def _acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
     """q̈ = L b + H (Q + Q_z)."""
     H = at.eom.H
-    return AffineMap(H, H, (at.eom.L @ at.eom.b[..., None])[..., 0])
+    return AffineMap(H, H, torch.zeros_like(H), (at.eom.L @ at.eom.b[..., None])[..., 0])
 
 
 def _free_acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
     """q̈′ = M⁻¹ Q."""
     _, zero, nothing = _identity(at)
-    return AffineMap(at.eom.M_inv, zero, nothing)
+    return AffineMap(at.eom.M_inv, zero, at.eom.M_inv, nothing)
 
 
 def _multiplier(system: ConstrainedSystem, at: States) -> AffineMap:
     """λ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z)."""
     B = -at.eom.L.mT
-    return AffineMap(B, B, (at.eom.constraint_inertia @ at.eom.b[..., None])[..., 0])
+    return AffineMap(B, B, B, (at.eom.constraint_inertia @ at.eom.b[..., None])[..., 0])
 
 
 def _constraint_force(system: ConstrainedSystem, at: States) -> AffineMap:
     """Q_I = Aᵀ λ."""
-    B_Q, B_z, o = _multiplier(system, at)
-    At = at.eom.A.mT
-    return AffineMap(At @ B_Q, At @ B_z, (At @ o[..., None])[..., 0])
+    return _left(at.eom.A.mT, _multiplier(system, at))
 
 
 def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
-    """F_I = ∇c λ of each surface contact, three Cartesian components a contact, in the order of contacts."""
+    """F_I = ∇c λ of each surface contact, three Cartesian components per contact, in the order of the
+    contacts."""
     multiplier = _multiplier(system, at)
     rows, columns = [], []
     first = 0
@@ -76,26 +169,25 @@ def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
         normals = normals.slice_scatter(
             normals[:, 3 * i : 3 * i + 3].select_scatter(normal, 2, row), 1, 3 * i, 3 * i + 3
         )
-    return AffineMap(
-        normals @ multiplier.B_Q, normals @ multiplier.B_z, (normals @ multiplier.o[..., None])[..., 0]
-    )
+    return _left(normals, multiplier)
 
 
 def _total_force(system: ConstrainedSystem, at: States) -> AffineMap:
     """Q̄ = Q + Q_z."""
     eye, _, nothing = _identity(at)
-    return AffineMap(eye, eye, nothing)
+    return AffineMap(eye, eye, eye, nothing)
 
 
 def _joint_force(system: ConstrainedSystem, at: States) -> AffineMap:
     """Q."""
-    return AffineMap(*_identity(at))
+    eye, zero, nothing = _identity(at)
+    return AffineMap(eye, zero, eye, nothing)
 
 
 def _contact_friction(system: ConstrainedSystem, at: States) -> AffineMap:
     """Q_z."""
     eye, zero, nothing = _identity(at)
-    return AffineMap(zero, eye, nothing)
+    return AffineMap(zero, eye, zero, nothing)
 
 
 QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {

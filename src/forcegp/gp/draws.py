@@ -4,29 +4,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from forcegp.errors import UnknownNameError
-
-Features = Mapping[str, Tensor]
-"""Named kernel inputs `(n, w)`."""
-
-
-def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
-    """The named features side by side, `(n, w)`.
-
-    Raises:
-        UnknownNameError: a feature is not given.
-    """
-    names = tuple(x) if inputs is None else inputs
-    for name in names:
-        if name not in x:
-            raise UnknownNameError("kernel input", name, x)
-    return torch.cat([x[name] for name in names], dim=-1)
+from forcegp.gp.features import Features, stacked
 
 
 class FunctionDraw(ABC):
@@ -63,6 +46,17 @@ class LinearDraw(FunctionDraw):
     def basis(self, x: Features) -> Tensor:
         scaled = stacked(x, self.inputs) * self.slope[:, None, :]
         return torch.cat([scaled, self.bias[:, None, None].expand(-1, scaled.shape[1], 1)], dim=-1)
+
+
+@dataclass(frozen=True)
+class ConstantDraw(FunctionDraw):
+    """A constant per output."""
+
+    std: Tensor
+
+    def basis(self, x: Features) -> Tensor:
+        n = stacked(x, None).shape[-2]
+        return self.std[:, None, None].expand(-1, n, 1)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,10 @@ class Conditioned:
     alpha: Tensor
     jitter: float
 
+    def negative_log_likelihood(self, y: Tensor) -> Tensor:
+        """½ yᵀK⁻¹y + ½ log|K| + ½ n log 2π."""
+        return 0.5 * (y @ self.alpha) + self.L.diagonal().log().sum() + 0.5 * len(y) * math.log(2 * math.pi)
+
 
 def target_of(blocks: Sequence[Block]) -> Tensor:
     """All whitened residuals `(rows,)`."""
@@ -53,8 +57,7 @@ class _NegativeLogLikelihood(torch.autograd.Function):
     def forward(ctx: Any, priors: Sequence[Process], layout: _Layout, *tensors: Tensor) -> Tensor:
         params, blocks = layout.unpack(tensors)
         fit = condition(priors, params, blocks)
-        y = target_of(blocks)
-        value = 0.5 * (y @ fit.alpha) + fit.L.diagonal().log().sum() + 0.5 * len(y) * math.log(2 * math.pi)
+        value = fit.negative_log_likelihood(target_of(blocks))
         needs = ctx.needs_input_grad[2:]
         if any(needs):
             K_inv = cholesky_inverse_(fit.L)

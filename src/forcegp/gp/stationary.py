@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forcegp.gp.draws import Features, FourierDraw, FunctionDraw, stacked
+from forcegp.gp.draws import FourierDraw, FunctionDraw
+from forcegp.gp.features import Features, stacked
 from forcegp.gp.kernels import Initial, Kernel, Parameters, width_of
 
 LARGEST_EXPONENT = 300.0

@@ -1,4 +1,4 @@
-"""The analytical model: the equations of motion with learned figures of the robot, and no contact friction.
+"""The analytical model: the equations of motion with learned robot parameters, and no contact friction.
 
 q̈ = L b + H(Q_C + Q_G + Q_D + Q_u) (eqs. 2 and 4, with Q_z = 0), trained by mean squared error.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -15,19 +14,21 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.errors import ForceGPError, ModelError
 from forcegp.forces.mean import AnalyticalMean
-from forcegp.forces.measurements import Observation, measurement_of
-from forcegp.forces.projection import Measurement, prior_mean
-from forcegp.forces.quantities import affine_map
-from forcegp.forces.states import states
+from forcegp.forces.measurements import Measurement, Observation, measurement_of
+from forcegp.forces.projection import prior_mean
+from forcegp.forces.quantities import affine_maps, flat_states, stack
 from forcegp.gp.optimise import Learned, LearningOptions, minimise
-from forcegp.models.base import FitProgress, FitResult, ForceField, Model, Prediction
-from forcegp.models.flat import flat_states
+from forcegp.models.base import FitProgress, FitResult, FittedModel, ForceField, Model, Prediction
 from forcegp.models.minibatch import BatchOptions, Loss, train
 from forcegp.robot.parameters import AnalyticalParameters
+from forcegp.storage.folder import ModelHeader, Settings, settings_of
+from forcegp.storage.system import robot_tensors, take, take_robot
 
-LearnedFigures = Mapping[str, Sequence[str] | Literal["all"]]
-EVERY_LINK: LearnedFigures = {"inertia": "all", "damping": "all"}
+KIND = "analytical"
+LearnedParameters = Mapping[str, Sequence[str] | Literal["all"]]
+EVERY_LINK: LearnedParameters = {"inertia": "all", "damping": "all"}
 """Mass, centre of mass and rotational inertia of every link, and the viscous friction of every joint."""
 ADAM = BatchOptions(epochs=30, batch=128, learning_rate=0.05, patience=10)
 CHUNK_STATES = 4096
@@ -36,7 +37,7 @@ CHUNK_STATES = 4096
 
 @dataclass(frozen=True)
 class Window:
-    """How far from the robot file's figures learning starts.
+    """How far from the parameters of the robot file learning starts.
 
     Args:
         relative: half width for logarithms of masses, moments and friction; 0.5 is a factor of 0.37 to
@@ -50,32 +51,42 @@ class Window:
     angle: float = 0.1
 
 
-class AnalyticalModel(Model):
-    """The constrained equations of motion, with the robot's figures θ_A learned from accelerations.
+class AnalyticalSettings(Settings):
+    """What is kept of an analytical model besides its tensors; the robot is the learned one."""
 
-    Without `fit` it predicts with the robot file's figures. Learned figures stay physical, since θ_A
-    are coordinates of physical bodies only.
+    learn: dict[str, tuple[str, ...]]
+    relative: float
+    length: float
+    angle: float
+    seed: int
+
+
+class AnalyticalModel(Model["AnalyticalFit"]):
+    """The constrained equations of motion, with the robot parameters θ_A learned from accelerations.
+
+    Before `fit` it predicts with the parameters of the robot file. Learned parameters stay physically
+    consistent, since θ_A are coordinates of physical bodies only.
 
     Args:
         system: robot and contacts.
         learn: joint names by quantity, as for `AnalyticalParameters`.
-        window: how far from the file's figures learning starts.
+        window: how far from the parameters of the file learning starts.
         seed: of the start.
 
     Raises:
         UnknownNameError, ModelError, InertiaError: `learn` does not fit the robot.
     """
 
-    kind = "analytical"
+    kind = KIND
 
     def __init__(
         self,
         system: ConstrainedSystem,
-        learn: LearnedFigures = EVERY_LINK,
+        learn: LearnedParameters = EVERY_LINK,
         window: Window | None = None,
         seed: int = 0,
     ) -> None:
-        self.system = system
+        self.specified = system
         self.window = window or Window()
         self.seed = seed
         self.parameters = AnalyticalParameters(system.robot, learn)
@@ -86,7 +97,7 @@ class AnalyticalModel(Model):
         *,
         options: BatchOptions | LearningOptions | None = None,
         progress: FitProgress | None = None,
-    ) -> FitResult:
+    ) -> AnalyticalFit:
         """Minimise the mean squared error of the accelerations, from a random start in the window.
 
         Args:
@@ -99,50 +110,53 @@ class AnalyticalModel(Model):
             ModelError, DataError: the data do not fit the model.
         """
         options = options or ADAM
-        measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system, 1.0)
+        measured, _ = measurement_of(Observation(data, noise_std=1.0), self.specified)
         generator, width = torch.Generator().manual_seed(self.seed), self.window
-        self.parameters.reset(generator, relative=width.relative, length=width.length, angle=width.angle)
-        start = {name: value.detach().clone() for name, value in self.parameters.named_parameters()}
+        theta = AnalyticalParameters(self.parameters.start, self.parameters.joints)
+        theta.reset(generator, relative=width.relative, length=width.length, angle=width.angle)
+        start = {name: value.detach().clone() for name, value in theta.named_parameters()}
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-            robot = torch.func.functional_call(self.parameters, dict(tensors), ())
-            return _mean_squared_error(self.system.with_robot(robot), measured, rows)
+            robot = torch.func.functional_call(theta, dict(tensors), ())
+            return _mean_squared_error(self.specified.with_robot(robot), measured, rows)
 
         if isinstance(options, BatchOptions):
             learned = train(loss, start, len(measured.q), options, generator, progress)
         else:
-            learned = self._minimise(loss, start, len(measured.q), options, progress)
-        self._adopt(learned)
-        return FitResult(
-            converged=learned.converged,
-            evaluations=learned.evaluations,
-            seconds=learned.seconds,
-            objective=learned.value,
-            message=learned.message,
-            history=tuple(learned.history),
-        )
-
-    @staticmethod
-    def _minimise(
-        loss: Loss,
-        start: dict[str, Tensor],
-        samples: int,
-        options: LearningOptions,
-        progress: FitProgress | None,
-    ) -> Learned:
-        """Minimise over all samples at once."""
-        rows = torch.arange(samples, device=next(iter(start.values())).device)
-
-        def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
-            if progress is not None:
-                progress(evaluations, options.max_evaluations, value)
-
-        return minimise(lambda tensors: loss(tensors, rows), start, options, progress=report)
-
-    def _adopt(self, learned: Learned) -> None:
-        self.parameters.load_state_dict(learned.tensors)
+            learned = _minimise(loss, start, len(measured.q), options, progress)
+        theta.load_state_dict(learned.tensors)
         with torch.no_grad():
-            self.system = self.system.with_robot(self.parameters())
+            system = self.specified.with_robot(theta())
+        self._fitted = AnalyticalFit(system, theta, self.window, self.seed, FitResult.of(learned))
+        return self._fitted
+
+    @property
+    def fitted(self) -> AnalyticalFit:
+        """The most recent fit, or the robot file as it is."""
+        if self._fitted is not None:
+            return self._fitted
+        result = FitResult(True, 0, 0.0, 0.0, message="parameters of the robot file, nothing learned")
+        return AnalyticalFit(self.specified, self.parameters, self.window, self.seed, result)
+
+
+@dataclass(frozen=True, eq=False)
+class AnalyticalFit(FittedModel):
+    """The equations of motion of a robot with learned parameters.
+
+    Attributes:
+        system: robot and contacts.
+        parameters: the learned coordinates.
+        window, seed: where learning started.
+        result: how the fit went.
+    """
+
+    system: ConstrainedSystem
+    parameters: AnalyticalParameters
+    window: Window
+    seed: int
+    result: FitResult
+
+    kind = KIND
 
     @torch.no_grad()
     def predict(
@@ -154,6 +168,7 @@ class AnalyticalModel(Model):
         *,
         active: Tensor | None = None,
         covariance: bool = True,
+        system: ConstrainedSystem | None = None,
     ) -> Prediction:
         """A quantity by the equations of motion; there is no covariance.
 
@@ -161,7 +176,8 @@ class AnalyticalModel(Model):
             q, qd, tau: `(*batch, nq)` states.
             quantity: a name of `QUANTITIES`, or several.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            covariance: without effect, since the model knows no uncertainty.
+            covariance: without effect, since the model has no uncertainty.
+            system: predict on another system.
 
         Returns:
             The values `(*batch, d)` as the mean.
@@ -170,40 +186,73 @@ class AnalyticalModel(Model):
             UnknownNameError: no such quantity.
             ShapeError: a state does not fit the robot.
         """
-        flat = flat_states(self.system, q, qd, tau, active)
-        names = [quantity] if isinstance(quantity, str) else list(quantity)
+        system = system or self.system
+        flat = flat_states(system, q, qd, tau, active)
         values: list[Tensor] = []
         parts: dict[str, slice] = {}
         for first in range(0, max(len(flat.q), 1), CHUNK_STATES):
-            rows = slice(first, first + CHUNK_STATES)
-            at = states(self.system, flat.q[rows], flat.qd[rows], flat.tau[rows], flat.active[rows])
-            by_name = [
-                prior_mean(self.system, at, affine_map(self.system, at, name), AnalyticalMean())
-                for name in names
-            ]
-            values.append(torch.cat(by_name, dim=-1))
-            parts = _parts(names, [x.shape[-1] for x in by_name])
+            at = flat.rows(slice(first, first + CHUNK_STATES)).at(system)
+            z, parts = stack(affine_maps(system, at, quantity))
+            values.append(prior_mean(system, at, z, AnalyticalMean()))
         mean = torch.cat(values)
         return Prediction(mean.reshape(*flat.batch, mean.shape[-1]), None, parts)
 
     def force_field(self) -> ForceField:
+        """Q_C + Q_G + Q_D + Q_u at states."""
         return AnalyticalMean()
 
-    def save(self, path: str | Path) -> None:
-        """Write the model as a folder; `forcegp.load_model` reads it back exactly."""
-        from forcegp.models.baseline_files import save_analytical
+    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+        theta, width = self.parameters, self.window
+        settings = AnalyticalSettings(
+            learn=theta.joints,
+            relative=width.relative,
+            length=width.length,
+            angle=width.angle,
+            seed=self.seed,
+        )
+        start = {f"start.{name}": getattr(theta.start, name) for name in robot_tensors(theta.start)}
+        return settings, dict(theta.state_dict()) | start
 
-        save_analytical(self, path)
+
+def load_analytical(
+    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+) -> AnalyticalModel:
+    """The model that `AnalyticalFit.save` wrote."""
+    settings = settings_of(header, AnalyticalSettings, source)
+    original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
+    window = Window(settings.relative, settings.length, settings.angle)
+    try:
+        model = AnalyticalModel(original, settings.learn, window, settings.seed)
+    except ForceGPError as cause:
+        raise ModelError.at(f"{source}: field 'settings.learn'", cause) from cause
+    state = {
+        name: take(tensors, name, tuple(old.shape), old.dtype, source)
+        for name, old in model.parameters.state_dict().items()
+    }
+    theta = AnalyticalParameters(original.robot, settings.learn)
+    theta.load_state_dict(state)
+    result = FitResult(True, 0, 0.0, 0.0, message="loaded")
+    model._fitted = AnalyticalFit(system, theta, window, settings.seed, result)
+    return model
+
+
+def _minimise(
+    loss: Loss,
+    start: dict[str, Tensor],
+    samples: int,
+    options: LearningOptions,
+    progress: FitProgress | None,
+) -> Learned:
+    """Minimise over all samples at once."""
+    rows = torch.arange(samples, device=next(iter(start.values())).device)
+
+    def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
+        if progress is not None:
+            progress(evaluations, options.max_evaluations, value)
+
+    return minimise(lambda tensors: loss(tensors, rows), start, options, progress=report)
 
 
 def _mean_squared_error(system: ConstrainedSystem, measured: Measurement, rows: Tensor) -> Tensor:
     eom = system.equations(measured.q[rows], measured.qd[rows], measured.active[rows])
     return ((eom.acceleration(eom.Q_K + measured.tau[rows]) - measured.values[rows]) ** 2).mean()
-
-
-def _parts(names: Sequence[str], widths: Sequence[int]) -> dict[str, slice]:
-    """The slice of each quantity among several side by side."""
-    parts, first = {}, 0
-    for name, width in zip(names, widths, strict=True):
-        parts[name], first = slice(first, first + width), first + width
-    return parts

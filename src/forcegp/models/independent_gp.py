@@ -5,25 +5,37 @@ q̈_j ~ GP(0, k_j(x, x′)) with x = (q, q̇, τ) and squared-exponential k_j (s
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
+from pydantic import PositiveFloat
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.errors import ForceGPError, ModelError
 from forcegp.forces.measurements import NoiseStd, Observation, measurement_of
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.quantities import flat_states
 from forcegp.forces.start import bounds_of, initial_hyperparameters, negative_log_prior
-from forcegp.gp.kernels import sub
-from forcegp.gp.likelihood import Conditioned, condition, negative_log_likelihood
-from forcegp.gp.optimise import Learned, LearningOptions, minimise
-from forcegp.gp.standardization import Standardization
-from forcegp.gp.structured_covariance import Block, cross_gram
-from forcegp.models.base import FitProgress, FitResult, Model, Prediction, not_fitted, only_qdd
-from forcegp.models.flat import flat_states
+from forcegp.gp.exact import ExactPosterior
+from forcegp.gp.features import Standardization
+from forcegp.gp.likelihood import negative_log_likelihood
+from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
+from forcegp.gp.structured_covariance import Block
+from forcegp.models.base import (
+    FitProgress,
+    FitResult,
+    FittedModel,
+    Model,
+    Prediction,
+    check_acceleration_only,
+)
+from forcegp.storage.folder import ModelHeader, Settings, settings_of
+from forcegp.storage.system import take
 
+KIND = "independent_gp"
 CHUNK_STATES = 2000
 """States predicted at a time, which bounds the memory."""
 
@@ -35,7 +47,7 @@ class IndependentTraining:
     Attributes:
         features: inputs before standardization, `(n, nq)` by name.
         qdd: `(n, nq)` [rad/s², m/s²].
-        noise_std: `(nq,)`.
+        noise_std: `(nq,)` or `(n, nq)`.
         scale: standardization of the inputs.
     """
 
@@ -44,27 +56,39 @@ class IndependentTraining:
     noise_std: Tensor
     scale: Standardization
 
+    def block(self, joint: int) -> Block:
+        """The accelerations of one joint in units of their noise."""
+        inverse = 1.0 / self.noise_std.expand_as(self.qdd)[:, joint : joint + 1]
+        inputs = self.scale.apply(self.features)
+        return Block((inputs,), (inverse[..., None],), self.qdd[:, joint : joint + 1] * inverse)
 
-class IndependentGP(Model):
-    """Independent zero-mean Gaussian processes, one a joint acceleration, on standardized (q, q̇, τ).
+    def constant(self, joint: int) -> float:
+        """Normalisation of the noise of one joint."""
+        return float(self.noise_std.expand_as(self.qdd)[:, joint].log().sum())
+
+
+class IndependentSettings(Settings):
+    """What is kept of independent Gaussian processes besides their tensors."""
+
+    noise_std: PositiveFloat | tuple[PositiveFloat, ...] | None
+
+
+class IndependentGP(Model["IndependentFit"]):
+    """Independent zero-mean Gaussian processes, one per joint acceleration, on standardized (q, q̇, τ).
 
     Contacts are not an input: the model sees only states and torques.
 
     Args:
         system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
-        noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one a joint.
+        noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
+            default what the log states, else 0.1.
     """
 
-    kind = "independent_gp"
+    kind = KIND
 
-    def __init__(self, system: ConstrainedSystem, noise_std: NoiseStd = 0.1) -> None:
-        self.system = system
+    def __init__(self, system: ConstrainedSystem, noise_std: NoiseStd | None = None) -> None:
+        self.specified = system
         self.noise_std = noise_std
-        # Likelihood and Gram matrices read nothing of a prior but its name and kernel.
-        self.priors = tuple(JointForcePrior(name=f"qdd_{j}") for j in range(system.robot.nq))
-        self.hyperparameters: dict[str, Tensor] = {}
-        self.training: IndependentTraining | None = None
-        self._conditioned: tuple[Conditioned, ...] = ()
 
     def fit(
         self,
@@ -72,7 +96,7 @@ class IndependentGP(Model):
         *,
         options: LearningOptions | None = None,
         progress: FitProgress | None = None,
-    ) -> FitResult:
+    ) -> IndependentFit:
         """Learn the hyperparameters of each joint by maximum a posteriori, one joint after the other.
 
         Args:
@@ -85,57 +109,22 @@ class IndependentGP(Model):
             NumericalError: the likelihood cannot be computed.
         """
         options = options or LearningOptions()
-        measured, noise_std = measurement_of(Observation(data), self.system, self.noise_std)
+        measured, noise_std = measurement_of(Observation(data), self.specified, self.noise_std)
         features = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
         training = IndependentTraining(features, measured.values, noise_std, Standardization.of(features))
+        priors = joint_processes(self.specified.robot.nq)
         parts: list[Learned] = []
-        for joint in range(self.system.robot.nq):
+        for joint, prior in enumerate(priors):
             before = sum(part.evaluations for part in parts)
-            parts.append(self._learn(training, joint, options, before, progress))
-        self.adopt({key: x for part in parts for key, x in part.tensors.items()}, training)
-        return self._result(training, parts)
 
-    def _learn(
-        self,
-        training: IndependentTraining,
-        joint: int,
-        options: LearningOptions,
-        before: int,
-        progress: FitProgress | None,
-    ) -> Learned:
-        """Learn the process of one joint."""
-        priors, blocks = self.priors[joint : joint + 1], [self.block(training, joint)]
-        start = initial_hyperparameters(priors, blocks)
-        constant = len(training.qdd) * training.noise_std[joint].log()
+            def report(evaluations: int, value: float, _: dict[str, Tensor], before: int = before) -> None:
+                if progress is not None:
+                    progress(before + evaluations, options.max_evaluations * len(priors), value)
 
-        def objective(tensors: dict[str, Tensor]) -> Tensor:
-            value, _ = negative_log_likelihood(priors, tensors, blocks)
-            return value + constant + negative_log_prior(tensors, start)
-
-        def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
-            if progress is not None:
-                progress(before + evaluations, options.max_evaluations * len(self.priors), value)
-
-        return minimise(objective, start, options, bounds=bounds_of(start), progress=report)
-
-    def block(self, training: IndependentTraining, joint: int) -> Block:
-        """The accelerations of one joint in units of their noise."""
-        inverse = 1.0 / training.noise_std[joint]
-        operator = inverse.expand(len(training.qdd), 1, 1)
-        target = training.qdd[:, joint : joint + 1] * inverse
-        return Block((training.scale.apply(training.features),), (operator,), target)
-
-    def adopt(self, hyperparameters: dict[str, Tensor], training: IndependentTraining) -> None:
-        """Condition on training data under given hyperparameters.
-
-        Raises:
-            NumericalError: a covariance is not positive definite.
-        """
-        self._conditioned = tuple(
-            condition(self.priors[j : j + 1], hyperparameters, [self.block(training, j)])
-            for j in range(len(self.priors))
-        )
-        self.hyperparameters, self.training = hyperparameters, training
+            parts.append(_learn(training, prior, joint, options, report))
+        hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
+        self._fitted = fitted(self.specified, self.noise_std, training, hyperparameters, parts)
+        return self._fitted
 
     def log_marginal_likelihood(self) -> float:
         """log p(y | X, θ) of the training data, summed over the joints.
@@ -143,27 +132,88 @@ class IndependentGP(Model):
         Raises:
             ModelError: the model has not been fitted.
         """
-        if self.training is None:
-            raise not_fitted(self)
-        total = len(self.training.qdd) * float(self.training.noise_std.log().sum())
-        for j in range(len(self.priors)):
-            blocks = [self.block(self.training, j)]
-            total += float(negative_log_likelihood(self.priors[j : j + 1], self.hyperparameters, blocks)[0])
-        return -total
+        value = self.fitted.log_marginal_likelihood
+        assert value is not None
+        return value
 
-    def _result(self, training: IndependentTraining, parts: list[Learned]) -> FitResult:
-        ended = zip(self.system.robot.joint_names, parts, strict=True)
-        return FitResult(
-            converged=all(part.converged for part in parts),
-            evaluations=sum(part.evaluations for part in parts),
-            seconds=sum(part.seconds for part in parts),
-            objective=sum(part.value for part in parts),
-            log_marginal_likelihood=self.log_marginal_likelihood(),
-            jitter=max(fitted.jitter for fitted in self._conditioned),
-            constant_inputs=training.scale.constant,
-            message="; ".join(f"{joint}: {part.message}" for joint, part in ended),
-            history=tuple(value for part in parts for value in part.history),
-        )
+
+def joint_processes(nq: int) -> tuple[JointForcePrior, ...]:
+    """One process per joint; the likelihood reads only name and kernel of each."""
+    return tuple(JointForcePrior(name=f"qdd_{j}") for j in range(nq))
+
+
+def _learn(
+    training: IndependentTraining,
+    prior: JointForcePrior,
+    joint: int,
+    options: LearningOptions,
+    report: Progress,
+) -> Learned:
+    """Learn the process of one joint."""
+    blocks = [training.block(joint)]
+    start = initial_hyperparameters([prior], blocks)
+    constant = training.constant(joint)
+
+    def objective(tensors: dict[str, Tensor]) -> Tensor:
+        value, _ = negative_log_likelihood([prior], tensors, blocks)
+        return value + constant + negative_log_prior(tensors, start)
+
+    return minimise(objective, start, options, bounds=bounds_of(start), progress=report)
+
+
+def fitted(
+    system: ConstrainedSystem,
+    noise_std: NoiseStd | None,
+    training: IndependentTraining,
+    hyperparameters: dict[str, Tensor],
+    parts: Sequence[Learned] = (),
+) -> IndependentFit:
+    """Condition on training data at given hyperparameters.
+
+    Raises:
+        NumericalError: a covariance is not positive definite.
+    """
+    processes = joint_processes(system.robot.nq)
+    posteriors = tuple(
+        ExactPosterior.of([prior], hyperparameters, [training.block(j)]) for j, prior in enumerate(processes)
+    )
+    value = sum(float(p.log_likelihood() - training.constant(j)) for j, p in enumerate(posteriors))
+    ended = zip(system.robot.joint_names, parts, strict=False)
+    result = FitResult(
+        converged=all(part.converged for part in parts),
+        evaluations=sum(part.evaluations for part in parts),
+        seconds=sum(part.seconds for part in parts),
+        objective=sum(part.value for part in parts) if parts else -value,
+        log_marginal_likelihood=value,
+        jitter=max(p.conditioned.jitter for p in posteriors),
+        constant_inputs=training.scale.constant,
+        message="; ".join(f"{joint}: {part.message}" for joint, part in ended),
+        history=tuple(value for part in parts for value in part.history),
+    )
+    return IndependentFit(system, noise_std, training, hyperparameters, posteriors, result)
+
+
+@dataclass(frozen=True, eq=False)
+class IndependentFit(FittedModel):
+    """Conditioned processes.
+
+    Attributes:
+        system: robot and contacts.
+        noise_std: as given to the model.
+        training: what the processes are conditioned on.
+        hyperparameters: by process.
+        posteriors: of each joint.
+        result: how the fit went.
+    """
+
+    system: ConstrainedSystem
+    noise_std: NoiseStd | None
+    training: IndependentTraining
+    hyperparameters: dict[str, Tensor]
+    posteriors: tuple[ExactPosterior, ...]
+    result: FitResult
+
+    kind = KIND
 
     @torch.no_grad()
     def predict(
@@ -175,6 +225,7 @@ class IndependentGP(Model):
         *,
         active: Tensor | None = None,
         covariance: bool = True,
+        system: ConstrainedSystem | None = None,
     ) -> Prediction:
         """Posterior mean and covariance of the accelerations; the covariance is diagonal.
 
@@ -183,52 +234,71 @@ class IndependentGP(Model):
             quantity: `qdd`, the only one that this model knows.
             active: without effect, since the model does not know of contacts.
             covariance: whether to compute the covariance.
+            system: none but its own, since the model knows no forces.
 
         Returns:
             Mean `(*batch, nq)` and covariance `(*batch, nq, nq)`, without measurement noise.
 
         Raises:
-            ModelError: the model has not been fitted, or another quantity is asked for.
+            ModelError: another quantity, or another system, is asked for.
             ShapeError: a state does not fit the robot.
         """
-        only_qdd(self, quantity)
-        if self.training is None:
-            raise not_fitted(self)
+        check_acceleration_only(self, quantity, system)
         flat = flat_states(self.system, q, qd, tau, active)
         features = self.training.scale.apply({"q": flat.q, "qd": flat.qd, "tau": flat.tau})
         means, variances = [], []
         for first in range(0, max(len(flat.q), 1), CHUNK_STATES):
             part = {name: x[first : first + CHUNK_STATES] for name, x in features.items()}
-            mean, variance = self._predict(self.training, part, covariance)
-            means.append(mean)
-            variances.append(variance)
-        mean = torch.cat(means).reshape(*flat.batch, self.system.robot.nq)
-        if not covariance:
-            return Prediction(mean, None, {"qdd": slice(0, mean.shape[-1])})
-        spread = torch.cat(variances).reshape(mean.shape)
-        return Prediction(mean, torch.diag_embed(spread), {"qdd": slice(0, mean.shape[-1])})
-
-    def _predict(
-        self, training: IndependentTraining, features: dict[str, Tensor], covariance: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Mean and variance `(n, nq)` at standardized features; the variance is 0 if not asked for."""
-        n = len(features["q"])
-        means, variances = [], []
-        for j, prior in enumerate(self.priors):
-            fitted = self._conditioned[j]
-            at = Block((features,), (training.qdd.new_ones(n, 1, 1),), training.qdd.new_zeros(n, 1))
-            cross = cross_gram((prior,), self.hyperparameters, [self.block(training, j)], [at])
-            means.append(cross.mT @ fitted.alpha)
-            variance = torch.zeros_like(means[-1])
+            means.append(torch.cat([p.latent_mean(0, part) for p in self.posteriors], dim=-1))
             if covariance:
-                V = torch.linalg.solve_triangular(fitted.L, cross, upper=False)
-                own = sub(self.hyperparameters, prior.name)
-                variance = (prior.kernel.diagonal(own, features)[0] - (V * V).sum(0)).clamp(min=0.0)
-            variances.append(variance)
-        return torch.stack(means, dim=-1), torch.stack(variances, dim=-1)
+                variances.append(torch.stack([_variance(p, part) for p in self.posteriors], dim=-1))
+        mean = torch.cat(means).reshape(*flat.batch, self.system.robot.nq)
+        parts = {"qdd": slice(0, mean.shape[-1])}
+        if not covariance:
+            return Prediction(mean, None, parts)
+        return Prediction(mean, torch.diag_embed(torch.cat(variances).reshape(mean.shape)), parts)
 
-    def save(self, path: str | Path) -> None:
-        """Write the model as a folder; `forcegp.load_model` reads it back exactly."""
-        from forcegp.models.baseline_files import save_independent
+    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+        noise = None if self.noise_std is None else torch.as_tensor(self.noise_std).tolist()
+        settings = IndependentSettings(noise_std=tuple(noise) if isinstance(noise, list) else noise)
+        tensors = {f"training.{name}": value for name, value in self.training.features.items()}
+        tensors |= {"training.qdd": self.training.qdd, "training.noise_std": self.training.noise_std}
+        tensors |= {f"hyperparameters.{name}": value for name, value in self.hyperparameters.items()}
+        return settings, tensors
 
-        save_independent(self, path)
+
+def _variance(posterior: ExactPosterior, features: dict[str, Tensor]) -> Tensor:
+    """Variance of a scalar process, `(n,)`."""
+    n, like = len(features["q"]), posterior.alpha
+    rows = Block((features,), (like.new_ones(n, 1, 1),), like.new_zeros(n, 1))
+    return posterior.covariance(rows)[:, 0, 0].clamp(min=0.0)
+
+
+def load_independent(
+    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+) -> IndependentGP:
+    """The model that `IndependentFit.save` wrote."""
+    settings = settings_of(header, IndependentSettings, source)
+    nq, dtype = system.robot.nq, system.robot.dtype
+    model = IndependentGP(system, settings.noise_std)
+    n = len(take(tensors, "training.q", None, dtype, source))
+    features = {
+        name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
+    }
+    noise = take(tensors, "training.noise_std", None, dtype, source)
+    if noise.shape not in ((nq,), (n, nq)) or not bool((noise > 0.0).all()):
+        raise ModelError(f"{source}: tensor 'training.noise_std' is not valid", expected="positive numbers")
+    qdd = take(tensors, "training.qdd", (n, nq), dtype, source)
+    training = IndependentTraining(features, qdd, noise, Standardization.of(features))
+    hyperparameters = {
+        f"{prior.name}.{name}": take(
+            tensors, f"hyperparameters.{prior.name}.{name}", tuple(value.shape), torch.float64, source
+        )
+        for prior in joint_processes(nq)
+        for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
+    }
+    try:
+        model._fitted = fitted(system, settings.noise_std, training, hyperparameters)
+    except ForceGPError as cause:
+        raise ModelError.at(f"{source}: the training data", cause) from cause
+    return model

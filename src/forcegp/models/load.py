@@ -9,13 +9,12 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
-from forcegp.models.analytical import AnalyticalModel
+from forcegp.models.analytical import AnalyticalModel, load_analytical
 from forcegp.models.base import Model
-from forcegp.models.baseline_files import load_analytical, load_independent, load_network
-from forcegp.models.independent_gp import IndependentGP
-from forcegp.models.neural import NeuralNetwork
-from forcegp.models.structured_files import load_structured
+from forcegp.models.independent_gp import IndependentGP, load_independent
+from forcegp.models.neural import NeuralNetwork, load_network
 from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_load import load_structured
 from forcegp.storage.folder import HEADER_FILE, ModelHeader, own_tensors, read_model
 from forcegp.storage.system import unpack_system
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -13,11 +13,21 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Observation, measurement_of
-from forcegp.gp.standardization import Standardization
-from forcegp.models.base import FitProgress, FitResult, Model, Prediction, not_fitted, only_qdd
-from forcegp.models.flat import flat_states
+from forcegp.forces.quantities import flat_states
+from forcegp.gp.features import Standardization
+from forcegp.models.base import (
+    FitProgress,
+    FitResult,
+    FittedModel,
+    Model,
+    Prediction,
+    check_acceleration_only,
+)
 from forcegp.models.minibatch import BatchOptions, train
+from forcegp.storage.folder import ModelHeader, Settings, settings_of
+from forcegp.storage.system import take
 
+KIND = "neural_network"
 PAPER_ARCHITECTURES: tuple[tuple[int, ...], ...] = ((80,), (30, 20), (200, 200, 200, 200))
 """Widths of the hidden layers of the three networks of the paper."""
 SHALLOW = BatchOptions(epochs=3000, batch=1024, learning_rate=0.03, patience=300)
@@ -25,7 +35,15 @@ DEEP = BatchOptions(epochs=300, batch=256, learning_rate=0.003)
 """For networks of more than two hidden layers, whose epochs take longer and whose steps must be smaller."""
 
 
-class NeuralNetwork(Model):
+class NetworkSettings(Settings):
+    """What is kept of a neural network besides its tensors."""
+
+    hidden: tuple[int, ...]
+    seed: int
+    constant: tuple[str, ...]
+
+
+class NeuralNetwork(Model["NetworkFit"]):
     """A feed-forward network with sigmoid layers on standardized (q, q̇, τ), trained by mean squared error.
 
     Contacts are not an input, and there is no covariance.
@@ -39,17 +57,14 @@ class NeuralNetwork(Model):
         ModelError: a width is not positive.
     """
 
-    kind = "neural_network"
+    kind = KIND
 
     def __init__(self, system: ConstrainedSystem, hidden: Sequence[int] = (80,), seed: int = 0) -> None:
         if any(width < 1 for width in hidden):
             raise ModelError("a hidden layer needs at least one unit", got=tuple(hidden))
-        self.system = system
+        self.specified = system
         self.hidden = tuple(hidden)
         self.seed = seed
-        self.network = _network(system, self.hidden)
-        self.inputs: Standardization | None = None
-        self.outputs: Standardization | None = None
 
     def fit(
         self,
@@ -57,7 +72,7 @@ class NeuralNetwork(Model):
         *,
         options: BatchOptions | None = None,
         progress: FitProgress | None = None,
-    ) -> FitResult:
+    ) -> NetworkFit:
         """Train with ADAM on batches; the weights of the best epoch on held-out samples are kept.
 
         Args:
@@ -72,12 +87,12 @@ class NeuralNetwork(Model):
             ModelError, DataError: the data do not fit the model.
             NumericalError: training diverges.
         """
-        measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system, 1.0)
+        measured, _ = measurement_of(Observation(data, noise_std=1.0), self.specified)
         states = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
         inputs, outputs = Standardization.of(states), Standardization.of({"qdd": measured.values})
         x, y = _stacked(inputs, states), outputs.apply({"qdd": measured.values})["qdd"]
         generator = torch.Generator().manual_seed(self.seed)
-        network = _network(self.system, self.hidden)
+        network = _network(self.specified, self.hidden)
         _initialise(network, generator)
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
@@ -88,21 +103,33 @@ class NeuralNetwork(Model):
         start = dict(network.named_parameters())
         learned = train(loss, start, len(x), options, generator, progress)
         network.load_state_dict(learned.tensors)
-        self.adopt(network, inputs, outputs)
-        return FitResult(
-            converged=learned.converged,
-            evaluations=learned.evaluations,
-            seconds=learned.seconds,
-            objective=learned.value,
-            constant_inputs=inputs.constant,
-            message=learned.message,
-            history=tuple(learned.history),
-        )
+        result = FitResult.of(learned, constant_inputs=inputs.constant)
+        network.requires_grad_(False)
+        self._fitted = NetworkFit(self.specified, self.hidden, self.seed, network, inputs, outputs, result)
+        return self._fitted
 
-    def adopt(self, network: nn.Sequential, inputs: Standardization, outputs: Standardization) -> None:
-        """Predict with given weights and standardizations from now on."""
-        self.network = network.requires_grad_(False)
-        self.inputs, self.outputs = inputs, outputs
+
+@dataclass(frozen=True, eq=False)
+class NetworkFit(FittedModel):
+    """A trained network.
+
+    Attributes:
+        system: robot and contacts.
+        hidden, seed: what it was made from.
+        network: its layers.
+        inputs, outputs: standardization of (q, q̇, τ) and of q̈.
+        result: how training went.
+    """
+
+    system: ConstrainedSystem
+    hidden: tuple[int, ...]
+    seed: int
+    network: nn.Sequential
+    inputs: Standardization
+    outputs: Standardization
+    result: FitResult
+
+    kind = KIND
 
     @torch.no_grad()
     def predict(
@@ -114,6 +141,7 @@ class NeuralNetwork(Model):
         *,
         active: Tensor | None = None,
         covariance: bool = True,
+        system: ConstrainedSystem | None = None,
     ) -> Prediction:
         """Accelerations; there is no covariance.
 
@@ -121,28 +149,59 @@ class NeuralNetwork(Model):
             q, qd, tau: `(*batch, nq)` states.
             quantity: `qdd`, the only one that this model knows.
             active: without effect, since the model does not know of contacts.
-            covariance: without effect, since the model knows no uncertainty.
+            covariance: without effect, since the model has no uncertainty.
+            system: none but its own, since the model knows no forces.
 
         Returns:
             Mean `(*batch, nq)`.
 
         Raises:
-            ModelError: the model has not been fitted, or another quantity is asked for.
+            ModelError: another quantity, or another system, is asked for.
             ShapeError: a state does not fit the robot.
         """
-        only_qdd(self, quantity)
-        if self.inputs is None or self.outputs is None:
-            raise not_fitted(self)
+        check_acceleration_only(self, quantity, system)
         flat = flat_states(self.system, q, qd, tau, active)
         x = _stacked(self.inputs, {"q": flat.q, "qd": flat.qd, "tau": flat.tau})
         mean = self.network(x) * self.outputs.std["qdd"] + self.outputs.mean["qdd"]
         return Prediction(mean.reshape(*flat.batch, mean.shape[-1]), None, {"qdd": slice(0, mean.shape[-1])})
 
-    def save(self, path: str | Path) -> None:
-        """Write the model as a folder; `forcegp.load_model` reads it back exactly."""
-        from forcegp.models.baseline_files import save_network
+    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+        settings = NetworkSettings(hidden=self.hidden, seed=self.seed, constant=self.inputs.constant)
+        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        for part in (self.inputs, self.outputs):
+            for name in part.mean:
+                tensors |= {f"mean.{name}": part.mean[name], f"std.{name}": part.std[name]}
+        return settings, tensors
 
-        save_network(self, path)
+
+def load_network(
+    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+) -> NeuralNetwork:
+    """The model that `NetworkFit.save` wrote."""
+    settings = settings_of(header, NetworkSettings, source)
+    robot, model = system.robot, NeuralNetwork(system, settings.hidden, settings.seed)
+    widths = [3 * robot.nq, *settings.hidden, robot.nq]
+    state = {}
+    for layer, (before, after) in enumerate(pairwise(widths)):
+        # Shapes are checked before a network of them is made.
+        for name, shape in (("weight", (after, before)), ("bias", (after,))):
+            key = f"{2 * layer}.{name}"
+            state[key] = take(tensors, f"network.{key}", shape, robot.dtype, source)
+    network = _network(system, settings.hidden)
+    network.load_state_dict(state)
+    scales = []
+    for names, constant in ((("q", "qd", "tau"), settings.constant), (("qdd",), ())):
+        mean, std = (
+            {name: take(tensors, f"{part}.{name}", (robot.nq,), robot.dtype, source) for name in names}
+            for part in ("mean", "std")
+        )
+        scales.append(Standardization(mean, std, constant))
+    result = FitResult(True, 0, 0.0, 0.0, constant_inputs=settings.constant, message="loaded")
+    fitted = NetworkFit(
+        system, settings.hidden, settings.seed, network.requires_grad_(False), scales[0], scales[1], result
+    )
+    model._fitted = fitted
+    return model
 
 
 def _network(system: ConstrainedSystem, hidden: tuple[int, ...]) -> nn.Sequential:

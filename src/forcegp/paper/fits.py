@@ -1,4 +1,4 @@
-"""Fitted models and their scores: one stage a fit, one stage a score."""
+"""Fitted models and their scores: one stage per fit, one stage per score."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from forcegp.models.registry import create
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.paper.memory import peak_memory, reset_peak
 from forcegp.paper.profiles import Profile
+from forcegp.paper.results import Score
 from forcegp.paper.stages import Advance, Stage, Stages
 from forcegp.paper.task import Task
-from forcegp.report.data import Score
 
 MODEL, FIT, SCORE = "model", "fit.json", "score.json"
 
@@ -29,7 +29,7 @@ NETWORKS = {"nn-30-20": (30, 20), "nn-200x4": (200, 200, 200, 200)}
 
 
 class FitRecord(Header):
-    """How a fit went; times in seconds, memory in byte."""
+    """How a fit went; time in seconds, memory in bytes."""
 
     FORMAT: ClassVar[str] = "forcegp-fit"
     VERSION: ClassVar[int] = 1
@@ -72,7 +72,7 @@ class Fit:
 
 
 def noise_std_of(task: Task) -> float:
-    """The noise on the accelerations that models are told [rad/s²]."""
+    """The noise on the accelerations that models are given [rad/s²]."""
     noise = task.data.header.noise_std
     assert noise is not None
     return noise
@@ -81,15 +81,15 @@ def noise_std_of(task: Task) -> float:
 def fit_model(
     stages: Stages, task: Task, name: str, split: str, points: int, before: Fit | None = None
 ) -> Fit:
-    """Fit a model on the first training points of a split, or take up what was done before.
+    """Fit a model to the first training points of a split, or use the result of an earlier run.
 
     Args:
-        stages: where it is kept.
+        stages: where results are kept.
         task: the simulated run.
         name: of the model.
         split: where the training points come from.
         points: how many.
-        before: the same model on fewer points, at whose hyperparameters a structured GP begins.
+        before: the same model on fewer points, whose hyperparameters a structured GP starts from.
     """
     begins = [] if before is None else [before.stage]
     stage = stages.run(
@@ -113,17 +113,9 @@ def _fit(
     else:
         result = model.fit(data, progress=progress)
     model.save(folder / MODEL)
-    memory = peak_memory() if resettable else None
-    record = FitRecord(
-        seconds=result.seconds,
-        evaluations=result.evaluations,
-        converged=result.converged,
-        objective=result.objective,
-        log_marginal_likelihood=result.log_marginal_likelihood,
-        jitter=result.jitter,
-        message=result.message,
-        peak_memory=memory,
-    )
+    names = FitRecord.model_fields.keys() - {"peak_memory"}
+    taken = {name: getattr(result, name) for name in names}
+    record = FitRecord(**taken, peak_memory=peak_memory() if resettable else None)
     write_text(folder / FIT, record.to_json())
 
 
@@ -135,7 +127,7 @@ def make_model(name: str, task: Task) -> Model:
 
 
 def fit_progress(advance: Advance) -> Callable[[int, int, float], None]:
-    """A fit's progress on a bar, with the objective beside it."""
+    """Shows a fit's progress on a bar, with the objective beside it."""
 
     def progress(evaluations: int, most: int, objective: float) -> None:
         advance(evaluations, most, f"objective {objective:.6g}")
@@ -144,7 +136,7 @@ def fit_progress(advance: Advance) -> Callable[[int, int, float], None]:
 
 
 def score_fit(stages: Stages, profile: Profile, fit: Fit) -> Score:
-    """The score of a fit on test samples of its split, or what was found before."""
+    """The score of a fit on test samples of its split, or that of an earlier run."""
     stage = stages.run(
         f"score/seed-{fit.task.seed}/{fit.split}/{fit.name}-{fit.points}",
         lambda folder, _: _score(profile, fit, folder),
@@ -157,17 +149,13 @@ def score_fit(stages: Stages, profile: Profile, fit: Fit) -> Score:
 def _score(profile: Profile, fit: Fit, folder: Path) -> None:
     model, test = fit.load(), fit.task.test(fit.split, profile.test_samples)
     found, record = evaluate(model, test), fit.record()
+    measured = ("noisy_mae", "clean_mae", "coverage_noisy", "coverage_clean", "nlpd", "residual")
     score = Score(
         model=fit.name,
         points=fit.points,
         split=fit.split,
         seed=fit.task.seed,
-        noisy_mae=found.noisy_mae,
-        clean_mae=found.clean_mae,
-        coverage_noisy=found.coverage_noisy,
-        coverage_clean=found.coverage_clean,
-        nlpd=found.nlpd,
-        residual=found.residual,
+        **{name: getattr(found, name) for name in measured},
         test_samples=found.samples,
         fit_seconds=record.seconds,
         predict_seconds=found.seconds_per_state * found.samples,

@@ -1,4 +1,4 @@
-"""How much is computed: a few minutes, or the sizes of the paper."""
+"""Sizes of a reproduction: a few minutes, or those of the paper."""
 
 from __future__ import annotations
 
@@ -16,19 +16,21 @@ class Profile:
         duration: simulated motion [s].
         seeds: number of simulated runs, each with its own split.
         sizes: training points of the GP models.
-        paper_kernels_up_to: largest size at which the structured GPs have the paper's kernel alone, too.
+        paper_kernels_up_to: largest size at which the paper's kernel alone is fitted too.
         main: training points of the GP models in the figures over time.
         baseline_points: training points of the analytical model and the neural networks.
         networks: which networks are trained.
         paper_split_seeds: simulated runs that are scored on the paper's split too.
+        paper_split_baselines: whether analytical model and networks are scored on the paper's split too.
         stretch: duration of a held-out stretch, and of the window of figures 4 and 5 [s].
-        test_samples: at most so many test samples are predicted for the scores.
-        multiplier_seconds: length of the multiplier figure [s].
+        test_samples: maximum number of test samples that are predicted for the scores.
+        multiplier_seconds: length of figure 2 [s].
         identification_points: training points of the identification.
         identification_evaluations: iterations of the identification.
         rollout_seconds: length of the trajectories that are predicted in open loop [s].
         rollout_starts: states of a further simulated run that they start from.
         rollout_samples: function samples of their bands.
+        calibration_starts: trajectories on which the bands are calibrated.
     """
 
     name: str
@@ -40,6 +42,7 @@ class Profile:
     baseline_points: int
     networks: tuple[str, ...]
     paper_split_seeds: int = 1
+    paper_split_baselines: bool = True
     stretch: float = 3.0
     test_samples: int = 2000
     multiplier_seconds: float = 10.0
@@ -48,6 +51,7 @@ class Profile:
     rollout_seconds: float = 10.0
     rollout_starts: int = 16
     rollout_samples: int = 100
+    calibration_starts: int = 32
 
 
 PROFILES = {
@@ -60,10 +64,12 @@ PROFILES = {
         200,
         5000,
         ("nn",),
+        paper_split_baselines=False,
         identification_points=100,
         rollout_seconds=2.0,
         rollout_starts=8,
         rollout_samples=20,
+        calibration_starts=8,
     ),
     "paper": Profile(
         "paper",

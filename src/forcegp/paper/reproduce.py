@@ -1,4 +1,4 @@
-"""The main job: simulate, select, train all models, evaluate, draw, and write a page."""
+"""The main job: simulate, select, fit all models, evaluate them, and write a page."""
 
 from __future__ import annotations
 
@@ -13,28 +13,27 @@ import torch
 from forcegp.files import write_text
 from forcegp.paper.figures import all_figures
 from forcegp.paper.fits import Fit, fit_model, noise_std_of, score_fit
+from forcegp.paper.page import render_markdown, render_page
 from forcegp.paper.profiles import Profile, profile_of
+from forcegp.paper.results import GP_MODELS, PAPER_KERNELS, SPLITS, Results, Score
 from forcegp.paper.stages import Progress, Stages, silent
 from forcegp.paper.task import Task, make_task
-from forcegp.report.data import GP_MODELS, PAPER_KERNELS, SPLITS, Results, Score
-from forcegp.report.markdown import results_markdown
-from forcegp.report.page import write_page
 
 PAGE, RESULTS, MARKDOWN = "report.html", "results.json", "results.md"
 LARGE = 400
-"""Fits of structured GPs to so many points or more are where those to yet more points begin."""
+"""From this many points on, the fit to the next size starts from the hyperparameters of the last."""
 PACKAGES = ("forcegp", "torch", "numpy", "scipy", "pybullet", "mujoco", "matplotlib")
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """What a reproduction left.
+    """The outcome of a reproduction.
 
     Attributes:
         page: the page to open.
         results: its numbers.
-        reused: stages that were found done.
-        stages: in all.
+        reused: number of stages taken from an earlier run.
+        stages: number of all stages.
     """
 
     page: Path
@@ -43,8 +42,8 @@ class Reproduction:
     stages: int
 
     def summary(self) -> dict[str, object]:
-        """The main figures, by name, the page last."""
-        figures: dict[str, object] = {
+        """The main numbers by name, the page last."""
+        numbers: dict[str, object] = {
             "profile": self.results.profile,
             "stages": f"{self.stages} ({self.reused} done before)",
             "computing_time_s": round(self.results.seconds, 1),
@@ -52,8 +51,8 @@ class Reproduction:
         held = [s for s in self.results.scores if s.split == "stretches"]
         for name in dict.fromkeys(s.model for s in held):
             last = max((s for s in held if s.model == name), key=lambda s: s.points)
-            figures[f"{name}_noisy_error_rad_s2"] = round(last.noisy_mae, 4)
-        return figures | {"report": str(self.page)}
+            numbers[f"{name}_noisy_error_rad_s2"] = round(last.noisy_mae, 4)
+        return numbers | {"report": str(self.page)}
 
 
 def run(
@@ -64,17 +63,17 @@ def run(
     progress: Progress = silent,
     say: Callable[[str], None] = lambda _: None,
 ) -> Reproduction:
-    """Reproduce the paper's experiments; what is done in `out` and unchanged is not run again.
+    """Reproduce the paper's experiments; finished stages in `out` that have not changed are not run again.
 
     Args:
-        profile: `"quick"`, `"paper"`, or sizes of one's own.
+        profile: `"quick"`, `"paper"`, or your own sizes.
         out: folder for the page and everything it is made from.
         seed: of the first simulated run; the others follow.
         progress: opens a progress bar with a description and a total.
-        say: called with one line on every stage that ends.
+        say: called with one line for every stage that ends.
 
     Returns:
-        Where the page is, and its numbers.
+        The path of the page, and its numbers.
 
     Raises:
         UnknownNameError: no such profile.
@@ -91,23 +90,23 @@ def run(
     figures = all_figures(stages, sizes, tasks, fits)
     results = _results(sizes, tasks, scores, stages)
     write_text(root / RESULTS, results.to_json())
-    readings = figures.multiplier, figures.identification, figures.rollouts
-    write_text(root / MARKDOWN, results_markdown(results, *readings))
-    write_page(root / PAGE, results, figures)
+    write_text(root / MARKDOWN, render_markdown(results, figures))
+    write_text(root / PAGE, render_page(results, figures))
     done = stages.done.values()
     return Reproduction(root / PAGE, results, sum(stage.reused for stage in done), len(done))
 
 
 def _fits(stages: Stages, sizes: Profile, task: Task, splits: list[str]) -> list[Fit]:
-    """Every model on some splits: baselines at one size, GP models at all sizes, smaller ones first."""
+    """Every model on the given splits: baselines at one size, GP models at all sizes, smaller ones first."""
     fits = []
     for split in splits:
-        for name in ("analytical", *sizes.networks):
+        baselines = split == "stretches" or sizes.paper_split_baselines
+        for name in ("analytical", *sizes.networks) if baselines else ():
             fits.append(fit_model(stages, task, name, split, sizes.baseline_points))
         large: dict[str, Fit] = {}
         for points in sizes.sizes:
-            models = (*GP_MODELS, *PAPER_KERNELS) if points <= sizes.paper_kernels_up_to else GP_MODELS
-            for name in models:
+            papers = PAPER_KERNELS.values() if points <= sizes.paper_kernels_up_to else ()
+            for name in (*GP_MODELS, *papers):
                 fit = fit_model(stages, task, name, split, points, large.get(name))
                 fits.append(fit)
                 if points >= LARGE:
@@ -125,7 +124,7 @@ def _results(sizes: Profile, tasks: list[Task], scores: list[Score], stages: Sta
         versions=_versions(),
         machine=f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads",
         seconds=stages.seconds,
-        simulations={str(task.seed): task.figures for task in tasks},
+        simulations={str(task.seed): task.summary for task in tasks},
         scores=scores,
     )
 

@@ -20,7 +20,7 @@ from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import Observation
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.states import states
+from forcegp.forces.quantities import states
 from forcegp.gp.kernels import Linear
 from forcegp.gp.stationary import SquaredExponential
 from forcegp.models.structured_gp import StructuredGP

@@ -1,8 +1,8 @@
-"""Stages that are run once: each leaves a folder, with the key of what went into it.
+"""Stages that run once: each leaves a folder with the key of everything that went into it.
 
-The key is a hash of the stage's name, format, settings and the keys of its inputs. A folder whose key
-still fits is used as it is; a folder appears whole or not at all, so an interrupted run resumes with the
-first stage that did not end.
+The key is a hash of the stage's name, its settings, the keys of its inputs, and the code: the sources of
+the package and the versions of the libraries that compute. A folder whose key still matches is used as it
+is. A folder appears whole or not at all, so an interrupted run resumes with the first unfinished stage.
 """
 
 from __future__ import annotations
@@ -13,21 +13,27 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from importlib.metadata import version
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, TypeVar, runtime_checkable
 
 from forcegp.errors import DataError, ForceGPError
 from forcegp.files import Header, atomic_directory, write_text
 
-STAGE_FILE = "stage.json"
-FORMAT = 3
-"""Raised where what stages compute changes, in a way that their settings do not show."""
+STAGE_FILE, DATA = "stage.json", "data.json"
+PACKAGE = Path(__file__).parents[1]
+"""Folder of the library."""
+LIBRARIES = ("torch", "numpy", "scipy", "pybullet", "mujoco")
+"""Libraries whose versions go into the keys."""
+PRESENTATION = ("cli/", "report/templates/", "paper/page.py", "paper/templates/")
+"""Sources that only show what stages have computed."""
+H = TypeVar("H", bound=Header)
 
 
 @runtime_checkable
 class Advance(Protocol):
-    """Moves a progress bar; `note` is a word on how it goes, such as the objective."""
+    """Moves a progress bar; `note` is a short remark, such as the objective."""
 
     def __call__(self, done: int, total: int | None = None, note: str = "") -> None: ...
 
@@ -46,7 +52,7 @@ def silent(description: str, total: int) -> AbstractContextManager[Advance]:
 
 
 class StageHeader(Header):
-    """What a stage's folder says about itself.
+    """Header of a stage's folder.
 
     Attributes:
         name: of the stage.
@@ -63,7 +69,7 @@ class StageHeader(Header):
 
 
 class StageError(ForceGPError, RuntimeError):
-    """A stage that did not leave what it should."""
+    """A stage that cannot be run as asked."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +80,7 @@ class Stage:
         folder: where its files are.
         key: of everything that went into it.
         seconds: how long it took when it was run.
-        reused: whether it was found done.
+        reused: whether an earlier result was used.
     """
 
     folder: Path
@@ -93,7 +99,7 @@ class Stages:
     Args:
         root: where the stages' folders go.
         progress: opens a progress bar.
-        say: called with one line on every stage that ends.
+        say: called with one line for every stage that ends.
     """
 
     def __init__(
@@ -116,7 +122,7 @@ class Stages:
         Args:
             name: a path below the root, such as `"fit/seed-0/gp-200"`.
             make: writes the stage's files into the folder it is given, and may report progress.
-            settings: everything but the inputs that decides the result; must be JSON.
+            settings: everything besides inputs and code that decides the result; must be JSON.
             inputs: stages whose files are read.
             total: steps of the progress bar.
 
@@ -136,9 +142,36 @@ class Stages:
             stage = Stage(folder, key, seconds, reused=False)
             self.say(f"{name}: {seconds:.1f} s")
         if self.done.get(name, stage).key != key:
-            raise StageError(f"the stage {name!r} was asked for twice, with different settings")
+            raise StageError(f"the stage {name!r} was requested twice, with different settings")
         self.done[name] = stage
         return stage
+
+    def data(
+        self,
+        name: str,
+        kind: type[H],
+        make: Callable[[Advance], H],
+        *,
+        settings: Mapping[str, object],
+        inputs: Sequence[Stage] = (),
+    ) -> H:
+        """Run a stage that computes one header, unless it is done; see `run`.
+
+        Args:
+            name: a path below the root.
+            kind: class of the header.
+            make: computes it, and may report progress.
+            settings, inputs: as for `run`.
+
+        Returns:
+            The header, read from the stage's folder.
+        """
+
+        def write(folder: Path, advance: Advance) -> None:
+            write_text(folder / DATA, make(advance).to_json())
+
+        path = self.run(name, write, settings=settings, inputs=inputs) / DATA
+        return kind.from_json(path.read_bytes(), str(path), DataError)
 
     @property
     def seconds(self) -> float:
@@ -149,14 +182,41 @@ class Stages:
 def stage_key(name: str, settings: Mapping[str, object], inputs: Sequence[Stage]) -> str:
     """Hash of everything that decides the result of a stage."""
     parts = {
-        "format": FORMAT,
-        "release": version("forcegp"),
+        "code": code_digest(PACKAGE),
+        "libraries": {library: _version(library) for library in LIBRARIES},
         "name": name,
         "settings": settings,
         "inputs": [stage.key for stage in inputs],
     }
     text = json.dumps(parts, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+@cache
+def code_digest(package: Path) -> str:
+    """Hash of the sources and data files below a folder, without those that only present results.
+
+    Args:
+        package: folder of a package.
+
+    Returns:
+        Hexadecimal SHA-256 over the relative paths and contents.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*")):
+        name = path.relative_to(package).as_posix()
+        if "__pycache__" in name or name.startswith(PRESENTATION) or not path.is_file():
+            continue
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        digest.update(f"{name}\0{content}\n".encode())
+    return digest.hexdigest()
+
+
+def _version(library: str) -> str | None:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return None
 
 
 def _found(folder: Path, key: str) -> Stage | None:

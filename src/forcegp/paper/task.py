@@ -1,10 +1,9 @@
-"""The task of the paper: simulate the arm as it slides over the table, and choose training points."""
+"""The task of the paper: simulate the arm sliding over the table, and choose training points."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -22,7 +21,7 @@ from forcegp.scene import Scene, load_scene
 from forcegp.simulate import SimulationConfig, check_engine, make_engine, simulate
 
 SCENE = "kuka_plane"
-LOG, MOTION, FIGURES, ROWS = "run.parquet", "motion.safetensors", "figures.json", "rows.json"
+LOG, MOTION, SUMMARY, ROWS = "run.parquet", "motion.safetensors", "summary.json", "rows.json"
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class Task:
         system: robot and contacts.
         data: the log.
         motion: planned and executed motion of the tool, constraint error, by name.
-        figures: on the simulated run, by name.
+        summary: numbers on the simulated run, by name.
         splits: by name, see `SPLITS`.
         simulated, selected: the stages that made it.
     """
@@ -43,7 +42,7 @@ class Task:
     system: ConstrainedSystem
     data: Dataset
     motion: dict[str, Tensor]
-    figures: dict[str, float | int | str]
+    summary: dict[str, float | int | str]
     splits: dict[str, Split]
     simulated: Stage
     selected: Stage
@@ -55,7 +54,7 @@ class Task:
     def test(self, split: str, most: int) -> Dataset:
         """At most `most` test samples of a split, spread evenly over all of them.
 
-        They do not say which robot was logged, as models with learned figures are tried on them.
+        The header does not name the logged robot, as models with learned parameters are tested on them.
         """
         rows = self.splits[split].test
         if len(rows) > most:
@@ -80,7 +79,7 @@ class RowsFile(Header):
 
 
 def make_task(stages: Stages, profile: Profile, seed: int) -> Task:
-    """Simulate and select, or take up what was done before."""
+    """Simulate and select, or use the results of an earlier run."""
     scene = load_scene(SCENE)
     system = scene.system()
     config = dataclasses.replace(scene.simulation, duration=profile.duration, seed=seed)
@@ -104,7 +103,7 @@ def make_task(stages: Stages, profile: Profile, seed: int) -> Task:
         system=system,
         data=data,
         motion=load_file(str(simulated / MOTION)),
-        figures=json.loads((simulated / FIGURES).read_text(encoding="utf-8")),
+        summary=json.loads((simulated / SUMMARY).read_text(encoding="utf-8")),
         splits=_read_splits(selected / ROWS),
         simulated=simulated,
         selected=selected,
@@ -140,11 +139,8 @@ def _simulate(system: ConstrainedSystem, config: SimulationConfig, folder: Path,
         check = check_engine(system, engine, torch.Generator().manual_seed(config.seed))
     finally:
         engine.close()
-    write_json(folder / FIGURES, _plain(result.summary()) | _plain(dataclasses.asdict(check), "check_"))
-
-
-def _plain(figures: Mapping[str, object], prefix: str = "") -> dict[str, object]:
-    return {prefix + name: value for name, value in figures.items()}
+    checked = {f"check_{name}": value for name, value in dataclasses.asdict(check).items()}
+    write_json(folder / SUMMARY, dict(result.summary()) | checked)
 
 
 def _select(data: Dataset, most: int, stretch: float, seed: int, folder: Path, advance: Advance) -> None:

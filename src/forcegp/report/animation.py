@@ -1,4 +1,4 @@
-"""The arm in motion: an animation that a person can watch in a page, drawn by a script of its own."""
+"""The arm in motion: an animation in the page, drawn by its own script."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from forcegp.report.style import DASHES, INK, colour, label
 
 
 def animation(data: RolloutData) -> Markup:
-    """The arm in motion: a canvas with a slider, a play button and a box to tick for each model."""
+    """The arm in motion: a canvas with a slider, a play button and a checkbox for each model."""
     films = [
         {
             "label": "simulated" if film.label == "logged" else label(film.label),
@@ -25,7 +25,7 @@ def animation(data: RolloutData) -> Markup:
         for film in data.films
     ]
     content = {"times": data.frame_times, "bodies": data.bodies, "films": films}
-    # "</" would end the script element, whatever it stands in.
+    # "</" would end the script element, even inside a string.
     text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
     return Markup(
         '<figure class="animation"><canvas width="920" height="560" role="img" '
@@ -37,7 +37,7 @@ def animation(data: RolloutData) -> Markup:
 
 
 def animation_source() -> str:
-    """The animation's script as a page's content security policy names it: by its hash."""
+    """Hash of the animation's script for a content security policy."""
     digest = hashlib.sha256(_script().encode()).digest()
     return "sha256-" + base64.b64encode(digest).decode()
 

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from forcegp.files import write_text
-from forcegp.report.data import WindowData
-from forcegp.report.html import FigureBlock, render
-from forcegp.report.predictions import draw_errors, draw_predictions
-from forcegp.report.tables import Table
+from forcegp.report.html import Block, render
+from forcegp.report.tables import Table, cell
+from forcegp.report.window import WindowData, draw_errors, draw_predictions
 
 PAGE, WINDOW = "evaluation.html", "window.json"
 FIGURES = ("predictions.svg", "errors.svg")
@@ -31,7 +30,7 @@ def write_evaluation(folder: Path, title: str, scores: Mapping[str, object], win
     for name, picture in zip(FIGURES, pictures, strict=True):
         write_text(folder / name, picture.svg)
     write_text(folder / WINDOW, window.to_json())
-    block = FigureBlock(
+    block = Block(
         "Predictions and errors",
         "Left: accelerations by joint, measured in black, predicted in colour, with the band of two standard "
         "deviations where the model gives one. Right: the same less the prediction; where the data hold the "
@@ -39,11 +38,7 @@ def write_evaluation(folder: Path, title: str, scores: Mapping[str, object], win
         pictures,
         WINDOW,
     )
-    rows = tuple((name.replace("_", " "), _text(value)) for name, value in scores.items())
+    rows = tuple((name.replace("_", " "), cell(value)) for name, value in scores.items())
     table = Table("Scores on this data set", ("score", "value"), rows)
     write_text(folder / PAGE, render("evaluation.html.j2", title=title, table=table, blocks=(block,)))
     return folder / PAGE
-
-
-def _text(value: object) -> str:
-    return "–" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""Pages as single HTML files: templates, style and figures in one, nothing to be fetched."""
+"""Pages as single HTML files: templates, style and plots in one file that fetches nothing."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from forcegp.report.style import Picture
 
 
 @dataclass(frozen=True)
-class FigureBlock:
+class Block:
     """Pictures under one heading and caption.
 
     Attributes:
-        heading: what it is, with the paper's figure number where it has one.
-        caption: what is seen.
+        heading: the title, with the paper's figure number if it has one.
+        caption: what the pictures show.
         pictures: the panels.
         source: file with the data.
     """
@@ -26,10 +26,32 @@ class FigureBlock:
     source: str
 
 
-def render(template: str, **values: object) -> str:
-    """A template of this package with its values; a value that is missing is an error."""
+@dataclass(frozen=True)
+class Finding:
+    """A sentence computed from results.
+
+    Attributes:
+        topic: a few words.
+        agrees: whether the claim is confirmed; `None` if none is made.
+        text: the sentence, with its numbers.
+    """
+
+    topic: str
+    agrees: bool | None
+    text: str
+
+
+def render(template: str, package: str = "forcegp.report", **values: object) -> str:
+    """Fill in a template; a missing value is an error.
+
+    Args:
+        template: file name under `templates/` of the package, or of this one.
+        package: where to look first.
+        values: what the template refers to.
+    """
+    packages = dict.fromkeys((package, "forcegp.report"))
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("forcegp.report"),
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in packages]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

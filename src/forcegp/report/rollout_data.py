@@ -1,4 +1,4 @@
-"""The data of the section on trajectories: what its figures, table and animation are drawn from."""
+"""Data of the section on trajectories: what its plots, table and animation are drawn from."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 
 from forcegp import kinematics
 from forcegp.files import Header
-from forcegp.report.data import Part, Series, series
+from forcegp.report.values import Part, Series, series
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.rollout.comparison import HORIZONS, LEVEL, Comparison
 
 FRAMES_PER_SECOND = 20
-"""Of the animation; one and a half times as smooth as a hand-drawn film, at half its size."""
+"""Frame rate of the animation."""
 
 
 class Band(Part):
@@ -38,15 +38,15 @@ class ModelPath(Part):
         tip_bands: of x, y and z over samples; empty without samples.
         tip_error: distance from the logged tip, median over the starts [m].
         drift: constraint error c(q) [m]; empty without contacts.
-        multiplier: λ [N]; empty where the model knows no forces.
+        multiplier: λ [N]; empty for models without forces.
         multiplier_band: over samples.
         lost: probability that contact was lost by then, over samples; empty without samples.
-        errors: tip error after each horizon, median over the starts [m]; `None` where over half diverged.
+        errors: tip error after each horizon, median over the starts [m]; `None` if over half diverged.
         coverage: share of logged tip coordinates within the band; `None` without samples.
-        inflation: factor on the band that holds the right share of another motion, where one was tried.
-        calibrated_coverage: share within the band that is longer by that factor.
+        inflation: factor on the band, calibrated on another motion; `None` without one.
+        calibrated_coverage: coverage of the band widened by that factor.
         worst_drift: largest constraint error of mean and samples over all starts [m].
-        diverged_at: when the first trajectory was given up [s].
+        diverged_at: time of the first divergence [s].
     """
 
     model: str
@@ -83,16 +83,15 @@ class RolloutData(Header):
     Attributes:
         t: time since the start [s].
         tip: logged x, y and z of the tip [m].
-        multiplier: logged λ of the first contact [N]; empty where it is not logged.
-        starts: number of starts that medians are over.
-        band_starts: number of starts that coverages are over.
-        band_seconds: time that they, and the bands, are over [s].
-        level: part of the samples that bands hold.
+        multiplier: logged λ of the first contact [N]; empty if it is not logged.
+        starts: number of starts of the medians.
+        band_starts, band_seconds: number of starts and duration of the bands and their coverage.
+        level: nominal coverage of the bands.
         horizons: times of `ModelPath.errors` [s].
-        models: one a model.
+        models: one per model.
         frame_times: of the animation [s].
         bodies: number of points of the arm in each frame.
-        films: the logged motion and one a model.
+        films: the logged motion and one per model.
     """
 
     FORMAT: ClassVar[str] = "forcegp-rollout"
@@ -118,7 +117,7 @@ def rollout_data(found: Comparison, calibration: Comparison | None = None) -> Ro
 
     Args:
         found: the comparison.
-        calibration: one of the same models with another motion, which bands are made longer to hold.
+        calibration: the same models on another motion, on which the bands are calibrated.
     """
     horizons = [h for h in HORIZONS if h <= float(found.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(found.t[1] - found.t[0]))))
@@ -146,13 +145,13 @@ def rollout_data(found: Comparison, calibration: Comparison | None = None) -> Ro
 
 
 def with_bands(paths: RolloutData, bands: RolloutData) -> RolloutData:
-    """Trajectories of mean functions, with what function samples say of the same models and first start.
+    """Trajectories of mean functions with the bands of another, cheaper comparison of the same models.
 
-    Bands cost as many trajectories as there are samples, so that they may be of fewer starts and less time.
+    Bands cost one trajectory per sample, so they may cover fewer starts and a shorter time.
 
     Args:
         paths: tip errors, drift and multiplier over the whole time.
-        bands: of those of the models that have function samples.
+        bands: of the models that have function samples, from the same first start.
     """
     sampled = {band.model: band for band in bands.models}
     models = [_with_bands(p, sampled[p.model]) if p.model in sampled else p for p in paths.models]

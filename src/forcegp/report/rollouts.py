@@ -1,4 +1,4 @@
-"""Trajectories beside the logged one: figures, table, and an animation that a person can watch."""
+"""Predicted trajectories beside the logged one: plots, table and animation."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 
 from forcegp.files import write_text
 from forcegp.report.animation import animation, animation_source
-from forcegp.report.data import Series
-from forcegp.report.html import FigureBlock, render
+from forcegp.report.html import Block, render
 from forcegp.report.rollout_data import Band, ModelPath, RolloutData
 from forcegp.report.style import INK, Picture, colour, draw, label, line
-from forcegp.report.tables import Table
+from forcegp.report.tables import NONE, Table
+from forcegp.report.values import Series
 
 WIDTH = 4.6
 PAGE, DATA = "rollout.html", "rollout.json"
@@ -44,39 +44,32 @@ def draw_tip(data: RolloutData) -> Picture:
 
 def draw_tip_error(data: RolloutData) -> Picture:
     """Distance between predicted and logged tip over time, on a logarithmic scale."""
-
-    def paint(figure: Figure) -> None:
-        axes = figure.subplots()
-        for path in data.models:
-            _curve(axes, data, path, _logarithmic(path.tip_error, 1e-9))
-        axes.set_yscale("log")
-        axes.set_xlabel("time [s]")
-        axes.set_ylabel("tip error [m]")
-        axes.margins(x=0.0)
-        figure.legend(loc="outside upper center", ncols=2)
-
-    alt = f"Tip error over time, median over {data.starts} starts, on a logarithmic scale, one curve a model."
-    return draw(paint, (WIDTH, 3.0), alt, "Tip error over time")
+    curves = [(path, _logarithmic(path.tip_error, 1e-9)) for path in data.models]
+    alt = f"Tip error over time, median over {data.starts} starts, logarithmic scale, one curve per model."
+    return _draw_logarithmic(data, curves, "tip error [m]", alt, "Tip error over time")
 
 
 def draw_drift(data: RolloutData) -> Picture:
     """Constraint error of the predicted trajectories."""
-    shown = [path for path in data.models if path.drift]
+    curves = [(path, _logarithmic(path.drift, 1e-16)) for path in data.models if path.drift]
+    alt = "Distance of the predicted tip from the surface over time, logarithmic scale, one curve per model."
+    return _draw_logarithmic(data, curves, "|c(q)| [m]", alt, "Drift off the surface")
 
+
+def _draw_logarithmic(
+    data: RolloutData, curves: list[tuple[ModelPath, Series]], name: str, alt: str, title: str
+) -> Picture:
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
-        for path in shown:
-            _curve(axes, data, path, _logarithmic(path.drift, 1e-16))
+        for path, values in curves:
+            _curve(axes, data, path, values)
         axes.set_yscale("log")
         axes.set_xlabel("time [s]")
-        axes.set_ylabel("|c(q)| [m]")
+        axes.set_ylabel(name)
         axes.margins(x=0.0)
         figure.legend(loc="outside upper center", ncols=2)
 
-    alt = (
-        "Distance of the predicted tip from the surface over time, on a logarithmic scale, one curve a model."
-    )
-    return draw(paint, (WIDTH, 2.6), alt, "Drift off the surface")
+    return draw(paint, (WIDTH, 3.0), alt, title)
 
 
 def draw_contact_force(data: RolloutData) -> Picture:
@@ -115,12 +108,12 @@ def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band:
 
 
 def _logarithmic(values: Series, least: float) -> Series:
-    """Sizes for a logarithmic scale; the first is of the logged state that the prediction starts from."""
+    """Magnitudes for a logarithmic scale; the first, at the logged start, is zero and left out."""
     return [math.nan, *(max(abs(value), least) for value in values[1:])]
 
 
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
-    """All figures of the section that the data hold something for."""
+    """The plots of the section for which there are data."""
     pictures = [draw_tip(data), draw_tip_error(data)]
     if any(path.drift for path in data.models):
         pictures.append(draw_drift(data))
@@ -131,29 +124,24 @@ def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
 
 def rollout_table(data: RolloutData) -> Table:
     """Tip errors at the horizons, coverage of the bands and largest drift."""
-    heads = (
-        "model",
-        *(f"after {h:g} s [mm]" for h in data.horizons),
-        "in band",
-        "widened",
-        "largest |c(q)| [m]",
-    )
+    after = (f"after {h:g} s [mm]" for h in data.horizons)
+    head = ("model", *after, "in band", "in widened band", "largest |c(q)| [m]")
     rows = []
     for path in data.models:
         errors = ["diverged" if e is None else f"{1e3 * e:.3g}" for e in path.errors]
-        coverage = "–" if path.coverage is None else f"{path.coverage:.3f}"
+        coverage = NONE if path.coverage is None else f"{path.coverage:.3f}"
         calibrated = path.calibrated_coverage
-        widened = "–" if calibrated is None else f"{calibrated:.3f} (× {path.inflation:.2f})"
-        drift = "–" if path.worst_drift is None else f"{path.worst_drift:.1e}"
+        widened = NONE if calibrated is None else f"{calibrated:.3f} (× {path.inflation:.2f})"
+        drift = NONE if path.worst_drift is None else f"{path.worst_drift:.1e}"
         rows.append((label(path.model), *errors, coverage, widened, drift))
     caption = f"Tip error in open loop (median over {data.starts} starts)"
     if any(path.coverage is not None for path in data.models):
         caption += (
-            f"; share of simulated tip positions in the {data.level:.0%} bands over function samples "
-            f"({data.band_starts} starts, {data.band_seconds:.3g} s), and in the bands widened by the factor "
-            "that held-out stretches of the training run ask for"
+            f"; share of simulated tip positions inside the {data.level:.0%} bands over function samples "
+            f"({data.band_starts} starts, {data.band_seconds:.3g} s), and inside the bands widened by the "
+            "factor calibrated on held-out stretches of the training run"
         )
-    return Table(caption, heads, tuple(rows))
+    return Table(caption, head, tuple(rows))
 
 
 @dataclass(frozen=True)
@@ -161,13 +149,13 @@ class RolloutSection:
     """The section on trajectories, of any page.
 
     Attributes:
-        block: the figures under their caption.
+        block: the plots under their caption.
         table: tip errors, coverage and drift.
         animation: the arm in motion.
-        script: the animation's script, as the page's content security policy is to name it.
+        script: hash of the animation's script for the page's content security policy.
     """
 
-    block: FigureBlock
+    block: Block
     table: Table
     animation: Markup
     script: str
@@ -178,17 +166,17 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
     band = f" with the band that holds {data.level:.0%} of the function samples"
     sampled = any(path.tip_bands for path in data.models)
     caption = (
-        f"From a logged state and the logged torques, {data.t[-1]:.3g} s ahead: simulated in black, "
-        f"predicted in colour{band if sampled else ''}. Position and contact force are shown for the first "
-        f"{data.band_seconds:.3g} s. Errors are medians over {data.starts} starts. A curve ends where its "
-        "prediction diverged."
+        f"Open loop from a logged state under the logged torques, {data.t[-1]:.3g} s ahead: simulated in "
+        f"black, predicted in colour{band if sampled else ''}. Position and contact force are shown for the "
+        f"first {data.band_seconds:.3g} s. Errors are medians over {data.starts} starts. A curve ends where "
+        "its prediction diverged."
     )
-    block = FigureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
+    block = Block("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
     return RolloutSection(block, rollout_table(data), animation(data), animation_source())
 
 
 def write_rollouts(folder: Path, title: str, data: RolloutData) -> Path:
-    """Write the page on trajectories, its figures and their data.
+    """Write the page on trajectories, its plots and their data.
 
     Args:
         folder: where the files go.

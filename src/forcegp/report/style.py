@@ -1,4 +1,4 @@
-"""How figures look: colours, names and sizes; and figures as text that a page can hold."""
+"""How plots look: colours, names and sizes; and plots as SVG text for a page."""
 
 from __future__ import annotations
 
@@ -20,11 +20,19 @@ COLOURS = {
     "sgp-mean": "#6a3d9a",
     "sgp-contact": "#007a5e",
 }
-"""One colour a model, told apart by colour-blind readers and on paper."""
+"""One colour per model, distinguishable by colour-blind readers and in print."""
 MARKERS = {"analytical": "x", "nn": "v", "gp": "s", "sgp-zero": "o", "sgp-mean": "D", "sgp-contact": "^"}
 DASHES = {"nn-30-20": (1.0, 1.2), "nn-200x4": (5.0, 1.5, 1.0, 1.5)}
-"""Lengths of dashes and gaps of the networks that share a colour with the first, in line widths."""
-OTHER = "#555555"
+"""Dashes and gaps, in line widths, of the networks that share the first one's colour."""
+KINDS = {
+    "analytical": "Analytical model",
+    "neural_network": "Neural network",
+    "independent_gp": "GP",
+    "structured_gp": "Structured GP",
+}
+"""What the kinds of saved models are called."""
+OTHER = "#0072b2"
+"""Colour of a model without one of its own; not black, as measurements are."""
 INK = "#222222"
 FAINT = "#b8b8b8"
 AXES = ("#0072b2", "#d55e00", "#007a5e")
@@ -43,7 +51,7 @@ LABELS = {
     "sgp-mean-se": "S-GP, analytical mean, paper's kernel",
     "sgp-contact-se": "S-GP, mean and contact prior, paper's kernel",
 }
-"""What a model is called in figures and tables."""
+"""What a model is called in plots and tables."""
 
 SETTINGS: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -76,11 +84,11 @@ SETTINGS: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn figure.
+    """A drawn plot.
 
     Attributes:
         svg: the file's text.
-        alt: what it shows, for those who do not see it.
+        alt: what it shows, for readers who cannot see it.
         title: short heading, such as the model's name.
     """
 
@@ -90,13 +98,13 @@ class Picture:
 
     @property
     def uri(self) -> str:
-        """The figure as an address that needs no file."""
+        """The plot as a data URI."""
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg.encode()).decode()
 
 
 def label(model: str) -> str:
     """What a model is called."""
-    return LABELS.get(model, model)
+    return LABELS.get(model) or KINDS.get(model, model)
 
 
 def colour(model: str) -> str:
@@ -110,12 +118,12 @@ def line(model: str) -> str | tuple[float, tuple[float, ...]]:
 
 
 def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, title: str = "") -> Picture:
-    """A figure as SVG, drawn in the style of this project without touching the settings of others.
+    """Draw a plot as SVG in the style of this project, without changing global settings.
 
     Args:
-        paint: fills the empty figure.
+        paint: fills the empty canvas.
         size: width and height [inch]; a page column is 4.6 wide.
-        alt: what the figure shows.
+        alt: what the plot shows.
         title: short heading.
     """
     buffer = io.StringIO()
@@ -127,6 +135,6 @@ def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, t
 
 
 def shade(axes: Axes, spans: list[tuple[float, float]]) -> None:
-    """Mark spans of time behind the curves."""
+    """Shade spans of time behind the curves."""
     for first, last in spans:
         axes.axvspan(first, last, color="#f1ead2", zorder=0, linewidth=0)

@@ -1,4 +1,4 @@
-"""From a tree of links and joints to the robot model: fixed joints are folded into the links they join."""
+"""From an ordered tree of links and joints to the robot model, with fixed joints folded into the links."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ import numpy as np
 import torch
 
 from forcegp.errors import InertiaError, RobotFileWarning, UnsupportedRobotError
-from forcegp.robot.inertia import inertia_doubt, inertia_error
+from forcegp.robot.check import CheckedTree
 from forcegp.robot.model import BASE, RobotModel
-from forcegp.robot.tree import Inertial, Joint, Site, Tree, joint_motion, ordered_joints
+from forcegp.robot.tree import Inertial, Joint, Site, Tree, joint_motion
 
 FRICTION_VELOCITY = 0.1
-"""Default speed over which Coulomb friction changes sign [rad/s, m/s]; the files have no such figure."""
+"""Default speed over which Coulomb friction changes sign [rad/s, m/s]; robot files do not specify it."""
 SINGULAR = 1e-12
 """Smallest eigenvalue of the scaled mass matrix below which it counts as singular in double precision."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """The world's pose, gravity and tensor options that a robot is built with."""
+    """Pose of the base in the world, gravity, and the type and device of the robot's tensors."""
 
-    base: np.ndarray
+    base_rotation: np.ndarray
+    base_position: np.ndarray
     gravity: np.ndarray
     dtype: torch.dtype
     device: torch.device | str
@@ -31,7 +32,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class _Placed:
-    """Where each link of the file ends up: the joint that moves it, and its pose in that joint's link."""
+    """The moving joints, and for each link of the file the joint that moves it and its pose in that link."""
 
     moving: list[Joint]
     parents: list[int]
@@ -39,18 +40,16 @@ class _Placed:
     links: dict[str, tuple[int, np.ndarray]]
 
 
-def build_robot(tree: Tree, pose: Pose) -> RobotModel:
+def build_robot(checked: CheckedTree, pose: Pose) -> RobotModel:
     """The robot that a tree describes.
 
     Raises:
-        RobotFileError: the tree is no valid robot.
-        UnsupportedRobotError: a joint is not modelled.
-        InertiaError: the inertial figures are not physical.
+        UnsupportedRobotError: the name of a frame is ambiguous.
+        InertiaError: the robot can move without inertia.
     """
-    root, joints = ordered_joints(tree)
-    placed = _place(root, joints)
-    remarks = list(tree.remarks)
-    bodies = _merge(placed, _checked_inertials(tree, placed, remarks))
+    tree, remarks = checked.tree, list(checked.remarks)
+    placed = _place(checked.root, checked.joints)
+    bodies = _merge(tree, placed)
     _check_mass_matrix(tree, placed, bodies)
     frames = _frames(tree, placed, remarks)
     for remark in remarks:
@@ -58,7 +57,7 @@ def build_robot(tree: Tree, pose: Pose) -> RobotModel:
     return _model(tree, placed, bodies, frames, pose, tuple(remarks))
 
 
-def _place(root: str, joints: list[Joint]) -> _Placed:
+def _place(root: str, joints: tuple[Joint, ...]) -> _Placed:
     placed = _Placed([], [], [], {root: (BASE, np.eye(4))})
     for joint in joints:
         index, T = placed.links[joint.parent]
@@ -73,31 +72,14 @@ def _place(root: str, joints: list[Joint]) -> _Placed:
     return placed
 
 
-def _checked_inertials(tree: Tree, placed: _Placed, remarks: list[str]) -> list[tuple[str, Inertial]]:
-    """The links that have inertia, checked; what never moves has no effect and is only remarked on."""
-    inertials = [(link.name, link.inertial) for link in tree.links if link.inertial is not None]
-    for name, body in inertials:
-        reason = inertia_error(body.mass, body.com, body.inertia)
-        fixed = placed.links[name][0] == BASE
-        if reason and not fixed:
-            raise InertiaError(
-                f"{tree.label}: the inertia of link {name!r} is not physical",
-                expected="positive mass and a positive definite inertia",
-                got=reason,
-                hint="correct the <inertial> of this link",
-            )
-        doubt = reason if fixed else inertia_doubt(body.mass, body.inertia)
-        if doubt:
-            remarks.append(f"{tree.label}: the inertia of link {name!r} is not physical: {doubt}")
-    return [(name, body) for name, body in inertials if placed.links[name][0] != BASE]
-
-
-def _merge(placed: _Placed, inertials: list[tuple[str, Inertial]]) -> list[Inertial]:
-    """Mass, centre of mass and inertia of each moving link with all that is fixed to it."""
+def _merge(tree: Tree, placed: _Placed) -> list[Inertial]:
+    """Mass, centre of mass and inertia of each moving link, including the links fixed to it."""
     parts: list[list[Inertial]] = [[] for _ in placed.moving]
-    for name, body in inertials:
-        index, T = placed.links[name]
-        R = T[:3, :3]
+    for link in tree.links:
+        index, T = placed.links[link.name]
+        if link.inertial is None or index == BASE:
+            continue
+        body, R = link.inertial, T[:3, :3]
         parts[index].append(Inertial(body.mass, R @ body.com + T[:3, 3], R @ body.inertia @ R.T))
     return [_sum(bodies) for bodies in parts]
 
@@ -115,7 +97,7 @@ def _sum(bodies: list[Inertial]) -> Inertial:
 
 
 def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
-    """Refuse a robot that can move without kinetic energy, judged at a configuration without symmetry."""
+    """Refuse a robot that can move without kinetic energy, tested at a generic configuration."""
     M = _mass_matrix(placed, bodies) + np.diag([joint.armature for joint in placed.moving])
     scale = np.sqrt(np.diag(M))
     if scale.min() > 0.0:
@@ -129,7 +111,7 @@ def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> N
     raise InertiaError(
         f"{tree.label}: link {joint.child!r} of joint {joint.name!r} moves without inertia",
         expected="mass beyond every moving joint, so that the mass matrix is positive definite",
-        got=f"link mass {mass:g} kg, and nothing beyond it that resists the motion",
+        got=f"link mass {mass:g} kg, and no link beyond it that resists the motion",
         hint="give the link an <inertial>, or lock the joint with locked_joints",
     )
 
@@ -170,13 +152,13 @@ def _frames(tree: Tree, placed: _Placed, remarks: list[str]) -> list[tuple[str, 
 
 
 def _free_name(tree: Tree, site: Site, taken: set[str], remarks: list[str]) -> str:
-    """MJCF lets a site and a body share a name; a frame name has to be unique."""
+    """A unique frame name: in MJCF, a site and a body may share a name."""
     if site.name not in taken:
         return site.name
     name = f"site/{site.name}"
     if name in taken:
         raise UnsupportedRobotError(
-            f"{tree.label}: site {site.name!r} shares its name with a body", expected="names that differ"
+            f"{tree.label}: site {site.name!r} shares its name with a body", expected="different names"
         )
     remarks.append(f"{tree.label}: site {site.name!r} shares its name with a body; its frame is {name!r}")
     return name
@@ -221,8 +203,8 @@ def _model(
         frame_parents=tuple(index for _, index, _ in frames),
         frame_rotation=tensor(poses[:, :3, :3]),
         frame_position=tensor(poses[:, :3, 3]),
-        base_rotation=tensor(pose.base[:3, :3]),
-        base_position=tensor(pose.base[:3, 3]),
+        base_rotation=tensor(pose.base_rotation),
+        base_position=tensor(pose.base_position),
         gravity=tensor(pose.gravity),
         remarks=remarks,
     )

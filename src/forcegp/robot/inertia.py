@@ -1,15 +1,14 @@
-"""Inertial parameters of a rigid body: what is physical, and coordinates that are always physical.
+"""Inertial parameters of a rigid body in coordinates that are always physical.
 
 A body has the ten parameters π = (m, m c, I_o), with I_o about the link origin. They belong to a
-distribution of mass exactly when the pseudo-inertia J = [[Σ, m c], [m cᵀ, m]], Σ = ½ tr(I_o) 1 − I_o, is
+mass distribution if and only if the pseudo-inertia J = [[Σ, m c], [m cᵀ, m]], Σ = ½ tr(I_o) 1 − I_o, is
 positive definite (Wensing, Kim, Slotine, RA-L 2018). The log-Cholesky coordinates θ of
-Rucker and Wensing, *Smooth parameterization of rigid-body inertia* (RA-L 2022), reach all such J and
-no others.
+Rucker and Wensing, *Smooth parameterization of rigid-body inertia* (RA-L 2022), parametrise exactly
+these J.
 """
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,33 +18,6 @@ from forcegp.types import Rotation, Scalars, Vector3
 
 PseudoInertia = Float[Tensor, "*batch 4 4"]
 InertialParameters = Float[Tensor, "*batch 10"]
-ROUNDING = 1e-6
-"""Share of the largest principal moment that figures printed with a few digits may be off by."""
-
-
-def inertia_error(mass: float, com: np.ndarray, inertia: np.ndarray) -> str:
-    """Why no rigid body can have these figures, or "" if one can (up to `inertia_doubt`)."""
-    if not (np.isfinite(mass) and np.isfinite(com).all() and np.isfinite(inertia).all()):
-        return "a figure is not finite"
-    if mass < 0.0:
-        return f"the mass {mass:g} kg is negative"
-    moments = np.linalg.eigvalsh(inertia)
-    if moments[0] < -ROUNDING * max(abs(moments[2]), 1e-12):
-        return f"the inertia is not positive definite: a principal moment is {moments[0]:.6g} kg m²"
-    return ""
-
-
-def inertia_doubt(mass: float, inertia: np.ndarray) -> str:
-    """What no exact body has but rounded or invented figures of published files do, or ""."""
-    low, mid, high = np.linalg.eigvalsh(inertia)
-    if mass == 0.0 and high > 0.0:
-        return f"it has a rotational inertia of {high:.4g} kg m² but no mass"
-    if high > (low + mid) * (1.0 + ROUNDING) + 1e-15:
-        return (
-            "its principal moments violate the triangle inequality "
-            f"({low:.6g} + {mid:.6g} < {high:.6g} kg m²), which no distribution of mass does"
-        )
-    return ""
 
 
 def pseudo_inertia(mass: Scalars, com: Vector3, inertia: Rotation) -> PseudoInertia:
@@ -84,7 +56,7 @@ def from_log_cholesky(theta: InertialParameters) -> PseudoInertia:
         theta: `(*batch, 10)` = (α, d1, d2, d3, s12, s23, s13, t1, t2, t3).
 
     Returns:
-        `(*batch, 4, 4)` positive definite, whatever θ.
+        `(*batch, 4, 4)`, positive definite for every θ.
     """
     alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = theta.unbind(-1)
     zero, one = torch.zeros_like(alpha), torch.ones_like(alpha)

@@ -11,11 +11,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from forcegp.errors import RobotFileError, ShapeError, UnknownNameError
+from forcegp.robot.check import checked
 from forcegp.robot.fold import Pose, build_robot
-from forcegp.robot.mjcf import read_mjcf
 from forcegp.robot.model import RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import Tree, lock_joints, transform
+from forcegp.robot.tree import Tree, lock_joints
 from forcegp.robot.urdf import read_urdf
 
 BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa")
@@ -33,30 +33,41 @@ def load_robot(
 ) -> RobotModel:
     """A robot model from a bundled name, a URDF file or an MJCF file.
 
-    What is doubtful but usable in the file is a `RobotFileWarning` and a sentence in `robot.remarks`.
+    A file that is usable but doubtful gives a `RobotFileWarning`, whose text is also in `robot.remarks`.
 
     Args:
         source: `"kuka_iiwa"`, `"franka_panda"`, `"double_pendulum"`, or the path of a file.
         base_position: position of the root link in the world [m].
         base_rpy: its roll, pitch and yaw about the world's axes [rad].
-        gravity: gravitational acceleration in the world [m/s²]; what an MJCF file says of it is not used.
-        locked_joints: joints to hold at a position [rad, m], as if they were fixed in the file.
+        gravity: gravitational acceleration in the world [m/s²]; that of an MJCF file is ignored.
+        locked_joints: positions [rad, m] of joints to treat as fixed, such as those of a gripper.
         dtype: floating-point type of all constants.
         device: device of all constants.
 
+    Returns:
+        The robot; frozen, so that it can be shared.
+
+    Example:
+        >>> robot = load_robot("kuka_iiwa", gravity=(0.0, 0.0, -9.8))
+        >>> robot.nq, robot.joint_names[0]
+        (7, 'lbr_iiwa_joint_1')
+
     Raises:
         UnknownNameError: no such bundled robot, or no such joint to lock.
-        RobotFileError: the file cannot be read or is no valid robot; the message names link or joint.
-        UnsupportedRobotError: a joint is floating, planar, ball or mimic.
+        RobotFileError: the file cannot be read or is not a valid robot; the message names link or joint.
+        UnsupportedRobotError: a joint is floating, planar, ball or mimic; the hint says how to lock it.
+        MissingDependencyError: the file is MJCF and MuJoCo is not installed.
         InertiaError: the inertia of a link is not physical.
-        ShapeError: base_position, base_rpy or gravity is not three finite numbers.
+        ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.
     """
-    base = transform(
-        Rotation.from_euler("xyz", _vector(base_rpy, "base_rpy")).as_matrix(),
-        _vector(base_position, "base_position"),
+    pose = Pose(
+        base_rotation=Rotation.from_euler("xyz", _vector(base_rpy, "base_rpy")).as_matrix(),
+        base_position=_vector(base_position, "base_position"),
+        gravity=_vector(gravity, "gravity"),
+        dtype=dtype,
+        device=device,
     )
-    pose = Pose(base, _vector(gravity, "gravity"), dtype, device)
-    tree = lock_joints(_read(source), locked_joints or {})
+    tree = checked(lock_joints(_read(source), locked_joints or {}))
     return build_robot(tree, pose)
 
 
@@ -75,6 +86,8 @@ def _read_file(path: Path) -> Tree:
     if root.tag == "robot":
         return read_urdf(root, str(path))
     if root.tag == "mujoco":
+        from forcegp.robot.mjcf import read_mjcf  # loads MuJoCo, which is optional
+
         return read_mjcf(root, path)
     raise RobotFileError(
         f"{path}: neither URDF nor MJCF",

@@ -1,11 +1,13 @@
-"""MJCF files: reduced to the mechanics, compiled by MuJoCo, and read from its compiled model."""
+"""MJCF files: reduced to the mechanics, compiled by MuJoCo, and read from its compiled model.
+
+Imported only when an MJCF file is read, since it needs the optional package `mujoco`.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, tostring
@@ -14,11 +16,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
-from forcegp.robot.mjcf_reduce import reduce_mjcf
+from forcegp.optional import optional_module
+from forcegp.robot.mjcf_reduce import Coupling, reduce_mjcf
 from forcegp.robot.tree import Inertial, Joint, JointKind, Link, Site, Tree, joint_motion, transform
 
-# The compiled parts of MuJoCo carry no types.
-mujoco: Any = import_module("mujoco")
+mujoco = optional_module("mujoco", "Reading MJCF files")
 _KINDS: dict[int, JointKind] = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "revolute",
     int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic",
@@ -35,8 +37,8 @@ def read_mjcf(root: Element, path: Path) -> Tree:
         path: the file, for messages and includes.
 
     Raises:
-        RobotFileError: the document is not valid; the message is MuJoCo's where its compiler refuses.
-        UnsupportedRobotError: the document uses what is not modelled; the message names it.
+        RobotFileError: the document is not valid; errors of MuJoCo's compiler are quoted.
+        UnsupportedRobotError: the document uses an unsupported feature; the message names it.
         InertiaError: a mass or an inertia is not physical.
     """
     document, coupled, remarks = reduce_mjcf(root, path)
@@ -65,7 +67,7 @@ def read_mjcf(root: Element, path: Path) -> Tree:
 
 @contextmanager
 def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
-    """Collect MuJoCo's warnings, which would else go to a log file in the working folder."""
+    """Collect MuJoCo's warnings, which would otherwise go to a log file in the working folder."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda text: remarks.append(f"{label}: MuJoCo warns: {text}"))
     try:
@@ -80,7 +82,7 @@ def _compile(document: Element, label: str) -> Any:
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         text = " ".join(str(error).split())
         kind = InertiaError if re.search(r"mass|inertia", text) else RobotFileError
-        message = f"{label}: refused by MuJoCo's compiler"
+        message = f"{label}: MuJoCo's compiler rejects the file"
         raise kind(message, expected="a valid MJCF model", got=text) from error
 
 
@@ -104,7 +106,7 @@ def _inertial(model: Any, b: int) -> Inertial | None:
 
 
 def _chain(
-    model: Any, b: int, names: list[str], joint_names: list[str], coupled: dict[str, str], label: str
+    model: Any, b: int, names: list[str], joint_names: list[str], coupled: dict[str, Coupling], label: str
 ) -> list[Joint]:
     """The joints of body b in order, each about its own anchor, and the fixed joint that ends at the body."""
     parent, placement = names[model.body_parentid[b]], _pose(model.body_pos[b], model.body_quat[b])
@@ -127,7 +129,7 @@ def _joint(
     parent: str,
     child: str,
     placement: np.ndarray,
-    coupled: dict[str, str],
+    coupled: dict[str, Coupling],
     label: str,
 ) -> Joint:
     kind, dof = _KINDS.get(int(model.jnt_type[j])), model.jnt_dofadr[j]
@@ -139,7 +141,9 @@ def _joint(
             got=word,
             hint="remove the free joint to hold the robot by its base" if "free" in word else None,
         )
-    refused = coupled.get(name, "")
+    follows = coupled.get(name)
+    relation = f"mimics joint {follows.leader!r}" if follows and follows.leader else "is held in place"
+    refused = f"{relation} by an equality constraint" if follows else ""
     if model.jnt_stiffness[j] or model.jnt_stiffnesspoly[j].any() or model.dof_dampingpoly[dof].any():
         refused = "has a spring or nonlinear damping, which is not modelled"
     axis = model.jnt_axis[j].copy()
@@ -159,11 +163,12 @@ def _joint(
         upper=float(limits[1]),
         effort=_effort(model, j),
         refused=refused,
+        follows=follows,
     )
 
 
 def _effort(model: Any, j: int) -> float:
-    """Largest force that joint and actuators let through; motors also limit it by their control."""
+    """Largest force that the joint and its actuators allow; the control range of a motor limits it too."""
     effort = float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
     drives = [
         a

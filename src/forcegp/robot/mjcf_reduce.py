@@ -1,17 +1,19 @@
-"""MJCF documents reduced to what the mechanics need, before MuJoCo's compiler sees them.
+"""MJCF documents reduced to their mechanics, before MuJoCo's compiler reads them.
 
-Bodies, joints, sites, inertias and defaults stay. What only draws, senses, drives or collides is left out,
-so no mesh or texture is ever opened. What would change the motion and is not modelled is refused.
+Bodies, joints, sites, inertias and defaults are kept. Elements for drawing, sensing, driving or colliding are
+dropped, so meshes and textures are never opened. Elements that affect the motion but are not supported are
+errors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement
 
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
-from forcegp.robot.safety import MAX_ELEMENTS, MAX_NUMBER, parse_xml, read_bytes
+from forcegp.robot.safety import MAX_ELEMENTS, MAX_NUMBER, parse_numbers, parse_xml, read_bytes
 
 _IGNORED_SECTIONS = (
     "size", "statistic", "visual", "asset", "contact", "sensor", "keyframe", "custom", "tendon",
@@ -29,7 +31,15 @@ _ACTUATOR_LIMITS = ("gear", "forcerange", "forcelimited", "ctrlrange", "ctrllimi
 _WORDS = ("name", "class", "childclass", "user", "joint1", "joint2")
 
 
-def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, str], list[str]]:
+class Coupling(NamedTuple):
+    """The joint that a coupled joint follows, and the linear part of the relation."""
+
+    leader: str
+    multiplier: float
+    offset: float
+
+
+def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling], list[str]]:
     """The reduced document, the joints that equality constraints couple, and remarks.
 
     Args:
@@ -37,16 +47,16 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, str], lis
         path: its file; includes are looked for beside it.
 
     Returns:
-        The reduced `<mujoco>` element; reason by joint name; remarks.
+        The reduced `<mujoco>` element; coupling by joint name; remarks.
 
     Raises:
-        RobotFileError: an include or a figure is not valid.
-        UnsupportedRobotError: the document uses what is not modelled.
+        RobotFileError: an include or a number is not valid.
+        UnsupportedRobotError: the document uses an unsupported feature.
     """
     _expand_includes(root, path)
     document = Element("mujoco", model=root.get("model", path.stem))
     from_geoms = [c.get("inertiafromgeom") == "true" for c in root.iter("compiler")]
-    coupled: dict[str, str] = {}
+    coupled: dict[str, Coupling] = {}
     remarks: list[str] = []
     for section in root:
         where = f"{path}: <{section.tag}>"
@@ -67,13 +77,13 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, str], lis
                 f"{where} is not supported", expected="bodies with joints", got=section.tag
             )
         elif section.tag == "tendon" and len(section):
-            remarks.append(f"{path}: the forces of tendons are left out")
+            remarks.append(f"{path}: the forces of tendons are ignored")
     _check_numbers(document, path)
     return document, coupled, remarks
 
 
 def _expand_includes(root: Element, path: Path) -> None:
-    """Put included files in place; each at most once, and only from the folder of the robot file or below."""
+    """Insert included files, each at most once, and only from the folder of the robot file or below."""
     folder = path.resolve().parent
     seen = {path.resolve()}
     stack = [root]
@@ -104,7 +114,9 @@ def _included(include: Element, folder: Path, seen: set[Path], path: Path) -> El
         raise RobotFileError(
             f"{path}: include of {name!r} is refused",
             expected="a file in the folder of the robot file, included once",
-            got="it was included before" if target in seen else "a file elsewhere, or none",
+            got="a file that is already included"
+            if target in seen
+            else "a missing file, or one in another folder",
         )
     seen.add(target)
     return parse_xml(read_bytes(target), str(target))
@@ -112,7 +124,7 @@ def _included(include: Element, folder: Path, seen: set[Path], path: Path) -> El
 
 def _fluid(option: Element, where: str) -> list[str]:
     present = [name for name in ("density", "viscosity", "wind") if option.get(name)]
-    return [f"{where}: the forces of {', '.join(present)} are left out"] if present else []
+    return [f"{where}: the forces of {', '.join(present)} are ignored"] if present else []
 
 
 def _copy_default(default: Element) -> Element:
@@ -135,7 +147,7 @@ def _actuator_limits(actuator: Element) -> dict[str, str]:
 
 
 def _copy_actuators(section: Element) -> Element:
-    """Actuators of joints with nothing but their limits; the name says whether the control is the force."""
+    """Actuators of joints, reduced to their limits; the name says whether the control is the force."""
     copy = Element("actuator")
     for i, actuator in enumerate(section):
         if actuator.tag in _ACTUATORS and actuator.get("joint"):
@@ -146,7 +158,7 @@ def _copy_actuators(section: Element) -> Element:
 
 
 def _parts(body: Element) -> Iterator[Element]:
-    """What belongs to a body itself, through frames but not through child bodies."""
+    """The elements of a body itself, including those within frames but not those of child bodies."""
     for child in body:
         yield child
         if child.tag == "frame":
@@ -180,7 +192,7 @@ def _copy_parts(source: Element, copy: Element, keep_geoms: bool, from_geoms: bo
             raise UnsupportedRobotError(
                 f"{where} has a <{part.tag[:60]}>, which is not supported",
                 expected=", ".join(_BODY_PARTS),
-                hint="save the compiled model from MuJoCo, which writes such elements out",
+                hint="save the compiled model with MuJoCo, which expands such elements",
             )
 
 
@@ -190,22 +202,24 @@ def _refuse_mesh(geom: Element, where: str) -> None:
         raise UnsupportedRobotError(
             f"{where} takes its inertia from the mesh {mesh!r}",
             expected="an <inertial>, or geoms that are primitive shapes",
-            hint="write the figures that MuJoCo computes from the mesh into an <inertial>",
+            hint="copy the inertia that MuJoCo computes from the mesh into an <inertial>",
         )
 
 
-def _couplings(equality: Element, path: Path) -> dict[str, str]:
-    coupled = {}
+def _couplings(equality: Element, path: Path) -> dict[str, Coupling]:
+    coupled: dict[str, Coupling] = {}
     for constraint in equality:
         if constraint.get("active") == "false":
             continue
         first, second = constraint.get("joint1"), constraint.get("joint2")
         if constraint.tag == "joint" and first:
-            coupled[first] = f"mimics joint {second!r} by an equality constraint"
+            where = f"{path}: the equality constraint of joint {first!r}: polycoef"
+            offset, slope, *_ = parse_numbers(constraint.get("polycoef", "0 1 0 0 0"), where, 5)
+            coupled[first] = Coupling(second or "", slope, offset)
         else:
             raise UnsupportedRobotError(
                 f"{path}: equality constraint <{constraint.tag[:60]}> is not supported",
-                expected="no <equality> but between joints",
+                expected="<equality> constraints between joints only",
                 got=f"one on body {constraint.get('body1')!r}",
                 hint="close the loop with a point constraint of this library",
             )
@@ -213,7 +227,7 @@ def _couplings(equality: Element, path: Path) -> dict[str, str]:
 
 
 def _check_numbers(document: Element, path: Path) -> None:
-    """Refuse NaN, infinite and absurd numbers, which MuJoCo's compiler lets through."""
+    """Refuse NaN, infinite and absurd numbers, which MuJoCo's compiler accepts."""
     for element in document.iter():
         for attribute, text in element.attrib.items():
             if attribute in _WORDS or element.tag == "mujoco":

@@ -1,4 +1,4 @@
-"""Reading XML from files that nobody vouches for: bounded in size, depth and count, and without entities."""
+"""Safe reading of XML from untrusted files: bounded in size, depth and number of elements, no entities."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_NUMBER = 1e12
 
 
 class _BoundedBuilder(TreeBuilder):
-    """A tree builder that gives up early on files that are too large or too deep."""
+    """A tree builder that stops at a file that is too large or too deep."""
 
     def __init__(self, label: str) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class _BoundedBuilder(TreeBuilder):
                 f"{self._label}: too many elements",
                 expected=f"at most {MAX_ELEMENTS} XML elements",
                 got="more",
-                hint="remove what is not links, joints or bodies from the file",
+                hint="keep only links, joints and bodies",
             )
         if self._depth > MAX_DEPTH:
             raise RobotFileError(
@@ -96,16 +96,28 @@ def parse_xml(data: bytes, label: str) -> Element:
             hint="write the text out instead of using entities",
         ) from error
     except ParseError as error:
+        if b"<xacro:" in data:
+            raise xacro_error(label, str(error)) from error
         raise RobotFileError(
             f"{label}: not well-formed XML",
             expected="a complete URDF or MJCF document",
             got=str(error),
-            hint="the file may be truncated or no XML at all",
+            hint="the file may be truncated, or may not be XML",
         ) from error
     except (LookupError, UnicodeError, ValueError, AssertionError) as error:
         if isinstance(error, RobotFileError):
             raise
         raise RobotFileError(f"{label}: not readable as XML", expected="UTF-8 text", got=error) from error
+
+
+def xacro_error(label: str, got: str) -> RobotFileError:
+    """The error of a file whose xacro macros have not been expanded."""
+    return RobotFileError(
+        f"{label}: the file has xacro macros that are not expanded",
+        expected="plain URDF",
+        got=got,
+        hint="expand them first: xacro robot.urdf.xacro > robot.urdf",
+    )
 
 
 def parse_numbers(
@@ -116,12 +128,12 @@ def parse_numbers(
     Args:
         text: the attribute's value.
         where: file, element and attribute, for messages.
-        count: how many numbers it must hold.
+        count: the number of values it must hold.
         infinite: whether ±infinity is allowed (limits).
         error: the class of error to raise.
 
     Raises:
-        RobotFileError: another count, no numbers, not finite, or beyond `MAX_NUMBER`.
+        RobotFileError: the attribute does not hold `count` numbers that are finite and below `MAX_NUMBER`.
     """
     expected = f"{count} finite number{'s' if count > 1 else ''}"
     try:

@@ -1,4 +1,4 @@
-"""URDF files: checked here, interpreted by yourdfpy."""
+"""URDF files: validated here, parsed by yourdfpy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import yourdfpy
 
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
-from forcegp.robot.safety import parse_numbers
+from forcegp.robot.safety import parse_numbers, xacro_error
 from forcegp.robot.tree import Inertial, Joint, Link, Tree, unit_axis
 
 _LINK_PARTS = ("inertial",)
@@ -21,14 +21,18 @@ _NUMBERS = {
     "inertia": {"ixx": 1, "ixy": 1, "ixz": 1, "iyy": 1, "iyz": 1, "izz": 1},
     "limit": {"lower": 1, "upper": 1, "effort": 1, "velocity": 1},
     "dynamics": {"damping": 1, "friction": 1},
+    "mimic": {"multiplier": 1, "offset": 1},
 }
 _NEEDED = {
     "mass": ("value",),
     "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
     "parent": ("link",),
     "child": ("link",),
+    "mimic": ("joint",),
 }
 _MOVING = ("revolute", "continuous", "prismatic")
+WORLD = "world"
+"""Name of the fixed surroundings, which some files use as a link without declaring it."""
 
 
 def read_urdf(root: Element, label: str) -> Tree:
@@ -39,9 +43,9 @@ def read_urdf(root: Element, label: str) -> Tree:
         label: the file name for messages.
 
     Raises:
-        RobotFileError: an element or a figure is missing or not valid; the message names it.
-        UnsupportedRobotError: a joint is of a kind that is not modelled.
-        InertiaError: a mass or an inertia is no finite number.
+        RobotFileError: an element or a number is missing or not valid; the message names it.
+        UnsupportedRobotError: a joint is of an unsupported type.
+        InertiaError: a mass or an inertia is not a finite number.
     """
     _refuse_xacro(root, label)
     document = Element("robot", name=root.get("name") or "robot")
@@ -52,22 +56,25 @@ def read_urdf(root: Element, label: str) -> Tree:
     robot = yourdfpy.URDF.load(
         io.BytesIO(tostring(document, encoding="utf-8")), build_scene_graph=False, load_meshes=False
     ).robot
-    return Tree(
-        name=robot.name,
-        label=label,
-        links=tuple(Link(link.name, _inertial(link)) for link in robot.links),
-        joints=tuple(_joint(joint, f"{label}: joint {joint.name!r}") for joint in robot.joints),
-    )
+    joints = tuple(_joint(joint, f"{label}: joint {joint.name!r}") for joint in robot.joints)
+    links = tuple(Link(link.name, _inertial(link)) for link in robot.links)
+    if not _uses_undeclared_world(links, joints):
+        return Tree(robot.name, label, links, joints)
+    remark = f"{label}: link {WORLD!r} is used but not declared; it is taken as the base"
+    return Tree(robot.name, label, (Link(WORLD), *links), joints, remarks=(remark,))
+
+
+def _uses_undeclared_world(links: tuple[Link, ...], joints: tuple[Joint, ...]) -> bool:
+    """Whether a fixed joint attaches the robot to a `world` that is no link of the file, as in Drake."""
+    attached = any(joint.parent == WORLD and joint.kind == "fixed" for joint in joints)
+    return attached and all(link.name != WORLD for link in links)
 
 
 def _refuse_xacro(root: Element, label: str) -> None:
-    if any("xacro" in element.tag for element in root.iter()):
-        raise RobotFileError(
-            f"{label}: the file has xacro macros",
-            expected="plain URDF",
-            got="a xacro file",
-            hint="expand it first: xacro in.urdf.xacro > out.urdf",
-        )
+    for element in root.iter():
+        macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
+        if macros or "xacro" in element.tag:
+            raise xacro_error(label, macros[0][:80] if macros else f"<{element.tag.rpartition('}')[2]}>")
 
 
 def _name(element: Element, label: str) -> str:
@@ -100,7 +107,7 @@ def _copy_joint(document: Element, joint: Element, label: str) -> None:
 
 
 def _copy(document: Element, source: Element, parts: tuple[str, ...], where: str) -> None:
-    """Copy what is read of a link or a joint, checked, so that nothing else reaches the parser."""
+    """Copy the validated parts of a link or joint, so that nothing else reaches the parser."""
     copy = SubElement(document, source.tag, dict(source.attrib))
     for part in parts:
         found = source.findall(part)
@@ -174,11 +181,19 @@ def _joint(joint: yourdfpy.Joint, where: str) -> Joint:
         velocity=velocity,
         effort=effort,
         refused=f"mimics joint {joint.mimic.joint!r}" if joint.mimic is not None else "",
+        follows=_follows(joint.mimic),
     )
 
 
+def _follows(mimic: yourdfpy.Mimic | None) -> tuple[str, float, float] | None:
+    if mimic is None:
+        return None
+    # yourdfpy fills in the format's defaults, 1 and 0, where the file leaves them out.
+    return mimic.joint, float(mimic.multiplier or 0.0), float(mimic.offset or 0.0)
+
+
 def _limits(joint: yourdfpy.Joint, where: str) -> tuple[float, float, float, float]:
-    """Position, effort, velocity limits; files leave out, or set to 0, what they do not limit."""
+    """Position, effort and velocity limits; a limit of effort or velocity that is 0 or missing is none."""
     limit = joint.limit or yourdfpy.Limit()
     effort, velocity = limit.effort or np.inf, limit.velocity or np.inf
     if min(effort, velocity) < 0.0:
@@ -191,6 +206,6 @@ def _limits(joint: yourdfpy.Joint, where: str) -> tuple[float, float, float, flo
     lower, upper = limit.lower or 0.0, limit.upper or 0.0
     if lower > upper:
         raise RobotFileError(
-            f"{where} has its limits the wrong way round", expected="lower ≤ upper", got=(lower, upper)
+            f"{where} has its lower limit above its upper limit", expected="lower ≤ upper", got=(lower, upper)
         )
     return lower, upper, effort, velocity

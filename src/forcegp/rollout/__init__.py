@@ -1,10 +1,12 @@
 """Forward in time: trajectories that stay on the surface, with uncertainty, and contact that can be lost."""
 
 from forcegp.rollout.comparison import Comparison, beside_log, compare
-from forcegp.rollout.contact import ContactEvent
-from forcegp.rollout.forward import RolloutOptions, rollout, rollout_model
-from forcegp.rollout.inputs import Feedback, Inputs, Sampled, TaskSpaceControl
-from forcegp.rollout.law import AccelerationLaw, ForceLaw, Law, law_of
+from forcegp.rollout.conformal import widening
+from forcegp.rollout.events import ContactEvent
+from forcegp.rollout.forward import rollout, rollout_model
+from forcegp.rollout.inputs import Feedback, Inputs, Sampled, TaskSpaceControl, Torque
+from forcegp.rollout.law import AccelerationLaw, ForceField, ForceLaw, ForwardModel, Law, law_of
+from forcegp.rollout.options import RolloutOptions
 from forcegp.rollout.probability import contact_loss_probability
 from forcegp.rollout.trajectory import Bands, DivergedError, Divergence, Rollout
 
@@ -16,17 +18,21 @@ __all__ = [
     "DivergedError",
     "Divergence",
     "Feedback",
+    "ForceField",
     "ForceLaw",
+    "ForwardModel",
     "Inputs",
     "Law",
     "Rollout",
     "RolloutOptions",
     "Sampled",
     "TaskSpaceControl",
+    "Torque",
     "beside_log",
     "compare",
     "contact_loss_probability",
     "law_of",
     "rollout",
     "rollout_model",
+    "widening",
 ]

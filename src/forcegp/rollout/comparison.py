@@ -1,8 +1,8 @@
-"""Predicted trajectories beside logged ones: tip error over time, drift, bands."""
+"""Comparison of predicted and logged trajectories: tip error over time, drift, coverage of the bands."""
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,15 +13,17 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
-from forcegp.models.base import Model
-from forcegp.rollout.forward import RolloutOptions, rollout_model
-from forcegp.rollout.run import Progress
+from forcegp.rollout.conformal import widening
+from forcegp.rollout.forward import rollout_model
+from forcegp.rollout.integrate import Progress
+from forcegp.rollout.law import ForwardModel
+from forcegp.rollout.options import RolloutOptions
 from forcegp.rollout.trajectory import Bands, Rollout
 
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Times at which tip errors are reported [s]."""
 LEVEL = 0.9
-"""Part of the samples that a band holds."""
+"""Share of the samples inside a band."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +76,13 @@ class Comparison:
         return float(self.tip_error(model)[:, step].median())
 
     def coverage(self, model: str, level: float = LEVEL, inflation: float = 1.0) -> float:
-        """Share of tip coordinates that the band over samples holds, of all starts and times but the first.
+        """Share of tip coordinates inside the band over samples, of all starts and all times but the first.
 
-        On a surface only the coordinates along it count, as the constraint leaves none across.
+        On a surface only the coordinates along it count, as the constraint fixes the one across it.
 
         Args:
             model: name.
-            level: part of the samples that the band holds.
+            level: share of the samples inside the band.
             inflation: factor on the half-widths of the band, such as `inflation` of another comparison.
         """
         logged, band = self._tip_along(model, level)
@@ -89,17 +91,8 @@ class Comparison:
         return float(inside.to(self.q.dtype).mean())
 
     def inflation(self, model: str, level: float = LEVEL) -> float:
-        """Factor by which bands must be longer to hold `level` of these tip coordinates (split conformal).
-
-        The ⌈(n + 1) level⌉-th smallest of n ratios |logged − median| / (half-width on that side). Bands of
-        trajectories like these, widened by it, hold about that share, whatever the model got wrong. It is
-        infinite where too few samples are left for a band.
-        """
-        logged, band = self._tip_along(model, level)
-        apart = logged - band.median
-        half = torch.where(apart < 0.0, band.median - band.lower, band.upper - band.median)
-        ratio = (apart.abs() / half).nan_to_num(torch.inf).flatten().sort().values
-        return float(ratio[min(math.ceil((len(ratio) + 1) * level), len(ratio)) - 1])
+        """Factor by which bands must grow to cover a share `level` of tip coordinates (`conformal.py`)."""
+        return widening(*self._tip_along(model, level), level)
 
     def _tip_along(self, model: str, level: float) -> tuple[Tensor, Bands]:
         """Logged tip coordinates `(k, T − 1, d)`, along the surface if there is one, and the band of each."""
@@ -135,7 +128,7 @@ def tip_of(system: ConstrainedSystem) -> tuple[str, Sequence[float]]:
 
 
 def compare(
-    models: Mapping[str, Model],
+    models: Mapping[str, ForwardModel],
     data: Dataset,
     duration: float,
     starts: int | Tensor = 1,
@@ -151,10 +144,10 @@ def compare(
         models: fitted models by name.
         data: a log in the order of time.
         duration: of each trajectory [s].
-        starts: how many, evenly spread over the log, or the rows to start from.
-        samples: function samples of the models that have them.
+        starts: the number of starts, spread evenly over the log, or the rows to start from.
+        samples: number of function samples, for the models that have them.
         system: robot and contacts of the log; those of the first model by default.
-        options: how the rollouts are computed; a diverging one is kept up to there.
+        options: how the rollouts are computed; by default a diverging one is kept up to its divergence.
         progress: called as the models are rolled out.
 
     Raises:
@@ -165,7 +158,8 @@ def compare(
     steps = round(duration / dt)
     first = _starts(data, steps, starts)
     rows = first[:, None] + torch.arange(steps + 1)
-    options = options or RolloutOptions(dt=dt, on_divergence="keep")
+    options = options or RolloutOptions(on_divergence="keep")
+    options = dataclasses.replace(options, dt=options.dt or dt)
     predicted = {}
     for i, (name, model) in enumerate(models.items()):
         drawn = samples if model.has_function_samples else 0
@@ -212,7 +206,7 @@ def _period(data: Dataset) -> float:
 
 
 def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
-    """Rows `(count,)` that `steps` more of the same trajectory follow: those given, or evenly spread."""
+    """Rows `(count,)` that `steps` more rows of their trajectory follow: those given, or spread evenly."""
     count = starts if isinstance(starts, int) else len(starts)
     fits = torch.arange(max(len(data) - steps, 0))
     fits = fits[data.segment[fits] == data.segment[fits + steps]]

@@ -1,4 +1,4 @@
-"""Motor torques of a rollout: an array over time, or a feedback law."""
+"""Motor torques of a rollout: an array over time, a log, a feedback law, or the task-space controller."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import Gains, Target, control_torque, tool_motion
-from forcegp.errors import ShapeError, UnknownNameError
+from forcegp.data import Dataset
+from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
 """Part of a sampling period within which a time counts as a sampling time, against rounding."""
+EVEN = 0.02
+"""Largest deviation of a step from the sampling period, relative to the period, in a log that is replayed."""
 
 
 class Reached(NamedTuple):
@@ -38,6 +41,11 @@ class Reached(NamedTuple):
 class Inputs(ABC):
     """Motor torque as a function of time and state."""
 
+    @property
+    def period(self) -> float | None:
+        """Sampling period [s]; `None` for a law in continuous time."""
+        return None
+
     @abstractmethod
     def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
         """Q_u `(n, nq)` [N m].
@@ -48,6 +56,10 @@ class Inputs(ABC):
                 the value before the jump.
             at: the state, and the equations of motion there.
         """
+
+
+Torque = Tensor | Dataset | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
+"""An array over time `(samples, nq)` or `(*batch, samples, nq)`, a log, inputs, or a law of (t, q, q̇)."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +75,10 @@ class Sampled(Inputs):
     values: Tensor
     dt: float
     linear: bool = False
+
+    @property
+    def period(self) -> float:
+        return self.dt
 
     def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
         last = self.values.shape[1] - 1
@@ -83,7 +99,7 @@ class Sampled(Inputs):
 
 @dataclass(frozen=True)
 class Feedback(Inputs):
-    """A law of one's own, `(t, q, qd)` → τ, of tensors `(n, 1)`, `(n, nq)`, `(n, nq)`."""
+    """A feedback law `(t, q, qd)` → τ, of tensors `(n, 1)`, `(n, nq)`, `(n, nq)`."""
 
     function: Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -96,8 +112,8 @@ class TaskSpaceControl(Inputs):
     """The simulator's task-space controller following a plan, with the analytical mechanics of a system.
 
     Args:
-        system: the mechanics that the controller believes in.
-        plan: what it follows.
+        system: the mechanics that the controller assumes.
+        plan: the motion that it follows.
         dt: sampling period of the plan [s].
         gains: its gains.
         limit: `(nq,)` torque limits [N m]; `None` for the robot's own.
@@ -109,6 +125,10 @@ class TaskSpaceControl(Inputs):
     gains: Gains
     limit: Tensor | None = None
 
+    @property
+    def period(self) -> float:
+        return self.dt
+
     def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
         robot, eom, q, qd = self.system.robot, at.eom, at.q, at.qd
         if at.system.robot is not robot:
@@ -116,41 +136,35 @@ class TaskSpaceControl(Inputs):
         tool = tool_motion(robot, eom.poses, eom.motion, qd, self.plan.frame, self.plan.point)
         k = torch.floor(t[:, 0] / self.dt + EDGE).long().clamp(max=len(self.plan.reference.t) - 1)
         target = Target(*(values[k] for values in self.plan.targets))
-        wanted = control_torque(tool, eom, q, qd, target, self._normal(eom, q), self.gains)
+        wanted = control_torque(tool, eom, q, qd, target, self.plan.normal(eom), self.gains)
         limit = robot.effort_limit if self.limit is None else self.limit
         return wanted.clamp(-limit, limit)
 
-    def _normal(self, eom: Equations, q: Tensor) -> Tensor:
-        """Unit normal of the surface below the tool; zero in free space, where there is nothing to push."""
-        if self.plan.contact is None:
-            return q.new_zeros(len(q), 3)
-        return torch.nn.functional.normalize(eom.contact_points[self.plan.contact].normal, dim=-1)
-
 
 def inputs_of(
-    tau: Tensor | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor],
-    batch: torch.Size,
-    rows: int,
-    dt: float,
-    interpolation: str,
+    tau: Torque, batch: torch.Size, rows: int, dt: float | None, interpolation: str = "hold"
 ) -> Inputs:
-    """Inputs from what a caller gives.
+    """Inputs from what a caller passes.
 
     Args:
-        tau: `(*batch, samples, nq)` or `(samples, nq)`, a law of (t, q, q̇), or inputs ready made.
+        tau: `(*batch, samples, nq)` or `(samples, nq)`, a log, a law of (t, q, q̇), or inputs.
         batch: batch of the initial states.
         rows: number of trajectories; a multiple of the batch.
-        dt: sampling period of an array [s].
+        dt: sampling period of an array [s]; a log has its own, and a single sample is a constant torque.
         interpolation: `"hold"` or `"linear"`.
 
     Raises:
-        UnknownNameError: no such interpolation.
+        UnknownNameError: unknown interpolation.
         ShapeError: the array does not fit the initial states.
+        ModelError: the sampling period of an array is missing.
+        DataError: the log is not one trajectory with a constant sampling period.
     """
     if interpolation not in INTERPOLATIONS:
         raise UnknownNameError("interpolation", interpolation, INTERPOLATIONS)
     if isinstance(tau, Inputs):
         return tau
+    if isinstance(tau, Dataset):
+        return Sampled(tau.tau[None], sampling_period(tau), interpolation == "linear")
     if not isinstance(tau, Tensor):
         return Feedback(tau)
     if tau.ndim < 2 or tau.shape[-2] == 0 or tau.shape[:-2] not in (torch.Size(), batch):
@@ -162,4 +176,32 @@ def inputs_of(
     values = tau.reshape((-1, *tau.shape[-2:]))
     if len(values) > 1:
         values = values.expand(rows // len(values), *values.shape).flatten(0, 1)
+    if values.shape[1] == 1:
+        return Feedback(lambda t, q, qd: values[:, 0])
+    if dt is None:
+        raise ModelError(
+            "the sampling period of an array of torques is not known",
+            expected="the torques with their period",
+            got=f"an array of shape {tuple(tau.shape)} without dt",
+            hint="pass the log itself instead of log.tau, or options=RolloutOptions(dt=…)",
+        )
     return Sampled(values, dt, interpolation == "linear")
+
+
+def sampling_period(log: Dataset) -> float:
+    """Sampling period of a log of one trajectory [s], from its time column.
+
+    Raises:
+        DataError: rows are out of order or selected, or the log has several trajectories or gaps.
+    """
+    steps = log.t.diff()
+    period = float(log.t[-1] - log.t[0]) / max(len(steps), 1)
+    one = len(steps) > 0 and log.header.ordered and bool((log.segment == log.segment[0]).all())
+    if not one or bool(((steps - period).abs() > EVEN * period).any()):
+        raise DataError(
+            "the torques of this log cannot be replayed",
+            expected="one trajectory of two or more rows in the order of time, at a constant sampling period",
+            got=f"{len(log.t)} rows" + ("" if log.header.ordered else " in the order of their selection"),
+            hint="pass the rows of one trajectory, without gaps",
+        )
+    return period

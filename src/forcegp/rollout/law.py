@@ -1,21 +1,86 @@
-"""What moves a rollout: accelerations from a force on the constrained system, or from a model of them."""
+"""The right-hand side of a rollout: states, and the law that gives the acceleration at each of them.
+
+A law is a force field on the constrained system, q̈ = L b + H Q̄, or a model of accelerations alone. Rollouts
+know no particular model: anything with the methods of `ForwardModel` can be rolled out.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.states import States
-from forcegp.models.base import ForceField, Model
+from forcegp.errors import ModelError
+from forcegp.forces.quantities import States
+from forcegp.rollout.inputs import Inputs, Reached
+
+ForceField = Callable[[ConstrainedSystem, States], Tensor]
+"""The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""
+
+
+@runtime_checkable
+class Predicted(Protocol):
+    """A predicted quantity."""
+
+    @property
+    def mean(self) -> Tensor:
+        """`(*batch, d)`."""
+        ...
+
+    @property
+    def std(self) -> Tensor | None:
+        """`(*batch, d)` standard deviation, `None` without one."""
+        ...
+
+
+@runtime_checkable
+class ForwardModel(Protocol):
+    """What a rollout asks of a model of the forward dynamics."""
+
+    @property
+    def kind(self) -> str:
+        """Name of the class of models."""
+        ...
+
+    @property
+    def system(self) -> ConstrainedSystem:
+        """Robot and contacts that the model was made for."""
+        ...
+
+    @property
+    def has_function_samples(self) -> bool:
+        """Whether `force_samples` draws functions from a posterior over forces."""
+        ...
+
+    def force_field(self) -> ForceField | None:
+        """The mean impressed force, or `None` for a model of accelerations alone."""
+        ...
+
+    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
+        """Force functions drawn from the posterior, on `(samples * k, nq)` states."""
+        ...
+
+    def predict(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str = "qdd",
+        *,
+        active: Tensor | None = None,
+        covariance: bool = True,
+    ) -> Predicted:
+        """Predict a quantity at states `(*batch, nq)`."""
+        ...
 
 
 class Motion(NamedTuple):
-    """What a law says at a state.
+    """What a law gives at a state.
 
     Attributes:
         qdd: `(n, nq)`.
@@ -55,7 +120,7 @@ class ForceLaw(Law):
 class AccelerationLaw(Law):
     """q̈ as a model predicts it, which need not obey the constraint."""
 
-    model: Model
+    model: ForwardModel
     has_multiplier: bool = False
 
     def motion(self, system: ConstrainedSystem, at: States) -> Motion:
@@ -63,7 +128,95 @@ class AccelerationLaw(Law):
         return Motion(qdd, torch.full_like(at.eom.c, torch.nan))
 
 
-def law_of(model: Model) -> Law:
-    """The mean motion of a model: of its force field where it has one, else of its accelerations."""
-    force = model.force_field()
-    return AccelerationLaw(model) if force is None else ForceLaw(force)
+def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
+    """The mean motion of a model: of its force field if it has one, otherwise of its accelerations.
+
+    Args:
+        model: a fitted model.
+        system: where it is to be rolled out; by default the model's own system.
+
+    Raises:
+        ModelError: a model of accelerations alone is asked for the motion of another system.
+    """
+    force, own = model.force_field(), model.system
+    if force is not None:
+        return ForceLaw(force)
+    if system is not None and (system.robot is not own.robot or [*system.contacts] != [*own.contacts]):
+        raise ModelError(
+            f"this model ({model.kind}) predicts accelerations of the system that it was fitted on only",
+            expected=f"robot {own.robot.name!r} with contacts {', '.join(own.contact_names) or '(none)'}",
+            got=f"another system: robot {system.robot.name!r} with contacts "
+            f"{', '.join(system.contact_names) or '(none)'}",
+            hint="leave `system` out, or use a model of forces such as StructuredGP",
+        )
+    return AccelerationLaw(model)
+
+
+class State(NamedTuple):
+    """The states of n trajectories; events within a step let their times differ.
+
+    Attributes:
+        t: `(n, 1)` [s].
+        q, qd: `(n, nq)`.
+        active: `(n, n_contacts)` bool, closed contacts.
+    """
+
+    t: Tensor
+    q: Tensor
+    qd: Tensor
+    active: Tensor
+
+    def where(self, rows: Tensor, other: State) -> State:
+        """This state in some rows `(n,)`, another one elsewhere."""
+        return State(*(torch.where(rows[:, None], a, b) for a, b in zip(self, other, strict=True)))
+
+
+class Evaluation(NamedTuple):
+    """The motion at a state.
+
+    Attributes:
+        tau, qdd: `(n, nq)` motor torque and acceleration.
+        multiplier, c, cd: `(n, m)` λ, constraint error and its rate.
+    """
+
+    tau: Tensor
+    qdd: Tensor
+    multiplier: Tensor
+    c: Tensor
+    cd: Tensor
+
+
+@dataclass(frozen=True)
+class Problem:
+    """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system.
+
+    Args:
+        system: robot and contacts, with the stabilization of the rollout.
+        law: gives the acceleration.
+        inputs: give the torque.
+        unilateral: whether contacts with a surface can open and close.
+    """
+
+    system: ConstrainedSystem
+    law: Law
+    inputs: Inputs
+    unilateral: bool
+
+    def __post_init__(self) -> None:
+        if self.unilateral and not self.law.has_multiplier:
+            raise ModelError(
+                "a model of accelerations alone has no multiplier that could tell when contact is lost",
+                hint="pass unilateral=False, or use a model with forces",
+            )
+
+    def evaluate(self, state: State, end: Tensor) -> Evaluation:
+        """The motion at a state, within a step that ends at `end` `(n, 1)`."""
+        eom = self.system.equations(state.q, state.qd, state.active)
+        tau = self.inputs.torque(state.t, end, Reached(self.system, eom, state.q, state.qd))
+        at = States(state.q, state.qd, tau, state.active, eom)
+        qdd, multiplier = self.law.motion(self.system, at)
+        return Evaluation(tau, qdd, multiplier, eom.c, eom.cd)
+
+
+Step = Callable[[Problem, State, Evaluation, Tensor], State]
+"""Advance a state, whose motion is known, by steps h `(n, 1)` [s]."""

@@ -6,20 +6,24 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.models.base import Model
+from forcegp.rollout.law import ForwardModel
 
 
 def contact_loss_probability(
-    model: Model, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
+    model: ForwardModel, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
 ) -> Tensor:
-    """P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²) at states, `(*batch, m)`.
+    """Probability that a contact would have to pull at a state, and therefore opens.
 
-    A contact that would have to pull opens, so this is the probability that it does not hold at the state.
+    P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²). A contact that is open is lost already: its
+    probability is 1.
 
     Args:
         model: a model with a posterior over forces.
         q, qd, tau: `(*batch, nq)` states.
         active: `(*batch, n_contacts)` bool, closed contacts; default all.
+
+    Returns:
+        `(*batch, m)`, between 0 and 1.
 
     Raises:
         ModelError: the model gives no variance of the multiplier.
@@ -30,4 +34,8 @@ def contact_loss_probability(
             f"a {model.kind!r} model gives no uncertainty of the multiplier",
             hint="use StructuredGP, or compare the predicted multiplier with zero",
         )
-    return torch.special.ndtr(-found.mean / found.std)
+    certain = found.std == 0.0
+    probability = torch.special.ndtr(-found.mean / torch.where(certain, 1.0, found.std))
+    probability = torch.where(certain, (found.mean < 0.0).to(probability.dtype), probability)
+    closed = model.system.active_rows(active, found.mean.shape[:-1])
+    return torch.where(closed, probability, 1.0)

@@ -1,4 +1,4 @@
-"""The result of a rollout: trajectories, drift, multipliers, contacts, and what samples say of them."""
+"""The result of a rollout: trajectories, drift, multipliers, contacts, and bands over samples."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ from torch import Tensor
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, NumericalError
-from forcegp.rollout.contact import ContactEvent
+from forcegp.rollout.events import ContactEvent
+
+FIELDS = ("q", "qd", "qdd", "tau", "multiplier", "c", "cd", "active")
+"""Attributes of a rollout that have the shape of its batch."""
 
 
 class Divergence(NamedTuple):
-    """A trajectory that was given up.
+    """A trajectory that was dropped because it diverged.
 
     Attributes:
         t: time of its last trustworthy state [s].
         row: index of the trajectory in the flattened batch.
         q, qd: that state.
-        reason: what was wrong with the next one.
+        reason: why the next one was rejected.
     """
 
     t: float
@@ -78,7 +81,7 @@ class Rollout:
         c, cd: `(*batch, T, m)` constraint error and its rate, of all contacts, open or closed [m], [m/s].
         active: `(*batch, T, n_contacts)` bool, closed contacts.
         events: contacts that opened and closed.
-        diverged: trajectories that were given up.
+        diverged: trajectories that diverged and were dropped.
         samples: trajectories of function samples, batch `(S, *batch)`.
     """
 
@@ -121,7 +124,7 @@ class Rollout:
 
         Args:
             values: `(S, …)`, such as `rollout.samples.multiplier`; NaN of diverged samples are left out.
-            level: part of the samples that the band holds, between 0 and 1.
+            level: share of the samples inside the band, between 0 and 1.
         """
         tail = 0.5 * (1.0 - level)
         quantiles = torch.tensor([tail, 1.0 - tail, 0.5], dtype=values.dtype, device=values.device)
@@ -148,8 +151,7 @@ class Rollout:
 
     def __getitem__(self, index: object) -> Rollout:
         """The trajectories of some members of the batch; events keep their row of the whole batch."""
-        names = ("q", "qd", "qdd", "tau", "multiplier", "c", "cd", "active")
-        chosen = {name: getattr(self, name)[index] for name in names}
+        chosen = {name: getattr(self, name)[index] for name in FIELDS}
         samples = None if self.samples is None else self.samples[(slice(None), *_as_tuple(index))]
         return dataclasses.replace(self, **chosen, samples=samples)
 

@@ -1,9 +1,9 @@
 """Simulation of a robot that follows a motion, free or in contact, in a physics engine."""
 
-from forcegp.control.config import SimulationConfig
 from forcegp.control.task_space import Gains
 from forcegp.control.trajectory import Reference
 from forcegp.simulate.check import EngineCheck, check_engine
+from forcegp.simulate.config import SimulationConfig
 from forcegp.simulate.engine import Engine, make_engine
 from forcegp.simulate.result import SimulationResult
 from forcegp.simulate.run import simulate

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from forcegp import dynamics
-from forcegp.constraints.gauss import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem
 from forcegp.simulate.engine import Engine
 from forcegp.types import JointVector
 

@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 from forcegp import kinematics
-from forcegp.constraints.gauss import ConstrainedSystem
-from forcegp.control.config import SimulationConfig
+from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.unilateral import ContactForces
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import tool_motion
 from forcegp.control.trajectory import Reference
 from forcegp.data.dataset import Dataset
 from forcegp.data.header import DataHeader
 from forcegp.simulate.check import acceleration_mismatch
-from forcegp.simulate.touch import Touch
+from forcegp.simulate.config import SimulationConfig
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,13 @@ class Log:
             saturated=torch.zeros(steps, dtype=torch.bool),
         )
 
-    def write(self, k: int, q: Tensor, qd: Tensor, Q_u: Tensor, touch: Touch, *, saturated: bool) -> None:
+    def write(
+        self, k: int, q: Tensor, qd: Tensor, Q_u: Tensor, forces: ContactForces, *, saturated: bool
+    ) -> None:
         """Write down step k, all but the acceleration, which is known a step later."""
-        self.q[k], self.qd[k], self.tau[k], self.Q[k] = q, qd, Q_u, touch.Q
-        self.Q_I[k], self.Q_z[k], self.multiplier[k] = touch.Q_I, touch.Q_z, touch.multiplier
-        self.c[k], self.contact[k], self.saturated[k] = touch.c, touch.closed, saturated
+        self.q[k], self.qd[k], self.tau[k], self.Q[k] = q, qd, Q_u, forces.Q
+        self.Q_I[k], self.Q_z[k], self.multiplier[k] = forces.Q_I, forces.Q_z, forces.multiplier
+        self.c[k], self.contact[k], self.saturated[k] = forces.c, forces.closed, saturated
 
 
 @dataclass(frozen=True)

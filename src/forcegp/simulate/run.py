@@ -8,14 +8,14 @@ from contextlib import closing
 import torch
 from torch import Tensor
 
-from forcegp.constraints.gauss import ConstrainedSystem, Equations
-from forcegp.control.config import SimulationConfig
+from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.unilateral import any_row, contact_forces, land
 from forcegp.control.plan import Plan, make_plan
 from forcegp.control.task_space import control_torque, tool_motion
 from forcegp.errors import NumericalError
+from forcegp.simulate.config import SimulationConfig
 from forcegp.simulate.engine import Engine, make_engine
 from forcegp.simulate.result import Log, SimulationResult, make_result
-from forcegp.simulate.touch import any_row, contact_forces, land
 from forcegp.threads import one_thread
 
 RUNAWAY_SPEED = 50.0
@@ -85,7 +85,7 @@ def _follow(
             engine.reset(q, qd)
         eom, target = landing.eom, plan.target(k)
         tool = tool_motion(system.robot, eom.poses, eom.motion, qd, plan.frame, plan.point)
-        wanted = control_torque(tool, eom, q, qd, target, _normal(eom, plan), config.gains)
+        wanted = control_torque(tool, eom, q, qd, target, plan.normal(eom), config.gains)
         Q_u = wanted.clamp(-limit, limit)
         touch = contact_forces(system, q, qd, landing, Q_u, config.viscous_friction)
         engine.step(Q_u + touch.Q_D + touch.Q_I + touch.Q_z)
@@ -96,13 +96,6 @@ def _follow(
         if progress is not None and ((k + 1) % PROGRESS_STRIDE == 0 or k + 1 == config.steps):
             progress(k + 1, config.steps)
     return log
-
-
-def _normal(eom: Equations, plan: Plan) -> Tensor:
-    """Unit normal of the surface below the tool; zero in free space, where there is nothing to push."""
-    if plan.contact is None:
-        return torch.zeros_like(plan.targets.position[0])
-    return torch.nn.functional.normalize(eom.contact_points[plan.contact].normal, dim=-1)
 
 
 def _torque_limit(system: ConstrainedSystem, config: SimulationConfig) -> Tensor:

@@ -13,12 +13,19 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.destination import check_destination
 from forcegp.errors import ModelError
-from forcegp.files import MAX_HEADER_BYTES, Header, atomic_directory
+from forcegp.exchange import recover
+from forcegp.files import Header, atomic_directory
+from forcegp.limits import HEADER_BYTES, MODEL_BYTES
+from forcegp.memory import announce_memory
 from forcegp.storage.system import PREFIX, pack_system
+from forcegp.storage.validate import check_tensors
 
 HEADER_FILE = "model.json"
 TENSOR_FILE = "model.safetensors"
+COPIES = 3
+"""A model is in memory as the bytes of its file, and as tensors before and after they are aligned."""
 
 
 class ModelHeader(Header):
@@ -95,28 +102,55 @@ def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
         ModelError: no model is there, or a file of it is damaged; names the file.
     """
     folder = Path(path)
+    recover(folder)
     for name in (HEADER_FILE, TENSOR_FILE):
         if not (folder / name).is_file():
             raise ModelError(
                 f"{folder} holds no saved model", expected=f"a folder with {HEADER_FILE} and {TENSOR_FILE}"
             )
-    source = str(folder / HEADER_FILE)
-    with (folder / HEADER_FILE).open("rb") as file:
-        header = ModelHeader.from_json(file.read(MAX_HEADER_BYTES + 1), source, ModelError)
-    data = (folder / TENSOR_FILE).read_bytes()
-    if hashlib.sha256(data).hexdigest() != header.sha256:
+    source = folder / HEADER_FILE
+    header = ModelHeader.from_json(_content(source, HEADER_BYTES), str(source), ModelError)
+    data = _content(folder / TENSOR_FILE, MODEL_BYTES)
+    digest = hashlib.sha256(data).hexdigest()
+    if digest != header.sha256:
         raise ModelError(
             f"{folder / TENSOR_FILE}: the file is damaged, truncated or of another model",
             expected=f"the SHA-256 in {HEADER_FILE}, {header.sha256[:12]}…",
-            got=f"{hashlib.sha256(data).hexdigest()[:12]}…",
+            got=f"{digest[:12]}…",
             hint="copy the folder again from where it was written",
         )
     try:
         tensors = safetensors.torch.load(data)
-    except (safetensors.SafetensorError, KeyError, ValueError) as cause:
+    except (safetensors.SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as cause:
         raise ModelError(f"{folder / TENSOR_FILE}: not a safetensors file", got=str(cause)) from cause
+    check_tensors(tensors, str(folder / TENSOR_FILE))
     # Copies, since vectorised kernels may round differently on memory that is not aligned as their own.
     return header, {name: value.clone() for name, value in tensors.items()}
+
+
+def _content(file: Path, most: int) -> bytes:
+    """The bytes of a file of bounded size."""
+    try:
+        size = file.stat().st_size
+        if size > most:
+            raise ModelError(f"{file}: too large", expected=f"at most {most:,} bytes", got=f"{size:,}")
+        announce_memory(COPIES * size, f"reading {file}")
+        return file.read_bytes()
+    except OSError as cause:
+        raise ModelError(f"{file}: cannot be read", got=cause.strerror or str(cause)) from cause
+
+
+def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:
+    """Check, before a long fit, that `write_model` will be able to write a model.
+
+    Args:
+        path: the folder.
+        needed_bytes: room that the model takes, where it is known [bytes].
+
+    Raises:
+        DestinationError: the folder holds other files than a model, or the place cannot be written.
+    """
+    check_destination(path, folder=True, own_files=(HEADER_FILE,), needed_bytes=needed_bytes)
 
 
 def own_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -1,33 +1,27 @@
-"""Robot, constraints and stabilization as records of a JSON file."""
+"""Robot, constraints and stabilization as records of a JSON file; surfaces are described as in scenes."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from forcegp.constraints import (
-    Constraint,
-    Cylinder,
-    Plane,
-    PointConnection,
-    Sphere,
-    Surface,
-    SurfaceContact,
-)
+from forcegp.constraints import Constraint, PointConnection, SurfaceContact, SurfaceSchema
 
 Point = tuple[float, float, float]
-POINTS = ("point", "other_point", "normal", "center", "axis")
+POINTS = ("point", "other_point")
+SURFACES = get_args(get_args(SurfaceSchema)[0])
+"""The surfaces that can be saved."""
 
 
 class Record(BaseModel):
-    """What every record shares: no other fields, finite numbers, no changes."""
+    """Base of all records: frozen; unknown fields and numbers that are not finite are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class RobotRecord(Record):
-    """A `RobotModel` but for its tensors."""
+    """A `RobotModel` without its tensors."""
 
     name: str
     joint_names: tuple[str, ...]
@@ -38,43 +32,6 @@ class RobotRecord(Record):
     remarks: tuple[str, ...]
 
 
-class PlaneRecord(Record):
-    """A plane."""
-
-    type: Literal["plane"] = "plane"
-    normal: Point
-    offset: float
-
-    def build(self) -> Surface:
-        """The surface that is recorded."""
-        return Plane(self.normal, self.offset)
-
-
-class SphereRecord(Record):
-    """A sphere."""
-
-    type: Literal["sphere"] = "sphere"
-    center: Point
-    radius: float
-
-    def build(self) -> Surface:
-        """The surface that is recorded."""
-        return Sphere(self.center, self.radius)
-
-
-class CylinderRecord(Record):
-    """A cylinder."""
-
-    type: Literal["cylinder"] = "cylinder"
-    center: Point
-    axis: Point
-    radius: float
-
-    def build(self) -> Surface:
-        """The surface that is recorded."""
-        return Cylinder(self.center, self.axis, self.radius)
-
-
 class SurfaceContactRecord(Record):
     """A point of the robot on a surface."""
 
@@ -82,11 +39,11 @@ class SurfaceContactRecord(Record):
     name: str
     frame: str
     point: Point
-    surface: Annotated[PlaneRecord | SphereRecord | CylinderRecord, Field(discriminator="type")]
+    surface: SurfaceSchema
 
     def build(self) -> Constraint:
-        """The constraint that is recorded."""
-        return SurfaceContact(self.name, self.frame, self.point, self.surface.build())
+        """The constraint."""
+        return SurfaceContact(self.name, self.frame, self.point, self.surface)
 
 
 class PointConnectionRecord(Record):
@@ -100,12 +57,12 @@ class PointConnectionRecord(Record):
     other_point: Point
 
     def build(self) -> Constraint:
-        """The constraint that is recorded."""
+        """The constraint."""
         return PointConnection(self.name, self.frame, self.point, self.other_frame, self.other_point)
 
 
 class UnsavedRecord(Record):
-    """The place of a constraint that only Python code can describe."""
+    """Placeholder of a constraint that is defined in Python code."""
 
     type: Literal["unsaved"] = "unsaved"
     name: str
@@ -120,7 +77,7 @@ class BaumgarteRecord(Record):
 
 
 class SystemRecord(Record):
-    """A `ConstrainedSystem` but for the tensors of its robot."""
+    """A `ConstrainedSystem` without the tensors of its robot."""
 
     robot: RobotRecord
     contacts: tuple[
@@ -137,21 +94,12 @@ def fields_of(value: Any, record: type[Record]) -> dict[str, Any]:
     return kept | {name: tuple(map(float, kept[name])) for name in POINTS if name in kept}
 
 
-def _surface_record(surface: Surface) -> PlaneRecord | SphereRecord | CylinderRecord | None:
-    if type(surface) is Plane:
-        return PlaneRecord(**fields_of(surface, PlaneRecord))
-    if type(surface) is Sphere:
-        return SphereRecord(**fields_of(surface, SphereRecord))
-    return CylinderRecord(**fields_of(surface, CylinderRecord)) if type(surface) is Cylinder else None
-
-
 def contact_record(contact: Constraint) -> SurfaceContactRecord | PointConnectionRecord | UnsavedRecord:
-    """The record of a contact, or of its place where only Python code can describe it."""
+    """The record of a contact, or a placeholder if it is defined in Python code."""
     if type(contact) is PointConnection:
         return PointConnectionRecord(**fields_of(contact, PointConnectionRecord))
     if type(contact) is not SurfaceContact:
         return UnsavedRecord(name=contact.name, described_by=type(contact).__name__)
-    surface = _surface_record(contact.surface)
-    if surface is None:
+    if type(contact.surface) not in SURFACES:
         return UnsavedRecord(name=contact.name, described_by=type(contact.surface).__name__)
-    return SurfaceContactRecord(**fields_of(contact, SurfaceContactRecord), surface=surface)
+    return SurfaceContactRecord(**fields_of(contact, SurfaceContactRecord), surface=contact.surface)  # pyright: ignore[reportArgumentType]

@@ -1,8 +1,8 @@
 """A constrained system as JSON and tensors, so that a saved model needs no other file.
 
-The robot is kept as the tensors of `RobotModel`, bit for bit. Constraints written by the user in Python
-(an `ImplicitSurface`, a constraint of one's own) cannot be kept: their place is marked, and reading
-takes them from a system that the caller gives.
+The robot is saved as the tensors of `RobotModel`, bit for bit. Constraints that the user defines in Python
+(an `ImplicitSurface`, a subclass of `Constraint`) cannot be saved: the file has a placeholder, and reading
+takes them from a system that the caller passes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from forcegp.storage.records import (
 )
 
 PREFIX = "system."
-"""Of the names of the robot's tensors."""
+"""Prefix of the names of the robot's tensors."""
 SHAPES: dict[str, tuple[str | int, ...]] = {
     "placement_rotation": ("nq", 3, 3),
     "placement_position": ("nq", 3),
@@ -43,7 +43,7 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "base_position": (3,),
     "gravity": (3,),
 }
-"""Shape of each tensor of a robot; one number a joint where not named."""
+"""Shape of each tensor of a robot; one number per joint for all others."""
 MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
@@ -82,16 +82,18 @@ def unpack_system(
         json: the JSON object.
         tensors: at least the tensors named `system.<field>`.
         source: name of the file, for messages.
-        given: where to take constraints from that cannot be saved.
+        given: system that provides the constraints that cannot be saved.
 
     Raises:
-        ModelError: a field or tensor is missing, damaged or not valid, or a constraint is to be given.
+        ModelError: a field or tensor is missing or not valid, or a constraint that was not saved is needed.
     """
     try:
         record = SystemRecord.model_validate(dict(json))
     except ValidationError as cause:
         first = cause.errors()[0]
         place = ".".join(str(part) for part in ("system", *first["loc"]))
+        if isinstance(reason := first.get("ctx", {}).get("error"), ForceGPError):
+            raise ModelError.at(f"{source}: field {place!r}", reason) from cause
         raise ModelError(
             f"{source}: field {place!r} is not valid", expected=first["msg"], got=first["input"]
         ) from cause
@@ -116,7 +118,7 @@ def _contact(
         return record.build()
     if given is None:
         raise ModelError(
-            f"contact {record.name!r} is described by a {record.described_by} in Python, which is not saved",
+            f"contact {record.name!r} is a {record.described_by} defined in Python, which is not saved",
             hint="pass the system that the model was made with: load_model(path, system=…)",
         )
     return given.contact(record.name)
@@ -189,3 +191,29 @@ def take(
     if bool(value.isnan().any()) or (finite and not bool(torch.isfinite(value).all())):
         raise ModelError(f"{source}: tensor {name!r} holds values that are not finite")
     return value
+
+
+def robot_tensors(robot: RobotModel) -> list[str]:
+    """Names of the fields of a robot that are tensors."""
+    names = [field.name for field in dataclasses.fields(robot)]
+    return [name for name in names if isinstance(getattr(robot, name), Tensor)]
+
+
+def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
+    """A robot with tensors named `<prefix><field>`, and everything else as in another one.
+
+    Raises:
+        ModelError: a tensor is missing, of another shape or type, or not finite.
+    """
+    fields = {
+        name: take(
+            tensors,
+            prefix + name,
+            tuple(getattr(like, name).shape),
+            getattr(like, name).dtype,
+            source,
+            finite=name not in MAY_BE_INFINITE,
+        )
+        for name in robot_tensors(like)
+    }
+    return like.replace(**fields)

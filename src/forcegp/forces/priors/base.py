@@ -8,28 +8,28 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.states import States
+from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel
 from forcegp.robot.model import RobotModel
 
-RESERVED = ("noise", "analytical")
+JOINT, CONTACT, CONSTRAINT = "joint", "contact", "constraint"
+"""Targets of priors: the joint force Q, the contact's dissipative force Q_z, or the part of Q that acts
+against the constraint (the range of Aᵀ), which no acceleration in contact shows."""
+NOISE, ANALYTICAL = "noise", "analytical"
+RESERVED = (NOISE, ANALYTICAL)
 """Prefixes of what is learned beside the hyperparameters of the priors."""
 
 
 class ForcePrior(ABC):
     """A zero-mean prior on an unknown force f(x), carried to generalized forces by a known operator E(x).
 
-    The generalized force is E(x) f(x). A prior with `in_contact_only` contributes to Q_z, the others to Q.
+    The generalized force is E(x) f(x); `target` says whether it is part of Q, of Q_z, or of Q along the
+    constraint.
     """
 
     name: str
     kernel: Kernel
-    in_contact_only: bool
-
-    @property
-    def measurable(self) -> bool:
-        """Whether accelerations in contact or in free motion show the force."""
-        return True
+    target: str
 
     @property
     def prefix(self) -> str:

@@ -12,8 +12,8 @@ from torch.nn.functional import normalize
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
 from forcegp.errors import ModelError
-from forcegp.forces.priors.base import ForcePrior, check_inputs
-from forcegp.forces.states import States
+from forcegp.forces.priors.base import CONTACT, ForcePrior, check_inputs
+from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel
 from forcegp.gp.stationary import SquaredExponential
 from forcegp.robot.model import RobotModel
@@ -27,7 +27,7 @@ class SurfaceForcePrior(ForcePrior):
     kernel: Kernel = field(default_factory=SquaredExponential)
     inputs: tuple[str, ...] = ("position", "velocity")
     name: str = ""
-    in_contact_only: bool = True
+    target: str = CONTACT
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or f"contact_{self.contact}")

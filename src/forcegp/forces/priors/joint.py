@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.priors.base import ForcePrior, check_inputs
-from forcegp.forces.states import States
+from forcegp.forces.priors.base import JOINT, ForcePrior, check_inputs
+from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel
 from forcegp.gp.stationary import SquaredExponential
 from forcegp.robot.model import RobotModel
@@ -33,7 +33,7 @@ class JointForcePrior(ForcePrior):
     inputs: tuple[str, ...] = ("q", "qd", "tau")
     periodic: bool = False
     name: str = "joint"
-    in_contact_only: bool = False
+    target: str = JOINT
 
     def __post_init__(self) -> None:
         check_inputs(self.name, self.inputs, ("q", "qd", "tau"))

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.base import CONSTRAINT, ForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.states import States
+from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel
 from forcegp.robot.model import RobotModel
 
@@ -28,7 +28,7 @@ class NormalForcePrior(ForcePrior):
     """
 
     like: JointForcePrior = field(default_factory=JointForcePrior)
-    in_contact_only: bool = True
+    target: str = CONSTRAINT
 
     @property
     def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -37,10 +37,6 @@ class NormalForcePrior(ForcePrior):
     @property
     def kernel(self) -> Kernel:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.like.kernel
-
-    @property
-    def measurable(self) -> bool:
-        return False
 
     @property
     def prefix(self) -> str:

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.states import States
+from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel
 from forcegp.gp.stationary import SquaredExponential
 from forcegp.robot.model import RobotModel
@@ -26,7 +26,8 @@ class OperatorForcePrior(ForcePrior):
         operator_function: maps `(system, states)` to E(x) `(n, nq, size)`.
         feature_function: maps `(system, states)` to named inputs `(n, w)`; q, q̇, τ by default.
         kernel: covariance of each component.
-        in_contact_only: whether the force belongs to Q_z.
+        target: `joint`, `contact` or `constraint`: whether the force is part of Q, Q_z or Q along the
+            constraint.
     """
 
     name: str
@@ -34,7 +35,7 @@ class OperatorForcePrior(ForcePrior):
     operator_function: Callable[[ConstrainedSystem, States], Tensor]
     feature_function: Callable[[ConstrainedSystem, States], dict[str, Tensor]] | None = None
     kernel: Kernel = field(default_factory=SquaredExponential)
-    in_contact_only: bool = False
+    target: str = JOINT
 
     def outputs(self, robot: RobotModel) -> int:
         return self.size

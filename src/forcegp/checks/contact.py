@@ -1,0 +1,197 @@
+"""Does the tip touch the surface of the scene where the log says so?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from forcegp import kinematics
+from forcegp.checks.clock import Outcome
+from forcegp.checks.finding import Finding, Intervals
+from forcegp.checks.log import Log
+from forcegp.checks.residual import CHUNK, tensors
+from forcegp.checks.statistics import Array, describe, intervals, robust_std
+from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
+
+OFFSET = 5e-4
+"""Displacement of a surface that is reported [m]."""
+TILT = np.radians(0.2)
+"""Tilt of a surface that is reported [rad]."""
+FAR = 0.01
+"""Displacement of all contact rows that no calibration explains: another surface, point or label [m]."""
+TOUCH = 2e-4
+"""Distance within which a tip touches, at least: surfaces and arms are no stiffer [m]."""
+ROUGH = 8.0
+"""Robust standard deviations of the distance in contact within which a tip touches."""
+RUN_SECONDS = 0.02
+"""Shortest run of rows that a wrong label is reported for [s]."""
+MISSED_SECONDS = 0.1
+"""Shortest time along the surface that counts as a contact that was not labelled [s]."""
+MISSED_DISTANCE = 2e-3
+"""The tip must slide this far along the surface to count as in contact [m]."""
+LEAST_ROWS = 20
+
+
+@dataclass(frozen=True)
+class Path:
+    """Motion of the touching point of one contact.
+
+    Attributes:
+        c: `(n,)` distance from the surface of the scene [m].
+        p, v: `(n, 3)` position and velocity in the world [m], [m/s].
+        normal: `(n, 3)` out of the solid.
+    """
+
+    c: Array
+    p: Array
+    v: Array
+    normal: Array
+
+
+def tip_path(system: ConstrainedSystem, contact: SurfaceContact, log: Log) -> Path:
+    """Where the touching point was; NaN in rows that are not finite."""
+    n = len(log)
+    path = Path(np.full(n, np.nan), *(np.full((n, 3), np.nan) for _ in range(3)))
+    rows = np.flatnonzero(log.finite)
+    with torch.no_grad():
+        for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
+            q, qd = tensors(log, part, "q", "qd")
+            p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
+            path.p[part] = p.numpy()
+            path.v[part] = kinematics.point_velocity(
+                system.robot, q, qd, contact.frame, contact.point
+            ).numpy()
+            path.c[part] = contact.surface.value(p).numpy()
+            path.normal[part] = contact.surface.gradient(p).numpy()
+    return path
+
+
+def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Contact labels against the distance of the tip from the surface, contact by contact."""
+    found = []
+    for contact in system.contacts:
+        if contact.name not in log.contact:
+            text = f"the scene has a contact {contact.name!r}, and the log does not say when it is closed"
+            found.append(Finding("contact-unlabelled", text, log.all_rows, contact=contact.name))
+        elif isinstance(contact, SurfaceContact):
+            found += _check_surface(contact, tip_path(system, contact, log), log)
+    return found, log
+
+
+def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Finding]:
+    usable = np.isfinite(path.c) & log.usable
+    closed = log.contact[contact.name] & usable
+    if closed.sum() < LEAST_ROWS:
+        return []
+    found, distance = _placement(contact, path, closed, log)
+    touch = max(TOUCH, ROUGH * float(robust_std(distance[closed])))
+    return [*found, *_labels(contact, path, closed, usable, distance, touch, log)]
+
+
+def _placement(
+    contact: SurfaceContact, path: Path, closed: np.ndarray, log: Log
+) -> tuple[list[Finding], Array]:
+    """Displacement and tilt of the surface, and the distance from it once they are undone."""
+    offset, tilt, shift = _fit_surface(contact, path, closed)
+    rows = intervals(closed)
+    name, evidence = contact.name, {"offset_m": offset, "tilt_deg": float(np.degrees(np.linalg.norm(tilt)))}
+    distance = path.c - shift
+    if abs(np.median(path.c[closed])) > FAR:
+        text = f"in contact {name!r} the tip is {1e3 * np.median(path.c[closed]):+.3g} mm from the surface"
+        return [Finding("contact-far", text, rows, contact=name, evidence=evidence)], distance
+    found = []
+    if np.linalg.norm(tilt) > TILT:
+        text = f"the surface of {name!r} is tilted by {evidence['tilt_deg']:.3g}° against the tip's path"
+        evidence |= {f"slope_{axis}": float(value) for axis, value in zip("xyz", tilt, strict=True)}
+        found.append(Finding("surface-tilted", text, rows, contact=name, evidence=evidence))
+    if abs(offset) > OFFSET:
+        text = f"the surface of {name!r} lies {1e3 * offset:+.3g} mm along its normal from the scene's"
+        found.append(Finding("surface-offset", text, rows, contact=name, evidence={"offset_m": offset}))
+    return found, distance if found else path.c
+
+
+def _fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
+    """Offset in the middle of the path [m], slope along the surface `(3,)`, and the distance they make `(n,)`.
+
+    Rows that stay off the fit, such as those labelled too early, are trimmed round by round.
+    """
+    p = path.p - np.median(path.p[closed], axis=0)
+    keep, slope = closed.copy(), np.zeros(3)
+    offset = float(np.median(path.c[closed]))
+    if not isinstance(contact.surface, Plane):
+        return offset, slope, np.full(len(p), offset)
+    n = np.asarray(contact.surface.normal)
+    tangent = np.linalg.svd(n[None])[2][1:]
+    x = p @ tangent.T
+    for _ in range(10):
+        A = np.column_stack([x[keep], np.ones(keep.sum())])
+        # Directions along which the tip hardly moves do not show a tilt.
+        theta = np.linalg.lstsq(A, path.c[keep], rcond=1e-3)[0]
+        rest = path.c - x @ theta[:2] - theta[2]
+        limit = max(TOUCH, 4.0 * float(robust_std(rest[keep])))
+        trimmed = closed & (np.abs(rest) <= limit)
+        if trimmed.sum() < max(LEAST_ROWS, 0.5 * closed.sum()) or (trimmed == keep).all():
+            break
+        keep = trimmed
+    slope = theta[:2] @ tangent
+    if np.linalg.norm(slope) <= TILT:
+        offset = float(np.median(path.c[keep]))
+        return offset, np.zeros(3), np.full(len(p), offset)
+    return float(theta[2]), slope, x @ theta[:2] + theta[2]
+
+
+def _labels(
+    contact: SurfaceContact,
+    path: Path,
+    closed: np.ndarray,
+    usable: np.ndarray,
+    c: Array,
+    touch: float,
+    log: Log,
+) -> list[Finding]:
+    """Rows labelled closed off the surface, by where in the interval they lie, and open ones that slide on it."""
+    least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
+    off = closed & (np.abs(c) > touch)
+    runs: dict[str, list[tuple[int, int]]] = {"contact-early": [], "contact-late": [], "contact-far": []}
+    for start, stop in intervals(closed):
+        for a, b in intervals(off[start:stop], join=least):
+            if b - a >= least:
+                kind = "contact-early" if a == 0 and b < stop - start else "contact-late"
+                inside = (a > 0 and b < stop - start) or (a == 0 and b == stop - start)
+                runs["contact-far" if inside else kind].append((start + a, start + b))
+    texts = {
+        "contact-early": "labelled closed before the tip touches",
+        "contact-late": "labelled closed after the tip has left",
+        "contact-far": "labelled closed while the tip is off the surface",
+    }
+    found = []
+    for kind, spans in runs.items():
+        if spans:
+            rows: Intervals = tuple(spans)
+            most = max(float(np.abs(c[a:b]).max()) for a, b in rows)
+            text = f"contact {contact.name!r} is {texts[kind]}, by up to {1e3 * most:.3g} mm, in {describe(rows)}"
+            found.append(Finding(kind, text, rows, contact=contact.name, evidence={"distance_m": most}))
+    return [*found, *_missed(contact, path, usable & ~closed, c, touch, log)]
+
+
+def _missed(
+    contact: SurfaceContact, path: Path, open_: np.ndarray, c: Array, touch: float, log: Log
+) -> list[Finding]:
+    """Rows labelled open in which the tip slides along the surface."""
+    if not np.isfinite(log.dt):
+        return []
+    near = open_ & (np.abs(c) <= touch)
+    along = path.v - (path.v * path.normal).sum(axis=1, keepdims=True) * path.normal
+    speed = np.linalg.norm(along, axis=1)
+    least = max(3, round(MISSED_SECONDS / log.dt))
+    spans = tuple(
+        (a, b)
+        for a, b in intervals(near)
+        if b - a >= least and speed[a:b].sum() * log.dt > MISSED_DISTANCE + 20.0 * np.ptp(c[a:b])
+    )
+    if not spans:
+        return []
+    text = f"the tip slides on the surface of {contact.name!r} while labelled open, in {describe(spans)}"
+    return [Finding("contact-missed", text, spans, contact=contact.name)]

@@ -1,0 +1,142 @@
+"""From an accepted hypothesis to a finding in words, and to the log without the fault."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from forcegp.checks.finding import Finding
+from forcegp.checks.fit import Fit
+from forcegp.checks.hypotheses import Hypothesis
+from forcegp.checks.log import Log
+from forcegp.constraints import ConstrainedSystem
+
+CURRENT = 1.6
+"""Gains of all joints beyond this factor are no calibration error: another quantity was logged."""
+TILT = 30.0
+"""Largest angle at which a base counts as tilted, not as mounted another way round [degrees]."""
+WEIGHTLESS = 0.3
+"""Share of gravity below which the torque holds none of it."""
+SIGNIFICANT = 3.0
+"""Standard errors from which a parameter of a tool counts."""
+
+
+SMALL_ANGLE = np.radians(0.5)
+"""Encoder offsets below this are within calibration, or an error of a centre of mass [rad]."""
+SMALL_GAIN = 0.05
+"""Gains closer to 1 than this are within the accuracy of torque sensors and masses."""
+
+
+def plausible(hypothesis: Hypothesis, fit: Fit) -> bool:
+    """Whether the parameters of a hypothesis are what it says: a tool has a mass, an offset is not a trifle."""
+    if hypothesis.name == "encoder-offset":
+        return bool(abs(fit.theta[0]) > max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0]))
+    if hypothesis.name == "gains":
+        return bool((np.abs(fit.theta[: len(hypothesis.joints)]) > SMALL_GAIN).any())
+    if hypothesis.name == "payload":
+        return bool(fit.theta[0] > SIGNIFICANT * fit.spread[0])
+    return True
+
+
+def corrected(hypothesis: Hypothesis, fit: Fit) -> Log | None:
+    """The log without the fault, or `None` where the robot is at fault."""
+    log, joints = hypothesis.log, list(hypothesis.joints)
+    if hypothesis.name == "gains":
+        tau = log.tau.copy()
+        # r = u − τ = g τ: the right torque is (1 + g) τ.
+        tau[:, joints] *= 1.0 + fit.theta[: len(joints)]
+        return log.replace(tau=tau)
+    if hypothesis.name == "encoder-offset":
+        q = log.q.copy()
+        q[:, joints] += fit.theta[:1]
+        return log.replace(q=q)
+    return log if hypothesis.columns is None else None
+
+
+def finding_of(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> list[Finding]:
+    """The finding that a hypothesis stands for."""
+    names = tuple(log.joint_names[j] for j in hypothesis.joints)
+    listed = "all joints" if len(names) == log.nq > 1 else " and ".join(names)
+    texts = {
+        "torque-sign": f"the torque of {listed} fits the motion with the opposite sign",
+        "joint-sign": f"{listed} fits the robot file when it turns the other way",
+        "torque-order": f"the torques of {listed} fit when exchanged",
+        "joint-order": f"{listed} fit the robot file when exchanged",
+    }
+    if hypothesis.name in texts:
+        return [Finding(hypothesis.name, texts[hypothesis.name], log.all_rows, names)]
+    return [_PARAMETRIC[hypothesis.name](system, log, hypothesis, fit)]
+
+
+def _delay(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+    seconds = abs(hypothesis.shift) * log.dt
+    word = "after" if hypothesis.shift > 0 else "before"
+    text = (
+        f"the torque is logged about {1e3 * seconds:.3g} ms ({abs(hypothesis.shift)} rows) {word} the motion"
+    )
+    return Finding(
+        "torque-delay", text, log.all_rows, evidence={"rows": hypothesis.shift, "seconds": seconds}
+    )
+
+
+def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+    gains = 1.0 + fit.theta[: len(hypothesis.joints)]
+    names = tuple(log.joint_names[j] for j in hypothesis.joints)
+    evidence = {f"factor {name}": gain for name, gain in zip(names, gains, strict=True)}
+    listed = ", ".join(f"{name} {gain:.3g}" for name, gain in zip(names, gains, strict=True))
+    factor = np.exp(np.abs(np.log(np.abs(gains) + 1e-12)))
+    if len(names) > 1 and np.median(factor) > CURRENT:
+        text = f"torques fit when multiplied by {listed}: currents, or torques on the motor side"
+        return Finding("torque-current", text, log.all_rows, names, evidence=evidence)
+    off = [k for k in range(len(names)) if factor[k] > 1.05]
+    text = f"torques fit when multiplied by {listed}"
+    return Finding(
+        "torque-gain", text, log.all_rows, tuple(names[k] for k in off) or names, evidence=evidence
+    )
+
+
+def _encoder(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+    name, offset = log.joint_names[hypothesis.joints[0]], float(fit.theta[0])
+    text = (
+        f"{name} fits with {offset:+.4f} rad ({np.degrees(offset):+.2f}°) added to its position, "
+        f"± {fit.spread[0]:.4f}"
+    )
+    return Finding("encoder-offset", text, log.all_rows, (name,), evidence={"add_rad": offset})
+
+
+def _gravity(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+    assumed = system.robot.gravity.numpy()
+    found = assumed + fit.theta[:3]
+    size, given = np.linalg.norm(found), np.linalg.norm(assumed)
+    angle = float(np.degrees(np.arccos(np.clip(found @ assumed / max(size * given, 1e-12), -1.0, 1.0))))
+    evidence = {"angle_deg": angle, **{f"g{axis}": value for axis, value in zip("xyz", found, strict=True)}}
+    vector = ", ".join(f"{value:.3g}" for value in found)
+    if given > 0.0 and size < WEIGHTLESS * given:
+        text = "the torque holds no gravity: a torque with gravity compensation taken off"
+        return Finding("torque-without-gravity", text, log.all_rows, log.joint_names, evidence=evidence)
+    tilted = given > 0.0 and angle <= TILT
+    text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"
+    return Finding("base-tilted" if tilted else "gravity-direction", text, log.all_rows, evidence=evidence)
+
+
+def _payload(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+    mass = float(fit.theta[0])
+    text = f"the torque fits with {mass:.3g} ± {fit.spread[0]:.2g} kg more on the last link"
+    evidence = {"mass_kg": mass, "spread_kg": fit.spread[0]}
+    return Finding("payload-missing", text, log.all_rows, (log.joint_names[-1],), evidence=evidence)
+
+
+def _masses(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+    text = "the torque fits better with other masses and centres of mass than those of the robot file"
+    worst = int(np.argmax(np.abs(fit.theta[: 10 * log.nq].reshape(log.nq, 10)[:, 0])))
+    evidence = {"largest_mass_change_kg": fit.theta[10 * worst]}
+    return Finding("masses-mismatch", text, log.all_rows, (log.joint_names[worst],), evidence=evidence)
+
+
+_PARAMETRIC = {
+    "torque-delay": _delay,
+    "gains": _gains,
+    "encoder-offset": _encoder,
+    "gravity": _gravity,
+    "payload": _payload,
+    "masses": _masses,
+}

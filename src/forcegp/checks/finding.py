@@ -1,0 +1,121 @@
+"""What a check says about a log: findings with rows, severity and remedy, and the report of them all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from forcegp.checks.kinds import KINDS
+from forcegp.errors import UnknownNameError
+
+Severity = Literal["note", "warning", "error"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+"""From the gravest to the lightest."""
+
+Intervals = tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a check found in a log.
+
+    Args:
+        kind: one of `KINDS`.
+        message: what was found, with its numbers.
+        intervals: rows concerned, half-open and increasing, counted from 0.
+        joints: the joints concerned.
+        contact: the contact concerned, if one is.
+        evidence: the numbers behind the message, by name.
+        weight: severity where it differs from that of the kind.
+
+    Raises:
+        UnknownNameError: no such kind.
+    """
+
+    kind: str
+    message: str
+    intervals: Intervals
+    joints: tuple[str, ...] = ()
+    contact: str | None = None
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    weight: Severity | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise UnknownNameError("kind of finding", self.kind, KINDS)
+
+    @property
+    def severity(self) -> Severity:
+        """`"error"` makes a fit worthless, `"warning"` biases it, `"note"` is worth knowing."""
+        return self.weight or KINDS[self.kind].severity
+
+    @property
+    def remedy(self) -> str:
+        """What to do about it."""
+        return KINDS[self.kind].remedy
+
+    @property
+    def rows(self) -> int:
+        """Number of rows concerned."""
+        return sum(stop - start for start, stop in self.intervals)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The finding as JSON holds it."""
+        return {
+            "kind": self.kind,
+            "severity": self.severity,
+            "message": self.message,
+            "remedy": self.remedy,
+            "intervals": [list(interval) for interval in self.intervals],
+            "joints": list(self.joints),
+            "contact": self.contact,
+            "evidence": {name: float(value) for name, value in self.evidence.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Report:
+    """All findings on a log, the gravest first.
+
+    Attributes:
+        findings: what was found.
+        samples: number of rows of the log.
+        joint_names: its joints.
+        skipped: checks that could not be made, with the reason.
+    """
+
+    findings: tuple[Finding, ...]
+    samples: int
+    joint_names: tuple[str, ...]
+    skipped: Mapping[str, str] = field(default_factory=dict)
+
+    def count(self, severity: Severity) -> int:
+        """Number of findings of a severity."""
+        return sum(finding.severity == severity for finding in self.findings)
+
+    @property
+    def usable(self) -> bool:
+        """Whether a model can be fitted to the log."""
+        return self.count("error") == 0
+
+    @property
+    def verdict(self) -> str:
+        """One line that says whether to go on."""
+        errors, warnings = self.count("error"), self.count("warning")
+        if errors:
+            return f"verdict: stop; repair {errors} error{'s' * (errors > 1)} before fitting a model"
+        if warnings:
+            return f"verdict: go on with care; {warnings} warning{'s' * (warnings > 1)} to look at"
+        return "verdict: go on"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as JSON holds it."""
+        return {
+            "samples": self.samples,
+            "joint_names": list(self.joint_names),
+            "usable": self.usable,
+            "verdict": self.verdict,
+            "findings": [finding.to_dict() for finding in self.findings],
+            "skipped": dict(self.skipped),
+        }

@@ -1,0 +1,175 @@
+"""What may be wrong with a log or a robot file, one hypothesis each, and the log or the torque that follows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import torch
+
+from forcegp import dynamics
+from forcegp.checks.fit import Problem
+from forcegp.checks.log import Log
+from forcegp.checks.residual import residual, tensors
+from forcegp.checks.statistics import Array
+from forcegp.constraints import ConstrainedSystem
+from forcegp.identification import regressor
+
+LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
+"""Delays between torque and motion that are tried, in samples either way."""
+MASS_SHARE = 0.3
+"""How far the masses of a robot file may be off, as a share."""
+MOMENT_ARM = 0.1
+"""How far centres of mass may be off [m]."""
+TOOL_MASS = 5.0
+"""How heavy a tool may be that the robot file lacks [kg]."""
+GRAVITY = 10.0
+"""How far gravity may be off [m/s²]."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One explanation.
+
+    Attributes:
+        name: what is wrong: a kind of finding, or a family of kinds.
+        size: number of parameters, discrete choices counted as none.
+        log: the log as it would be, were the hypothesis right.
+        columns: `(n, nq, p)` torque that the parameters add to r, if there are any.
+        prior: `(p,)` how large the parameters may be.
+        joints: indices of the joints concerned.
+        shift: delay of the torque in samples.
+    """
+
+    name: str
+    size: int
+    log: Log
+    columns: Array | None = None
+    prior: Array | None = None
+    joints: tuple[int, ...] = ()
+    shift: int = 0
+
+
+def problem_of(system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None) -> Problem:
+    """The torques of some rows, to be explained by joint friction and an offset per joint."""
+    left, nuisance = residual(system, log, rows), friction_columns(system, log, rows)
+    size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
+    size = np.maximum(size, 1e-3 * size.max())
+    return Problem(left.r, left.J, nuisance, size, size if scale is None else scale)
+
+
+def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
+    """Viscous friction, Coulomb friction and a constant, one of each per joint, `(n, nq, 3 nq)`."""
+    qd = log.qd[rows]
+    smooth = np.tanh(qd / system.robot.friction_velocity.numpy())
+    return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
+
+
+def with_log(problem: Problem, system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Problem:
+    """The same problem on a log that a hypothesis has changed."""
+    return problem_of(system, log, rows, problem.scale)
+
+
+def _diagonal(x: Array) -> Array:
+    """`(n, nq, nq)` with x on the diagonal."""
+    return x[..., None] * np.eye(x.shape[-1])
+
+
+def flipped(log: Log, j: int | slice, *names: str) -> Log:
+    """The log with the sign of some columns changed."""
+    sign = np.ones(log.nq)
+    sign[j] = -1.0
+    return log.replace(**{name: getattr(log, name) * sign for name in names})
+
+
+def swapped(log: Log, i: int, j: int, *names: str) -> Log:
+    """The log with two joints exchanged in some columns."""
+    order = np.arange(log.nq)
+    order[[i, j]] = j, i
+    return log.replace(**{name: getattr(log, name)[:, order] for name in names})
+
+
+def delayed(log: Log, shift: int) -> Log:
+    """The log with the torque of `shift` rows later, within each stretch; rows without one are masked."""
+    tau, lost = log.tau.copy(), np.ones(len(log), bool)
+    for s in log.stretches:
+        source = np.arange(s.start, s.stop) + shift
+        inside = (source >= s.start) & (source < s.stop)
+        tau[s][inside], lost[s] = log.tau[source[inside]], ~inside
+    return log.replace(tau=tau).mask(lost)
+
+
+def discrete(log: Log) -> Iterator[Hypothesis]:
+    """Signs, orders, units and delays: explanations without a parameter to fit."""
+    motion = ("q", "qd", "qdd")
+    if log.nq > 1:
+        yield Hypothesis("torque-sign", 0, flipped(log, slice(None), "tau"), joints=tuple(range(log.nq)))
+    for j in range(log.nq):
+        yield Hypothesis("torque-sign", 0, flipped(log, j, "tau"), joints=(j,))
+        yield Hypothesis("joint-sign", 0, flipped(log, j, *motion, "tau"), joints=(j,))
+        yield Hypothesis("joint-sign", 0, flipped(log, j, *motion), joints=(j,))
+    for i, j in combinations(range(log.nq), 2):
+        yield Hypothesis("torque-order", 0, swapped(log, i, j, "tau"), joints=(i, j))
+        yield Hypothesis("joint-order", 0, swapped(log, i, j, *motion, "tau"), joints=(i, j))
+    if log.stretches:
+        for lag in LAGS:
+            for shift in (lag, -lag):
+                yield Hypothesis("torque-delay", 1, delayed(log, shift), shift=shift)
+
+
+def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
+    """Gains, offsets, gravity, tool and masses: explanations with parameters."""
+    q, qd, qdd, tau = tensors(log, rows, "q", "qd", "qdd", "tau")
+    gains = _diagonal(tau.numpy())
+    yield Hypothesis("gains", log.nq, log, gains, np.full(log.nq, 100.0), tuple(range(log.nq)))
+    for j in range(log.nq):
+        yield Hypothesis("gains", 1, log, gains[..., [j]], np.full(1, 100.0), (j,))
+    for j in range(log.nq):
+        columns = _offset_column(system, j, q, qd, qdd)
+        # r = u(q) − τ, and u(q + δ) − τ vanishes: r = −∂u/∂q δ.
+        yield Hypothesis("encoder-offset", 1, log, -columns[..., None], np.full(1, 1.0), (j,))
+    for name in ROBOT:
+        columns, prior = robot_columns(system, log, rows, name)
+        yield Hypothesis(name, columns.shape[-1], log, columns, prior)
+
+
+ROBOT = ("gravity", "payload", "masses")
+"""Hypotheses about the robot file, which leave the log as it is."""
+
+
+def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
+    """Torque `(n, nq, p)` per unit of each parameter of the robot that may be off, and how far it may be `(p,)`."""
+    robot = system.robot
+    q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
+    if name == "gravity":
+        return _gravity_columns(system, q), np.full(3, GRAVITY)
+    with torch.no_grad():
+        Y = regressor(robot, q, qd, qdd).numpy()
+    # r = Y π₀ − τ = −Y δ for parameters that are off by δ.
+    if name == "payload":
+        tool = [TOOL_MASS, *[TOOL_MASS * MOMENT_ARM] * 3, *[TOOL_MASS * MOMENT_ARM**2] * 6]
+        return -Y[..., -10:], np.array(tool)
+    mass = robot.mass.numpy()[:, None]
+    share = np.array([MASS_SHARE, *[MOMENT_ARM] * 3, *[MOMENT_ARM**2] * 6])
+    return -Y, (np.maximum(mass, 0.01 * mass.max()) * share).ravel()
+
+
+def _offset_column(system: ConstrainedSystem, j: int, *motion: torch.Tensor) -> Array:
+    """∂u/∂q_j of the inverse dynamics by central differences, `(n, nq)`."""
+    q, qd, qdd = motion
+    step = torch.zeros(q.shape[-1], dtype=q.dtype)
+    step[j] = 1e-4
+    with torch.no_grad():
+        ahead = dynamics.inverse_dynamics(system.robot, q + step, qd, qdd)
+        behind = dynamics.inverse_dynamics(system.robot, q - step, qd, qdd)
+    return ((ahead - behind) / 2e-4).numpy()
+
+
+def _gravity_columns(system: ConstrainedSystem, q: torch.Tensor) -> Array:
+    """Q_G per unit of gravity along each world axis, `(n, nq, 3)`: r = Q_G(δ) for gravity off by δ."""
+    axes = torch.eye(3, dtype=q.dtype)
+    with torch.no_grad():
+        columns = [dynamics.gravity_force(replace(system.robot, gravity=axis), q) for axis in axes]
+    return torch.stack(columns, dim=-1).numpy()

@@ -1,0 +1,236 @@
+"""Is qd the derivative of q, and qdd that of qd? Units of time and angle, signs and order of columns.
+
+Over short windows the change of x is compared with the integral I of its logged rate. Noise in either
+flattens one of the two regression lines, so the slope of Δx over I lies between cov/var(I) and
+var(Δx)/cov: a rate is at fault where both bounds are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from forcegp.checks.clock import Outcome
+from forcegp.checks.finding import Finding
+from forcegp.checks.limits import DEGREE
+from forcegp.checks.log import Log
+from forcegp.checks.statistics import Array, robust_std
+from forcegp.constraints import ConstrainedSystem
+
+WINDOW = 0.05
+"""Length of a window [s]; long enough that noise averages out, short against the motion."""
+TOLERANCE = 0.05
+"""A slope within this of 1 is right: filters and uneven clocks cost a few percent."""
+RELATED = 0.7
+"""Correlation below which a velocity does not belong to its position, encoder steps aside."""
+UNITS = (1e-9, 1e-6, 1e-3, 1e3)
+"""Seconds over the unit of a clock in ns, µs, ms or ks."""
+UNIT_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True)
+class Match:
+    """Changes and integrals of one level, and the slopes between them.
+
+    Attributes:
+        change, integral: `(w, nq)` over windows.
+        low, high: `(nq,)` bounds of the slope.
+        correlation: `(nq,)`.
+        moving: `(nq,)` bool, joints whose change stands out from noise.
+    """
+
+    change: Array
+    integral: Array
+    low: Array
+    high: Array
+    correlation: Array
+    moving: np.ndarray
+
+    def right(self, factor: float = 1.0) -> np.ndarray:
+        """`(nq,)` bool, whether a slope can be this factor."""
+        ratio = np.stack([self.low, self.high]) / factor
+        return (ratio.min(axis=0) < 1.0 + TOLERANCE) & (ratio.max(axis=0) > 1.0 - TOLERANCE)
+
+
+def match(log: Log, value: str, rate: str) -> Match | None:
+    """Compare changes of a column with integrals of its rate; `None` where there are too few windows."""
+    x, v = getattr(log, value), getattr(log, rate)
+    width = max(2, round(WINDOW / log.dt)) if log.dt < WINDOW else 2
+    changes, integrals = [], []
+    for s in log.stretches:
+        dt = np.diff(log.t[s])[:, None]
+        total = np.concatenate([np.zeros((1, log.nq)), np.cumsum(0.5 * (v[s][1:] + v[s][:-1]) * dt, axis=0)])
+        changes.append(np.diff(x[s][::width], axis=0))
+        integrals.append(np.diff(total[::width], axis=0))
+    if sum(map(len, changes)) < 20:
+        return None
+    change, integral = _without_jumps(np.concatenate(changes), np.concatenate(integrals))
+    cross, own, other = (
+        (a * b).sum(axis=0) for a, b in ((change, integral), (integral, integral), (change, change))
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high, correlation = cross / own, other / cross, cross / np.sqrt(own * other)
+    speed = np.sqrt(other)
+    moving = speed > 1e-3 * speed.max()
+    return Match(change, integral, *np.nan_to_num((low, high, correlation)), moving)
+
+
+def _without_jumps(change: Array, integral: Array) -> tuple[Array, Array]:
+    """Windows without those that an impact crosses."""
+    scale = np.sqrt((change**2).sum(axis=0) / np.maximum((integral**2).sum(axis=0), 1e-300))
+    misfit = change - scale * integral
+    keep = (np.abs(misfit) <= 8.0 * robust_std(misfit) + 1e-12).all(axis=1)
+    return (change[keep], integral[keep]) if keep.mean() > 0.9 else (change, integral)
+
+
+def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
+    """One factor between changes and integrals of all joints and both levels: the clock is at fault."""
+    if not log.stretches:
+        return [], log
+    if log.derived:
+        return _check_long_step(log)
+    first, second = match(log, "q", "qd"), match(log, "qd", "qdd")
+    if first is None or second is None:
+        return [], log
+    factor = float(np.median(first.low[first.moving]))
+    if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or not first.right(factor)[first.moving].all():
+        return [], log
+    both = first.moving & second.moving
+    # The velocity alone being off leaves the acceleration its derivative.
+    if second.right()[both].mean() > 0.5 or second.right(factor)[both].mean() < 0.5:
+        return [], log
+    return _clock_finding(log, factor)
+
+
+def _clock_finding(log: Log, factor: float) -> Outcome:
+    near = [unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE]
+    evidence = {"seconds_per_unit": factor, "period": log.dt}
+    if near:
+        text = f"time advances by {log.dt:.4g} per row, and the motion says {factor * log.dt:.4g} s"
+        found = Finding("time-unit", text, log.all_rows, evidence=evidence)
+        return [found], log.replace(t=log.t * near[0])
+    text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
+    return [Finding("time-scale", text, log.all_rows, evidence=evidence)], log.replace(t=log.t * factor)
+
+
+def _check_long_step(log: Log) -> Outcome:
+    """Without logged velocities and accelerations only the length of a step tells the unit of time."""
+    if "qd" not in log.derived:
+        first = match(log, "q", "qd")
+        factor = float(np.median(first.low[first.moving])) if first is not None else 1.0
+        near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
+        return _clock_finding(log, factor) if near else ([], log)
+    if log.dt < 1.0:
+        return [], log
+    text = f"rows are {log.dt:.4g} apart, which in seconds is no sampling period of a robot's log"
+    return [Finding("time-unit", text, log.all_rows, evidence={"period": log.dt})], log
+
+
+def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Velocities that are not the derivative of the positions: unit, sign, order, or nothing alike."""
+    if not log.stretches or "qd" in log.derived:
+        return [], log
+    level = match(log, "q", "qd")
+    if level is None:
+        return [], log
+    wrong = level.moving & (~level.right() | (np.abs(level.correlation) < RELATED)) & ~_coarse(log, level)
+    if not wrong.any():
+        return [], log
+    permutation = _permutation(level)
+    if permutation is not None:
+        names = [log.joint_names[j] for j in np.flatnonzero(permutation != np.arange(log.nq))]
+        text = f"the velocities of {', '.join(names)} belong to each other's positions"
+        found = Finding("velocity-order", text, log.all_rows, tuple(names))
+        return [found], log.replace(qd=log.qd[:, permutation], qdd=_follow(log, permutation))
+    found, factor = _velocity_findings(log, level, wrong)
+    return found, log.replace(qd=log.qd * factor)
+
+
+def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
+    """One finding per cause, and the factors that undo it."""
+    causes = {"velocity-sign": -1.0, "degrees": 1.0 / DEGREE, "degrees ": DEGREE}
+    found, factor, left = [], np.ones(log.nq), wrong.copy()
+    for name, slope in causes.items():
+        kind = name.strip()
+        hit = left & level.right(slope) & (np.abs(level.correlation) >= RELATED)
+        if not hit.any():
+            continue
+        joints = tuple(log.joint_names[j] for j in np.flatnonzero(hit))
+        evidence = {"slope": float(np.median(level.low[hit]))}
+        what = {-1.0: "runs against", 1.0 / DEGREE: "is 1/57 of", DEGREE: "is 57 times"}[slope]
+        text = f"qd of {', '.join(joints)} {what} the rate of change of q"
+        found.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
+        factor[hit], left = slope, left & ~hit
+    if left.any():
+        joints = tuple(log.joint_names[j] for j in np.flatnonzero(left))
+        j = int(np.flatnonzero(left)[0])
+        text = (
+            f"qd of {', '.join(joints)} is not the rate of change of q: slope {level.low[j]:.3g}, "
+            f"correlation {level.correlation[j]:.3g}"
+        )
+        evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
+        found.append(Finding("velocity-mismatch", text, log.all_rows, joints, evidence=evidence))
+    return found, factor
+
+
+def _coarse(log: Log, level: Match) -> np.ndarray:
+    """Joints whose changes are of the size of encoder steps, so that nothing can be told of their rate."""
+    size = np.sqrt((level.change**2).mean(axis=0))
+    steps = np.array(
+        [np.median(np.abs(x[x != 0.0])) if (x != 0.0).any() else 0.0 for x in np.diff(log.q, axis=0).T]
+    )
+    return size <= 3.0 * np.where((np.diff(log.q, axis=0) == 0.0).mean(axis=0) > 0.3, steps, 0.0)
+
+
+def _permutation(level: Match) -> np.ndarray | None:
+    """The order of rates that fits the changes of all joints where their own does not, if there is one."""
+    from scipy.optimize import linear_sum_assignment
+
+    size = np.sqrt((level.change**2).sum(axis=0)), np.sqrt((level.integral**2).sum(axis=0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        alike = np.nan_to_num(level.change.T @ level.integral / np.outer(*size))
+    _, order = linear_sum_assignment(-alike)
+    moved = order != np.arange(len(order))
+    if not moved.any():
+        return None
+    fits = alike[np.arange(len(order)), order][moved & level.moving]
+    own = level.correlation[moved & level.moving]
+    return order if len(fits) and fits.min() > 0.95 and own.max() < RELATED else None
+
+
+def _follow(log: Log, permutation: np.ndarray) -> Array:
+    """Accelerations in the order of the velocities, where they had the order of the wrong ones."""
+    level = match(log, "qd", "qdd")
+    moved = permutation != np.arange(log.nq)
+    together = level is not None and np.median(level.correlation[moved]) > RELATED
+    return log.qdd[:, permutation] if together else log.qdd
+
+
+def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Accelerations that are not the derivative of the velocities, beyond what their noise explains."""
+    if not log.stretches or log.derived:
+        return [], log
+    level = match(log, "qd", "qdd")
+    if level is None:
+        return [], log
+    related = np.abs(level.correlation) > 0.3
+    wrong = level.moving & related & ~level.right()
+    # An acceleration without relation to the motion shows where its integral is as large as the change.
+    size = np.sqrt((level.integral**2).sum(axis=0) / np.maximum((level.change**2).sum(axis=0), 1e-300))
+    wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))
+    if not wrong.any():
+        return [], log
+    joints = tuple(log.joint_names[j] for j in np.flatnonzero(wrong))
+    j = int(np.flatnonzero(wrong)[0])
+    text = (
+        f"qdd of {', '.join(joints)} is not the rate of change of qd: slope {level.low[j]:.3g}, "
+        f"correlation {level.correlation[j]:.3g}"
+    )
+    evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
+    qdd = log.qdd.copy()
+    for s in log.stretches:
+        qdd[s, wrong] = np.gradient(log.qd[s][:, wrong], log.t[s], axis=0)
+    return [Finding("acceleration-mismatch", text, log.all_rows, joints, evidence=evidence)], log.replace(
+        qdd=qdd
+    )

@@ -1,0 +1,108 @@
+"""Values beyond the limits of the robot file, torques that clip, and degrees that look like radians."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from forcegp.checks.clock import Outcome
+from forcegp.checks.finding import Finding
+from forcegp.checks.log import Log
+from forcegp.checks.statistics import Array, describe, intervals
+from forcegp.constraints import ConstrainedSystem
+
+DEGREE = np.pi / 180.0
+TURN = 2.0 * np.pi
+SLACK = 1e-3
+"""Share of a limit by which it may be exceeded: rounding, and encoders that read a little beyond a stop."""
+CLIPPED_RUN = 3
+"""Rows in a row at the same extreme value that make a plateau."""
+OFTEN = 0.05
+"""Share of rows beyond the limits from which a wrong unit is considered."""
+
+
+def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
+    """Lower and upper limits by column."""
+    r = system.robot
+    low, high, speed, effort = (
+        x.detach().cpu().numpy() for x in (r.lower, r.upper, r.velocity_limit, r.effort_limit)
+    )
+    return {"q": (low, high), "qd": (-speed, speed), "tau": (-effort, effort)}
+
+
+def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Angles that leave the joint's range often, and would stay within it if they were in degrees."""
+    low, high = _limits(system)["q"]
+    turning = system.robot.revolute.cpu().numpy() > 0.0
+    low, high = np.where(np.isfinite(low), low, -TURN), np.where(np.isfinite(high), high, TURN)
+    q = log.q[log.usable]
+    if not len(q) or not turning.any():
+        return [], log
+    outside = ((q < low) | (q > high))[:, turning].any(axis=1).mean()
+    scaled = q * DEGREE
+    still = ((scaled < low - 0.1) | (scaled > high + 0.1))[:, turning].any(axis=1).mean()
+    largest = float(np.abs(q[:, turning]).max())
+    if outside < OFTEN or still > 0.0 or largest < TURN:
+        return [], log
+    text = (
+        f"angles reach {largest:.4g}, beyond the joint limits in {100 * outside:.0f} % of the rows: degrees"
+    )
+    names = tuple(np.array(log.joint_names)[turning])
+    factor = np.where(turning, DEGREE, 1.0)
+    found = Finding("degrees", text, log.all_rows, names, evidence={"largest": largest})
+    # Velocities follow the angles where they are their derivative; the check of units comes after.
+    return [found], log.replace(**{name: getattr(log, name) * factor for name in _angles(log, turning)})
+
+
+def _angles(log: Log, turning: np.ndarray) -> list[str]:
+    """The columns in degrees where angles are: velocities that are the derivative of the angles."""
+    columns = ["q"]
+    for name, source in (("qd", "q"), ("qdd", "qd")):
+        step = [np.abs(np.diff(getattr(log, source)[s], axis=0)).sum() for s in log.stretches]
+        path = [np.abs(getattr(log, name)[s]).sum() * log.dt for s in log.stretches]
+        if source in columns and sum(path) > 0.1 * sum(step):
+            columns.append(name)
+    return columns
+
+
+def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Positions, velocities and torques beyond the limits of the robot file."""
+    kinds = {"q": "position-limit", "qd": "velocity-limit", "tau": "torque-limit"}
+    found = []
+    for name, (low, high) in _limits(system).items():
+        value = getattr(log, name)
+        slack = SLACK * np.where(np.isfinite(high - low), high - low, 0.0)
+        with np.errstate(invalid="ignore"):
+            beyond = ((value < low - slack) | (value > high + slack)) & log.usable[:, None]
+        if beyond.any():
+            rows = intervals(beyond.any(axis=1))
+            joints = tuple(log.joint_names[j] for j in np.flatnonzero(beyond.any(axis=0)))
+            text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in {describe(rows)}"
+            found.append(
+                Finding(kinds[name], text, rows, joints, evidence={"rows": beyond.any(axis=1).sum()})
+            )
+    return found, log
+
+
+def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Torques that stay at their largest value for several rows: the amplifier clips."""
+    clipped = np.zeros(log.tau.shape, bool)
+    for j in range(log.nq):
+        tau = log.tau[:, j]
+        usable = tau[log.usable]
+        if not len(usable) or np.ptp(usable) == 0.0:
+            continue
+        # An extreme value that the column reaches far more often than its neighbourhood is a limit.
+        for extreme in (usable.max(), usable.min()):
+            at = (tau == extreme) & log.usable
+            near = np.abs(usable - extreme) <= 0.01 * np.ptp(usable)
+            runs = [(a, b) for a, b in intervals(at) if b - a >= CLIPPED_RUN]
+            levels = len(np.unique(usable[near]))
+            if runs and at.sum() > max(0.5 * near.sum(), levels) and extreme != 0.0:
+                for a, b in runs:
+                    clipped[a:b, j] = True
+    if not clipped.any():
+        return [], log
+    rows = intervals(clipped.any(axis=1))
+    joints = tuple(log.joint_names[j] for j in np.flatnonzero(clipped.any(axis=0)))
+    text = f"the torque of {', '.join(joints)} stays at its largest value in {describe(rows)}"
+    return [Finding("torque-saturated", text, rows, joints)], log

@@ -1,0 +1,196 @@
+"""A log as it was recorded, valid or not: NaN and backward time are findings here, not errors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forcegp.checks.statistics import Array, intervals, robust_std
+from forcegp.data.check import check_joints
+from forcegp.data.columns import JOINT_VECTORS, parse
+from forcegp.data.dataset import Dataset
+from forcegp.data.derivative import SavitzkyGolay, differentiate
+from forcegp.data.header import DataHeader
+from forcegp.data.table import read_table
+from forcegp.errors import DataError
+from forcegp.robot.model import RobotModel
+
+GAP = 1.5
+"""A step is a gap from this multiple of the median step on: half a sample is missing."""
+CLOCK_SPREAD = 10.0
+"""A gap also lies this many robust standard deviations of the steps above the median: clocks jitter."""
+SHORTEST = 8
+"""Rows of the shortest stretch that is looked at."""
+SMOOTHING = 0.03
+"""Length of the filter that derives missing accelerations [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Columns of a log, unchecked.
+
+    Attributes:
+        t: `(n,)` time [s].
+        q, qd, qdd, tau: `(n, nq)`, in radians, metres, newtons.
+        segment: `(n,)` number of the trajectory of each row.
+        contact: name → `(n,)` bool.
+        joint_names: the joints, in the order of the columns.
+        header: what the log says about itself.
+        derived: the columns among `qd`, `qdd` that were computed here, not logged.
+        masked: `(n,)` bool, rows that a check excludes from those after it.
+    """
+
+    t: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    tau: Array
+    segment: NDArray[np.int64]
+    contact: Mapping[str, NDArray[np.bool_]]
+    joint_names: tuple[str, ...]
+    header: DataHeader
+    derived: frozenset[str] = frozenset()
+    masked: NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.t)
+
+    @property
+    def nq(self) -> int:
+        """Number of joints."""
+        return self.q.shape[1]
+
+    @property
+    def all_rows(self) -> tuple[tuple[int, int], ...]:
+        """The whole log as one interval."""
+        return ((0, len(self)),)
+
+    def replace(self, **fields: Any) -> Log:
+        """The log with some fields changed."""
+        return dataclasses.replace(self, **fields)
+
+    def mask(self, rows: NDArray[np.bool_]) -> Log:
+        """The log with more rows masked."""
+        return self.replace(masked=rows if self.masked is None else self.masked | rows)
+
+    @cached_property
+    def finite(self) -> NDArray[np.bool_]:
+        """`(n,)` rows in which every number is finite."""
+        vectors = np.concatenate([getattr(self, name) for name in JOINT_VECTORS], axis=1)
+        return np.isfinite(self.t) & np.isfinite(vectors).all(axis=1)
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        """`(n,)` rows that are finite and not masked."""
+        return self.finite if self.masked is None else self.finite & ~self.masked
+
+    @cached_property
+    def steps(self) -> Array:
+        """`(n − 1,)` time steps, NaN between segments."""
+        steps = np.diff(self.t)
+        return np.where(np.diff(self.segment) == 0, steps, np.nan)
+
+    @cached_property
+    def dt(self) -> float:
+        """Median of the positive time steps [s]; NaN if there is none."""
+        forward = self.steps[self.steps > 0.0]
+        return float(np.median(forward)) if len(forward) else float("nan")
+
+    @cached_property
+    def longest_step(self) -> float:
+        """Longest time step that is no gap [s]."""
+        forward = self.steps[self.steps > 0.0]
+        spread = float(robust_std(forward)) if len(forward) else 0.0
+        return max(GAP * self.dt, self.dt + CLOCK_SPREAD * spread)
+
+    @cached_property
+    def stretches(self) -> list[slice]:
+        """Unbroken runs of usable rows: finite, not masked, one segment, time that steps on without a gap."""
+        linked = (self.steps > 0.0) & (self.steps <= self.longest_step) & self.usable[1:] & self.usable[:-1]
+        runs = intervals(linked) if self.header.ordered else ()
+        return [slice(a, b + 1) for a, b in runs if b + 1 - a >= SHORTEST]
+
+    def rows(self, most: int, margin: int = 0) -> NDArray[np.int64]:
+        """Up to `most` usable rows, evenly spread, at least `margin` rows from the end of a stretch."""
+        inner = [np.arange(s.start + margin, s.stop - margin) for s in self.stretches]
+        index = np.concatenate([np.empty(0, np.int64), *inner])
+        index = index if self.header.ordered else np.flatnonzero(self.usable)
+        return index[np.unique(np.linspace(0, len(index) - 1, min(most, len(index))).astype(np.int64))]
+
+
+def log_of(data: Dataset) -> Log:
+    """The log of a data set."""
+
+    def array(value: Any) -> Any:
+        return value.detach().cpu().numpy().astype(float)
+
+    return Log(
+        **{name: array(getattr(data, name)) for name in ("t", *JOINT_VECTORS)},
+        segment=data.segment.cpu().numpy(),
+        contact={name: value.cpu().numpy() for name, value in data.contact.items()},
+        joint_names=data.joint_names,
+        header=data.header,
+    )
+
+
+def read_log(path: str | Path) -> Log:
+    """Read a log from Parquet or CSV without refusing NaN, empty values or time that runs backward.
+
+    Velocities and accelerations that the file lacks are derived by a Savitzky-Golay filter.
+
+    Args:
+        path: the file, with the columns of docs/formats.md.
+
+    Raises:
+        DataError: the file is damaged, or a column is missing.
+    """
+    raw, header = read_table(path, missing="nan")
+    joints = header.joint_names or tuple(name[2:] for name in raw if name.startswith("q."))
+    absent = [n for n in ("qd", "qdd") if not any(f"{n}.{joint}" in raw for joint in joints)]
+    for name in absent:
+        raw |= {f"{name}.{joint}": np.full_like(raw["t"], np.nan, dtype=float) for joint in joints}
+    fields = parse(str(path), raw, header, None)
+    names = ("t", *JOINT_VECTORS, "segment", "contact", "joint_names", "header")
+    return derive(Log(**{name: fields[name] for name in names}), absent)
+
+
+def derive(log: Log, absent: list[str]) -> Log:
+    """The log with absent derivatives computed on each unbroken stretch; NaN where there is none."""
+    logged = [name for name in JOINT_VECTORS if name not in absent]
+    known = log.replace(**{name: np.zeros_like(log.q) for name in absent})
+    values = {name: np.full_like(log.q, np.nan) for name in absent}
+    window = 2 * max(3, round(SMOOTHING / log.dt / 2.0)) + 1 if np.isfinite(log.dt) else 7
+    method = SavitzkyGolay(window=window, order=3)
+    for rows in known.stretches:
+        even = known.dt * np.arange(rows.stop - rows.start)
+        if len(even) < window:
+            continue
+        for name in absent:
+            source, degree = ("q", 1) if name == "qd" else ("qd", 1) if "qd" in logged else ("q", 2)
+            one = np.zeros(len(even), np.int64)
+            values[name][rows] = differentiate(even, getattr(log, source)[rows], one, method, degree)[0]
+    return log.replace(**values, derived=log.derived | set(absent))
+
+
+def of_robot(log: Log, robot: RobotModel) -> Log:
+    """The log with the robot's joints in its order; further logged joints are left out.
+
+    Raises:
+        DataError: a joint of the robot is not in the log, or the log is empty.
+    """
+    if len(log) == 0:
+        raise DataError("the log holds no rows", expected="one or more samples")
+    if not set(robot.joint_names) <= set(log.joint_names):
+        check_joints(log.joint_names, robot.joint_names, robot.name)
+    order = [log.joint_names.index(joint) for joint in robot.joint_names]
+    return log.replace(
+        **{name: getattr(log, name)[:, order] for name in JOINT_VECTORS}, joint_names=robot.joint_names
+    )

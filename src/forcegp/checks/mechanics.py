@@ -1,0 +1,168 @@
+"""What remains of the torque once the faults are explained: friction, offsets, disturbances, and how much."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from forcegp.checks.clock import Outcome
+from forcegp.checks.explain import Explanation, explain
+from forcegp.checks.finding import Finding
+from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of
+from forcegp.checks.hypotheses import friction_columns, robot_columns
+from forcegp.checks.log import Log
+from forcegp.checks.residual import projector, residual
+from forcegp.checks.statistics import MAD_TO_STD, describe, intervals
+from forcegp.constraints import ConstrainedSystem
+
+LEAST_ROWS = 200
+"""Rows from which dynamics are judged."""
+SIGNIFICANT = 3.0
+"""Standard errors over blocks from which a part of the torque is there."""
+MATERIAL = 0.1
+"""Drop of the log error of a joint that makes friction or an offset worth reporting."""
+UNEXPLAINED = 0.5
+"""Share of the torque, in root mean square, that a useful model may leave unexplained."""
+TRACE_ROWS = 20_000
+"""Rows at which the residual is looked at over time."""
+DISTURBANCE_SECONDS = 0.1
+"""Length over which the residual is averaged [s]."""
+DISTURBANCE = 8.0
+"""Robust standard deviations of the log residual from which a stretch of time stands out."""
+VISIBLE = 0.1
+"""A disturbance is also this share of the joint's torque."""
+
+
+def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Signs, orders, gains, delays, gravity, tool, masses, friction, offsets: all that the torque tells."""
+    if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
+        return [], log
+    found, log = _without_torque(log)
+    if found:
+        return found, log
+    told = explain(system, log)
+    found = [*told.findings, *_friction(told), *_offsets(told), *_unexplained(told)]
+    return [*found, *_disturbances(system, told)], told.log
+
+
+def _without_torque(log: Log) -> Outcome:
+    """Torques that are constant though the joint moves."""
+    rows = log.usable
+    still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
+    zero = still & (log.tau[rows] == 0.0).all(axis=0)
+    if not still.any():
+        return [], log
+    joints = tuple(log.joint_names[j] for j in np.flatnonzero(still))
+    word = "zero" if zero[still].all() else "constant"
+    # One passive joint is a design; an arm without any torque is a missing column.
+    weight = "error" if still.all() else "warning"
+    text = f"the torque of {', '.join(joints)} is {word} throughout"
+    found = [Finding("torque-zero", text, log.all_rows, joints, weight=weight)]
+    return (found, log) if still.all() else ([], log)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What leaving out a part of the nuisance costs a joint."""
+
+    gain: float
+    error: float
+
+    @property
+    def there(self) -> bool:
+        return self.gain > MATERIAL and self.gain > SIGNIFICANT * self.error
+
+
+def _part(told: Explanation, j: int, columns: list[int]) -> _Part:
+    """Compare the error of joint j with and without some columns of the nuisance."""
+    keep = np.setdiff1d(np.arange(told.problem.nuisance.shape[-1]), columns)
+    less = replace(told.problem, nuisance=told.problem.nuisance[..., keep])
+    without = cross_validate(less, told.columns, told.prior)
+    floor = FLOOR * told.problem.size[j] / told.problem.scale[j]
+    gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (told.fit, without)))
+    return _Part(gain, error)
+
+
+def _friction(told: Explanation) -> list[Finding]:
+    log, nq = told.log, told.log.nq
+    viscous, coulomb = -told.fit.known[:nq], -told.fit.known[nq : 2 * nq]
+    rows = log.qd[told.rows]
+    power = (viscous * rows**2 + coulomb * np.abs(rows)).mean(axis=0)
+    there = np.array([_part(told, j, [j, nq + j]).there for j in range(nq)])
+    found = []
+    for hit, word in ((there & (power > 0.0), "more"), (there & (power <= 0.0), "less")):
+        if not hit.any():
+            continue
+        index = np.flatnonzero(hit)
+        joints = tuple(log.joint_names[j] for j in index)
+        listed = ", ".join(
+            f"{log.joint_names[j]} {viscous[j]:.3g} N m s/rad, {coulomb[j]:.3g} N m" for j in index
+        )
+        text = f"joints show {word} friction than the robot file declares (viscous, Coulomb): {listed}"
+        evidence = {f"viscous {log.joint_names[j]}": viscous[j] for j in index}
+        evidence |= {f"coulomb {log.joint_names[j]}": coulomb[j] for j in index}
+        found.append(Finding("friction-undeclared", text, log.all_rows, joints, evidence=evidence))
+    return found
+
+
+def _offsets(told: Explanation) -> list[Finding]:
+    log, nq = told.log, told.log.nq
+    offset = -told.fit.known[2 * nq : 3 * nq]
+    index = [j for j in range(nq) if _part(told, j, [2 * nq + j]).there]
+    if not index:
+        return []
+    joints = tuple(log.joint_names[j] for j in index)
+    listed = ", ".join(f"{log.joint_names[j]} {offset[j]:+.3g} N m" for j in index)
+    evidence = {f"offset {log.joint_names[j]}": offset[j] for j in index}
+    text = f"the logged torque is off by a constant: {listed}"
+    return [Finding("torque-offset", text, log.all_rows, joints, evidence=evidence)]
+
+
+def _unexplained(told: Explanation) -> list[Finding]:
+    error = np.median(told.fit.error, axis=0) * told.problem.scale
+    share = float(np.sqrt((error**2).sum() / (told.problem.size**2).sum()))
+    if share <= UNEXPLAINED:
+        return []
+    text = f"robot file, friction and offsets leave {100 * share:.0f} % of the torque unexplained"
+    return [Finding("torque-unexplained", text, told.log.all_rows, evidence={"share": share})]
+
+
+def _disturbances(system: ConstrainedSystem, told: Explanation) -> list[Finding]:
+    """Times at which far more torque is unexplained than usual."""
+    log, rows = told.log, told.log.rows(TRACE_ROWS)
+    trace = residual_trace(system, told, rows)
+    scale = np.maximum(told.problem.scale, FLOOR * told.problem.size)
+    stride = np.median(np.diff(rows)) * log.dt
+    width = max(1, round(DISTURBANCE_SECONDS / stride))
+    energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
+    level = np.log(energy + FLOOR**2)
+    middle = np.median(level)
+    spread = max(MAD_TO_STD * np.median(np.abs(level - middle)), 0.2)
+    visible = (np.abs(trace) > VISIBLE * told.problem.size).any(axis=1)
+    bad = level > middle + DISTURBANCE * spread
+    spans = intervals(bad, join=width)
+    spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)
+    if not spans:
+        return []
+    whole = tuple((int(rows[a]), int(rows[b - 1]) + 1) for a, b in spans)
+    worst = int(np.argmax((np.abs(trace) / scale)[bad].max(axis=0)))
+    peak = float(np.abs(trace[bad][:, worst]).max())
+    text = (
+        f"torque of up to {peak:.3g} N m at {log.joint_names[worst]} that neither robot nor labelled contacts "
+        f"explain, in {describe(whole)}"
+    )
+    return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence={"peak_Nm": peak})]
+
+
+def residual_trace(system: ConstrainedSystem, told: Explanation, rows: np.ndarray) -> Array:
+    """Torque that remains at some rows, contact forces taken out, `(n, nq)` [N m, N]."""
+    parts = []
+    for index in np.array_split(rows, max(1, len(rows) // 2048)):
+        left = residual(system, told.log, index)
+        columns = [robot_columns(system, told.log, index, name)[0] for name in told.robot]
+        columns = np.concatenate([*columns, friction_columns(system, told.log, index)], axis=-1)
+        r = left.r - columns @ np.concatenate([told.fit.theta, told.fit.known])
+        P, scale = projector(left.J, told.problem.scale), told.problem.scale
+        parts.append((P @ (r / scale)[..., None])[..., 0] * scale)
+    return np.concatenate(parts)

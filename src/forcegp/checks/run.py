@@ -1,0 +1,118 @@
+"""All checks in order, and the report that they make."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from forcegp.checks import (
+    clock,
+    contact,
+    excitation,
+    force,
+    jumps,
+    kinematics,
+    limits,
+    mechanics,
+    noise,
+    values,
+)
+from forcegp.checks.clock import Outcome
+from forcegp.checks.finding import SEVERITIES, Finding, Report
+from forcegp.checks.kinds import KINDS
+from forcegp.checks.log import Log, log_of, of_robot
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data.dataset import Dataset
+
+Check = Callable[[ConstrainedSystem, Log], Outcome]
+Progress = Callable[[int, int], None]
+
+
+def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
+    """The robot that the header names against that of the scene."""
+    logged = log.header.robot_fingerprint
+    if logged is None or logged == system.robot.fingerprint:
+        return [], log
+    text = f"logged on robot {log.header.robot!r} ({logged}), and the scene has {system.robot.name!r}"
+    return [Finding("robot-mismatch", text, log.all_rows)], log
+
+
+CHECKS: tuple[tuple[str, Check], ...] = (
+    ("finite values", values.check_finite),
+    ("order of time", clock.check_order),
+    ("robot", check_robot),
+    ("held rows", values.check_held),
+    ("gaps", clock.check_gaps),
+    ("jitter", clock.check_jitter),
+    ("degrees", limits.check_degrees),
+    ("unit of time", kinematics.check_clock_unit),
+    ("sampling period", clock.check_period),
+    ("spikes", values.check_spikes),
+    ("standing channels", values.check_stuck),
+    ("jumps", jumps.check_jumps),
+    ("velocity", kinematics.check_velocity),
+    ("acceleration", kinematics.check_acceleration),
+    ("impacts", jumps.check_impacts),
+    ("resolution", values.check_resolution),
+    ("limits", limits.check_limits),
+    ("saturation", limits.check_saturation),
+    ("length", excitation.check_length),
+    ("motion", excitation.check_motion),
+    ("noise", noise.check_noise),
+    ("contact", contact.check_contacts),
+    ("dynamics", mechanics.check_dynamics),
+    ("contact force", force.check_forces),
+    ("excitation", excitation.check_excitation),
+)
+"""Every check in the order in which they run; each sees the log as those before it have corrected it."""
+
+VOIDS = frozenset({"velocity-mismatch"})
+"""Findings after which the dynamics cannot be judged."""
+DYNAMIC = frozenset({"dynamics", "contact force", "excitation"})
+
+
+def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress | None = None) -> Report:
+    """Check a log against a scene before a model is fitted to it.
+
+    Each check is silent on a log that is in order. A fault that is found is undone for the checks after it, so
+    that one fault is reported once; the log itself is not changed.
+
+    Args:
+        system: robot and contacts.
+        data: the log; `forcegp.checks.read_log` reads one that `Dataset` refuses.
+        progress: called with the number of checks done and their number.
+
+    Returns:
+        The findings, the gravest first; `report.usable` says whether to go on.
+
+    Raises:
+        DataError: a joint of the robot is not in the log, or the log is empty.
+
+    Example:
+        >>> import forcegp
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> report = forcegp.check(system, forcegp.Dataset.read("run.parquet"))  # doctest: +SKIP
+        >>> print(report.verdict)  # doctest: +SKIP
+        verdict: go on
+    """
+    system = replace(system, robot=system.robot.to("cpu", torch.float64))
+    log = of_robot(data if isinstance(data, Log) else log_of(data), system.robot)
+    samples, findings, skipped = len(log), [], {}
+    for done, (name, run) in enumerate(CHECKS):
+        if progress is not None:
+            progress(done, len(CHECKS))
+        void = next((finding.kind for finding in findings if finding.kind in VOIDS), None)
+        if name in DYNAMIC and void:
+            skipped[name] = f"not judged after {void}"
+            continue
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            found, log = run(system, log)
+        findings += found
+    order = list(KINDS)
+    findings.sort(key=lambda finding: (SEVERITIES.index(finding.severity), order.index(finding.kind)))
+    return Report(tuple(findings), samples, system.robot.joint_names, skipped)

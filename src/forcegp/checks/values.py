@@ -1,0 +1,164 @@
+"""Numbers that a sensor cannot have meant: NaN, held rows, spikes, jumps, coarse steps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from forcegp.checks.clock import Outcome
+from forcegp.checks.finding import Finding
+from forcegp.checks.log import Log
+from forcegp.checks.statistics import Array, describe, intervals, robust_std, spikes
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data.columns import JOINT_VECTORS
+
+HELD_RUN = 2
+"""A logger that fails to update repeats a row at least this often before it is reported as held."""
+STUCK_SECONDS = 0.05
+"""A channel stands still when it repeats one value for this long while the joint moves [s]."""
+SPIKE = 12.0
+"""Robust standard deviations beyond which a single value is a spike: never reached by normal noise."""
+SPIKE_ALONE = 4.0
+"""Factor by which a spike stands out from the misfit of its neighbours."""
+COARSE = 0.05
+"""Share of the velocity that the steps of an encoder may make up when positions are differentiated."""
+
+
+def logged(log: Log) -> dict[str, Array]:
+    """The joint vectors that were logged, not derived."""
+    return {name: getattr(log, name) for name in JOINT_VECTORS if name not in log.derived}
+
+
+def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
+    """NaN and infinite values, by column."""
+    vectors, bad = logged(log), ~np.isfinite(log.t)
+    columns = ["t"] if bad.any() else []
+    for name, value in vectors.items():
+        wrong = ~np.isfinite(value)
+        columns += [f"{name}.{log.joint_names[j]}" for j in np.flatnonzero(wrong.any(axis=0))]
+        bad = bad | wrong.any(axis=1)
+    if not bad.any():
+        return [], log
+    rows = intervals(bad)
+    listed = ", ".join(columns[:4]) + (" and others" if len(columns) > 4 else "")
+    text = f"{int(bad.sum())} rows hold a NaN or an infinite value, in {listed}: {describe(rows)}"
+    return [Finding("not-finite", text, rows, evidence={"rows": bad.sum()})], log
+
+
+def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Rows in which every logged channel repeats while the arm moves."""
+    if not log.header.ordered:
+        return [], log
+    same = np.ones(len(log) - 1, bool)
+    for value in logged(log).values():
+        same &= (np.diff(value, axis=0) == 0.0).all(axis=1)
+    moving = np.abs(log.qd).max(axis=1)[1:] > 0.0
+    held = np.concatenate([[False], same & moving & (np.diff(log.segment) == 0)])
+    if held.sum() < HELD_RUN:
+        return [], log
+    rows = intervals(held)
+    share = held.mean()
+    text = f"{int(held.sum())} rows ({100 * share:.2g} %) repeat the one before: {describe(rows)}"
+    return [Finding("rows-held", text, rows, evidence={"rows": held.sum(), "share": share})], log.mask(held)
+
+
+def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
+    """A channel that keeps one value while its joint moves by more than its own resolution explains."""
+    if not log.header.ordered or not np.isfinite(log.dt):
+        return [], log
+    least, found, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
+    for name, value in logged(log).items():
+        for j, joint in enumerate(log.joint_names):
+            x = value[:, j]
+            steps = np.abs(np.diff(x))
+            usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
+            if (steps > 0.0).mean() < 0.1:
+                continue
+            runs = [
+                (a, b + 1)
+                for a, b in intervals((steps == 0.0) & log.usable[1:] & log.usable[:-1])
+                if b - a >= least and _expected_change(log, name, j, a, b) > 5.0 * max(usual, 1e-300)
+            ]
+            if runs:
+                spans = tuple(runs)
+                text = f"{name}.{joint} keeps one value while the joint moves, in {describe(spans)}"
+                found.append(Finding("channel-stuck", text, spans, (joint,)))
+                for a, b in runs:
+                    bad[a:b] = True
+    return found, log.mask(bad) if found else log
+
+
+def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
+    """How far a channel should have moved over rows a to b, judged by the channels of the same joint."""
+    if name == "q":
+        return float(np.abs(log.qd[a:b, j]).sum() * log.dt)
+    if name == "qd":
+        return float(np.abs(log.qdd[a:b, j]).sum() * log.dt)
+    # Torque and acceleration: as far as they change over as many rows elsewhere, if the arm moves.
+    x = getattr(log, name)[:, j]
+    lag = b - a
+    usual = float(np.median(np.abs(x[lag:] - x[:-lag])))
+    return usual if np.abs(np.diff(log.q[a:b], axis=0)).max(initial=0.0) > 0.0 else 0.0
+
+
+def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Single values far off the curve through their neighbours."""
+    bad, hit = np.zeros(len(log), bool), []
+    for name, value in logged(log).items():
+        own, around, scale = np.zeros_like(value), np.zeros_like(value), np.zeros(log.nq)
+        for s in log.stretches:
+            own[s], around[s] = spikes(value[s])
+        inner = own[log.usable]
+        if len(inner) < 50:
+            continue
+        scale = robust_std(inner) + resolution(value[log.usable]) + 1e-12 * np.abs(value[log.usable]).max()
+        outlier = (np.abs(own) > SPIKE * scale) & (np.abs(own) > SPIKE_ALONE * around)
+        # The neighbours of a spike are off as well, by less.
+        for j in np.flatnonzero(outlier.any(axis=0)):
+            peak = outlier[:, j] & (np.abs(own[:, j]) >= _neighbour_peak(np.abs(own[:, j])))
+            bad |= peak
+            hit += [f"{name}.{log.joint_names[j]}"] * bool(peak.any())
+    if not bad.any():
+        return [], log
+    rows = intervals(bad)
+    text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}: {describe(rows)}"
+    return [Finding("spike", text, rows, evidence={"rows": bad.sum()})], log.mask(bad)
+
+
+def _neighbour_peak(x: Array) -> Array:
+    """Largest of the two neighbours on either side."""
+    padded = np.pad(x, 2)
+    return np.max([padded[k : len(x) + k] for k in (0, 1, 3, 4)], axis=0)
+
+
+def resolution(x: Array) -> Array:
+    """Step between the values that a column takes, where it takes few; else zero."""
+    steps = np.zeros(x.shape[1])
+    for j in range(x.shape[1]):
+        levels = np.unique(x[:, j])
+        if 2 < len(levels) < 0.75 * len(x):
+            gaps = np.diff(levels)
+            # Rounding in the last digit makes two levels of one; those gaps are not steps.
+            gaps = gaps[gaps > 1e-6 * gaps.max()]
+            steps[j] = np.median(gaps)
+    return steps
+
+
+def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Encoder steps so coarse that they dominate a differentiated position."""
+    q = log.q[log.usable]
+    if len(q) < 50 or not np.isfinite(log.dt):
+        return [], log
+    step = resolution(q)
+    # A step Δ is noise of Δ/√12; the difference of two samples over dt has √2 of it.
+    noise = step / np.sqrt(6.0) / log.dt
+    speed = np.sqrt(np.mean(log.qd[log.usable] ** 2, axis=0))
+    coarse = np.flatnonzero((noise > COARSE * speed) & (step > 0.0))
+    if not len(coarse):
+        return [], log
+    joints = tuple(log.joint_names[j] for j in coarse)
+    worst = int(coarse[np.argmax(noise[coarse] / np.maximum(speed[coarse], 1e-300))])
+    text = (
+        f"positions come in steps of {step[worst]:.3g} rad ({log.joint_names[worst]}), which add noise of "
+        f"{noise[worst]:.3g} rad/s to a velocity from neighbouring samples"
+    )
+    return [Finding("quantised", text, log.all_rows, joints, evidence={"step": step[worst]})], log

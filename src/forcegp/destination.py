@@ -1,0 +1,134 @@
+"""Whether a result can be written, asked before the work starts; and a second place if writing fails."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from forcegp.errors import DestinationError, ForceGPError
+
+PROBE_BYTES = 1 << 16
+"""Written and removed again to see whether there is room, and whether a quota allows it."""
+
+
+def check_destination(
+    path: str | Path, *, folder: bool = False, own_files: Iterable[str] = (), needed_bytes: int = 0
+) -> None:
+    """Check that a file or folder can be written, without leaving anything behind.
+
+    Call it before long work; `write_or_keep` is its counterpart afterwards.
+
+    Args:
+        path: what will be written.
+        folder: whether that is a folder, which may replace one that is empty or holds one of `own_files`.
+        own_files: names by which a folder of ours is known; with none, any folder may be replaced.
+        needed_bytes: room that the result takes on the disk [bytes].
+
+    Raises:
+        DestinationError: a file is to replace a folder or the reverse, the folder holds other files, or the
+            place cannot be written or is full.
+
+    Example:
+        >>> check_destination("/proc/model", folder=True)
+        Traceback (most recent call last):
+        forcegp.errors.DestinationError: /proc/model: cannot be written
+          ...
+    """
+    target = Path(path)
+    if target.is_dir() and not folder:
+        raise DestinationError(f"{target} is a folder, and a file is to be written there")
+    if target.exists() and not target.is_dir() and folder:
+        raise DestinationError(f"{target} is a file, and a folder is to be written there")
+    try:
+        if target.is_dir():
+            _check_own(target, tuple(own_files))
+        parent = _existing_parent(target)
+        _probe(parent, needed_bytes)
+    except DestinationError:
+        raise
+    except OSError as cause:
+        raise DestinationError(
+            f"{target}: cannot be written",
+            got=cause.strerror or str(cause),
+            hint="name a place that exists, is not full and can be written",
+        ) from cause
+
+
+def write_or_keep(write: Callable[[Path], None], path: str | Path) -> None:
+    """Write a result; if that fails, write it to another place, which the error names.
+
+    Args:
+        write: writes the result to a path, such as `model.save`.
+        path: where it belongs.
+
+    Raises:
+        DestinationError: the place cannot be written; the message says where the result is instead.
+        ForceGPError: the result cannot be written anywhere, for a reason of its own.
+    """
+    target = Path(path)
+    try:
+        write(target)
+        return
+    except (OSError, ForceGPError) as error:
+        cause = error
+    kept = _kept(write, target.name)
+    if kept is None:
+        raise cause
+    reason = cause.message if isinstance(cause, ForceGPError) else (cause.strerror or str(cause))
+    raise DestinationError(
+        f"{target}: the result could not be written there",
+        got=reason,
+        hint=f"it was kept in {kept}; move it to where it belongs",
+    ) from cause
+
+
+def _kept(write: Callable[[Path], None], name: str) -> Path | None:
+    """A private place where the result could be written, or `None`."""
+    for parent in (tempfile.gettempdir(), os.getcwd(), str(Path.home())):
+        with contextlib.suppress(OSError, ForceGPError):
+            place = Path(tempfile.mkdtemp(prefix="forcegp-kept-", dir=parent))
+            try:
+                write(place / name)
+            except (OSError, ForceGPError):
+                shutil.rmtree(place, ignore_errors=True)
+                raise
+            return place / name
+    return None
+
+
+def _check_own(folder: Path, own_files: tuple[str, ...]) -> None:
+    names = {entry.name for entry in folder.iterdir()}
+    if own_files and names and names.isdisjoint(own_files):
+        raise DestinationError(
+            f"{folder} holds other files than a result of this command",
+            expected="a folder that is new, empty, or holds " + " or ".join(own_files),
+            got=", ".join(sorted(names)[:5]),
+            hint="name another folder",
+        )
+
+
+def _existing_parent(target: Path) -> Path:
+    """The nearest folder above a target that exists."""
+    parent = target.absolute().parent
+    while not parent.exists() and parent != parent.parent:
+        parent = parent.parent
+    return parent
+
+
+def _probe(parent: Path, needed_bytes: int) -> None:
+    with tempfile.NamedTemporaryFile(prefix=".forcegp-probe-", dir=parent) as file:
+        file.write(b"\0" * PROBE_BYTES)
+        file.flush()
+        os.fsync(file.fileno())
+    free = shutil.disk_usage(parent).free
+    if free < needed_bytes:
+        raise DestinationError(
+            f"{parent}: not enough room on the disk",
+            expected=f"{needed_bytes:,} bytes",
+            got=f"{free:,} bytes free",
+            hint="make room, or name a place on another disk",
+        )

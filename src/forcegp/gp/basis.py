@@ -1,0 +1,212 @@
+"""Basis functions of latent components: whitened covariances with inducing points, and exact features.
+
+With inducing points Z and K_zz = R⁻ᵀR⁻¹, V(x) = Rᵀk(Z, x) are features with a standard normal prior on
+their weights, and V(x)ᵀV(x′) = k(x, Z) K_zz⁻¹ k(Z, x′). Eigenvalues of K_zz below `TRUNCATION` of the
+largest are dropped. Linear parts of a kernel add their own features, which are exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from forcegp.gp.blocks import points
+from forcegp.gp.decomposition import Split, split
+from forcegp.gp.draws import FunctionDraw
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters, sub
+from forcegp.gp.spectrum import Spectrum
+from forcegp.gp.structured_covariance import Process
+
+
+@dataclass(frozen=True, eq=False)
+class ProcessBasis:
+    """Basis functions of the components of one process.
+
+    Attributes:
+        split: finite part and rest of the kernel.
+        params: the process's own log-hyperparameters.
+        components: number of components.
+        inducing: kernel inputs of the inducing points, none where only the finite part has features.
+        spectra: of K_zz of each component.
+    """
+
+    split: Split
+    params: dict[str, Tensor]
+    components: int
+    inducing: Features
+    spectra: tuple[Spectrum, ...]
+
+    @cached_property
+    def roots(self) -> Tensor:
+        """R of each component, filled up with zero columns `(components, m, most kept)`."""
+        kept = [spectrum.root for spectrum in self.spectra]
+        most = max(R.shape[1] for R in kept)
+        return torch.stack([torch.nn.functional.pad(R, (0, most - R.shape[1])) for R in kept])
+
+    @cached_property
+    def to_inducing(self) -> Callable[[Features], Tensor] | None:
+        """x ↦ k(x, Z) `(components, n, m)` of the kernel's rest; `None` without inducing points."""
+        rest = self.split.rest
+        if rest is None or not points(self.inducing):
+            return None
+        return rest.kernel.towards(rest.parameters(self.params), self.inducing)
+
+    @cached_property
+    def finite(self) -> FunctionDraw | None:
+        """The exact features of the finite part; `None` without one."""
+        return self.split.finite.features(self.params) if self.split.finite is not None else None
+
+    @cached_property
+    def finite_size(self) -> int:
+        """Number of exact features of each component."""
+        return self.finite.basis(self.inducing).shape[-1] if self.finite is not None else 0
+
+    @cached_property
+    def used(self) -> Tensor:
+        """Which values are basis functions and no filling, `(components, width)`."""
+        width = (self.roots.shape[-1] if self.spectra else 0) + self.finite_size
+        used = torch.ones(self.components, width, dtype=torch.bool)
+        for k, spectrum in enumerate(self.spectra):
+            used[k, len(spectrum.values) - spectrum.dropped : width - self.finite_size] = False
+        return used
+
+    @cached_property
+    def sizes(self) -> list[int]:
+        """Number of basis functions of each component."""
+        return self.used.sum(-1).tolist()
+
+    @cached_property
+    def columns(self) -> Tensor:
+        """Positions of the basis functions among the values of all components."""
+        device = next(iter(self.inducing.values())).device
+        return self.used.reshape(-1).nonzero()[:, 0].to(device)
+
+    def values(self, features: Features) -> tuple[Tensor, Tensor]:
+        """V(x) filled up with zeros `(components, n, width)`; |V|² of inducing points `(components, n)`."""
+        parts = []
+        explained = next(iter(features.values())).new_zeros(self.components, points(features))
+        if self.to_inducing is not None:
+            parts.append(self.to_inducing(features) @ self.roots)
+            explained = torch.linalg.vecdot(parts[0], parts[0])
+        if self.finite is not None:
+            parts.append(self.finite.basis(features))
+        if len(parts) == 1:
+            return parts[0], explained
+        return torch.cat([explained[..., None][..., :0], *parts], dim=-1), explained
+
+    def fold(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights of basis functions as those of k(x, Z) and of the exact features.
+
+        Args:
+            weights: of the process's basis functions `(Σ sizes, s)`.
+
+        Returns:
+            `(components, m, s)` and `(components, features, s)`.
+        """
+        filled = weights.new_zeros(self.used.numel(), weights.shape[1])
+        filled[self.columns] = weights
+        filled = filled.unflatten(0, self.used.shape)
+        width = filled.shape[1] - self.finite_size
+        on_kernel = self.roots @ filled[:, :width] if self.spectra else filled[:, :0]
+        return on_kernel, filled[:, width:]
+
+    def rest_variance(self, features: Features) -> Tensor:
+        """Prior variance of the part that inducing points approximate, `(components, n)`."""
+        rest = self.split.rest
+        if rest is None:
+            return next(iter(features.values())).new_zeros(self.components, points(features))
+        return rest.kernel.diagonal(rest.parameters(self.params), features)
+
+
+@dataclass(frozen=True, eq=False)
+class LatentBasis:
+    """Basis functions of every component of every process, side by side.
+
+    Attributes:
+        processes: the processes.
+        params: all log-hyperparameters.
+        parts: basis of each process.
+    """
+
+    processes: tuple[Process, ...]
+    params: dict[str, Tensor]
+    parts: tuple[ProcessBasis, ...]
+
+    @cached_property
+    def columns(self) -> tuple[slice, ...]:
+        """The basis functions of each component, the components of all processes in order."""
+        sizes = [size for part in self.parts for size in part.sizes]
+        ends = torch.tensor([0, *sizes]).cumsum(0).tolist()
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    @cached_property
+    def components(self) -> tuple[slice, ...]:
+        """The components of each process among all of them."""
+        ends = torch.tensor([0, *(part.components for part in self.parts)]).cumsum(0).tolist()
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    @cached_property
+    def size(self) -> int:
+        """Number of basis functions in all."""
+        return self.columns[-1].stop
+
+    @cached_property
+    def owner(self) -> Tensor:
+        """The component of each basis function `(size,)`."""
+        sizes = torch.tensor([own.stop - own.start for own in self.columns])
+        device = next(iter(self.parts[0].inducing.values())).device
+        return torch.arange(len(sizes)).repeat_interleave(sizes).to(device)
+
+    def of_process(self, p: int) -> slice:
+        """The basis functions of process p."""
+        own = self.columns[self.components[p]]
+        return slice(own[0].start, own[-1].stop)
+
+    def evaluate(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
+        """Basis functions at n samples.
+
+        Args:
+            features: kernel inputs of each process.
+
+        Returns:
+            V `(n, size)`; by component `(n, components)` the prior variance of the kernels' rest, and
+            what is missed of it, k(x, x) − |V(x)|².
+        """
+        n, V, prior, missed = points(features[0]), [], [], []
+        for part, x in zip(self.parts, features, strict=True):
+            values, explained = part.values(x)
+            V.append(values.transpose(0, 1).reshape(n, -1)[:, part.columns])
+            prior.append(part.rest_variance(x))
+            missed.append(prior[-1] - explained)
+        return torch.cat(V, dim=-1), torch.cat(prior).mT, torch.cat(missed).mT
+
+
+def latent_basis(
+    processes: Sequence[Process],
+    params: Parameters,
+    inducing: Sequence[Features],
+    components: Sequence[int],
+) -> LatentBasis:
+    """Basis functions of processes with given inducing points.
+
+    Args:
+        processes: the processes.
+        params: log-hyperparameters, `<process>.<name>`.
+        inducing: kernel inputs of the inducing points of each process, of any number, none included.
+        components: number of components of each process.
+    """
+    parts = []
+    for process, Z, count in zip(processes, inducing, components, strict=True):
+        own, kernel = sub(params, process.prefix), split(process.kernel)
+        spectra: tuple[Spectrum, ...] = ()
+        if kernel.rest is not None and points(Z):
+            K = kernel.rest.kernel.covariance(kernel.rest.parameters(own), Z, Z)
+            spectra = tuple(Spectrum.of(0.5 * (k + k.mT)) for k in K)
+        parts.append(ProcessBasis(kernel, own, count, Z, spectra))
+    return LatentBasis(tuple(processes), dict(params), tuple(parts))

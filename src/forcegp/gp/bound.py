@@ -1,0 +1,234 @@
+"""The collapsed variational bound on the likelihood of whitened rows, with its gradient in closed form.
+
+−F = ½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ] (Titsias 2009). The samples are passed
+over twice, once for the sums and once for the gradient, in memory that does not grow with their number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from forcegp.gp.basis import ProcessBasis, latent_basis
+from forcegp.gp.blocks import components_of, rows_of
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters
+from forcegp.gp.places import Gradient, Place, from_tensors, tensors_of
+from forcegp.gp.sparse import SparsePosterior
+from forcegp.gp.structured_covariance import Block, Process
+from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
+
+
+def bound_of(sums: Sums, posterior: SparsePosterior) -> Tensor:
+    """The negative bound from the sums `()`."""
+    fit = sums.yy - sums.v @ posterior.weights
+    log_determinant = 2.0 * posterior.L.diagonal().abs().log().sum()
+    return 0.5 * (fit + log_determinant + sums.rows * math.log(2.0 * math.pi) + sums.missed.sum())
+
+
+def negative_bound(
+    processes: Sequence[Process], params: Parameters, blocks: Sequence[Block], inducing: Sequence[Features]
+) -> Tensor:
+    """Negative collapsed bound, differentiable in hyperparameters, kernel inputs, operators and targets.
+
+    It is no smaller than the exact negative log likelihood, and equals it where inducing points are the data.
+    The inducing points are constants.
+
+    Args:
+        processes: the processes.
+        params: log-hyperparameters, `<process>.<name>`.
+        blocks: whitened rows.
+        inducing: kernel inputs of the inducing points of each process.
+
+    Returns:
+        The scalar.
+
+    Raises:
+        NumericalError: the sums are not finite.
+    """
+    named = dict(tensors_of(params, blocks))
+    value = _NegativeBound.apply(processes, inducing, list(named), *named.values())
+    return value  # pyright: ignore[reportReturnType]
+
+
+class _NegativeBound(torch.autograd.Function):
+    """The bound; forward computes the gradient too."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        processes: Sequence[Process],
+        inducing: Sequence[Features],
+        places: list[Place],
+        *tensors: Tensor,
+    ) -> Tensor:
+        named = dict(zip(places, (t.detach() for t in tensors), strict=True))
+        params, blocks = from_tensors(named)
+        basis = latent_basis(processes, params, inducing, components_of(blocks[0]))
+        sums = accumulate(basis, blocks)
+        posterior = SparsePosterior.of(basis, sums)
+        needs = ctx.needs_input_grad[3:]
+        ctx.wanted = [i for i, need in enumerate(needs) if need]
+        if ctx.wanted:
+            deep = any(needs[len(params) :])
+            gradient = _BoundGradient(posterior, deep).over(blocks)
+            ctx.save_for_backward(
+                *(gradient.get(places[i], torch.zeros_like(tensors[i])) for i in ctx.wanted)
+            )
+        return bound_of(sums, posterior)
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Any, ...]:
+        gradients: list[Tensor | None] = [None] * len(ctx.needs_input_grad)
+        for i, saved in zip(ctx.wanted, ctx.saved_tensors, strict=True):
+            gradients[3 + i] = grad[0] * saved
+        return tuple(gradients)
+
+
+class _BoundGradient:
+    """Derivatives of the negative bound, added up chunk by chunk.
+
+    With D = ½(A⁻¹ + mmᵀ) the derivative for V_k of one sample is 2 Σ_l S_kl D_kl V_l − m_k c_k − S_kk V_k,
+    and that for S_kl is V_kᵀD_kl V_l + ½ δ_kl (k − |V|²).
+    """
+
+    def __init__(self, posterior: SparsePosterior, deep: bool) -> None:
+        self.basis, self.deep = posterior.basis, deep
+        self.m = posterior.weights
+        self.D = 0.5 * torch.addr(torch.cholesky_inverse(posterior.L), self.m, self.m)
+        self.total: Gradient = {}
+        # By process, Σ k(Z, x) ∂F/∂V `(components, m, kept)`: the derivative for R.
+        self.roots = [
+            torch.zeros_like(part.roots) if part.spectra else self.m[:0] for part in self.basis.parts
+        ]
+
+    def over(self, blocks: Sequence[Block]) -> Gradient:
+        """The derivatives over all samples."""
+        for g, block in enumerate(blocks):
+            chunks = []
+            for first in range(0, len(block.target), CHUNK_SAMPLES):
+                chunks.append(self._chunk(rows_of(block, slice(first, first + CHUNK_SAMPLES))))
+            if self.deep and chunks:
+                for place in chunks[0]:
+                    self.total[(place[0], g, *place[1:])] = torch.cat([chunk[place] for chunk in chunks])
+        for part, prior, dR in zip(self.basis.parts, self.basis.processes, self.roots, strict=True):
+            if part.spectra:
+                self._through_inducing(part, prior.prefix, dR)
+        return self.total
+
+    def _chunk(self, block: Block) -> Gradient:
+        """Add the derivatives for hyperparameters; return those for the block's own tensors."""
+        V, _, missed = self.basis.evaluate(block.features)
+        W = torch.cat(block.operators, dim=-1)
+        S = (W.mT @ W).permute(1, 2, 0).contiguous()
+        c = (W.mT @ block.target[..., None])[..., 0]
+        own: Gradient = {}
+        dV, DV = self._basis_gradient(V, S, c)
+        if self.deep:
+            dS = torch.stack([self._by_component(V * DV_l) for DV_l in DV], dim=-1)
+            dS = 0.5 * (dS + dS.mT) + 0.5 * torch.diag_embed(missed)
+            dc = -self._by_component(V * self.m)
+            dW = 2.0 * W @ dS + block.target[..., None] * dc[:, None, :]
+            for p, components in enumerate(self.basis.components):
+                own["operator", p] = dW[..., components]
+            own["target",] = block.target + (W @ dc[..., None])[..., 0]
+        weight = torch.diagonal(S, dim1=0, dim2=1)
+        for p in range(len(self.basis.parts)):
+            own |= self._through_kernel(p, block.features[p], dV, 0.5 * weight)
+        return own
+
+    def _basis_gradient(self, V: Tensor, S: Tensor, c: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Derivative for V `(n, size)`, and D_·l V_l of each component l where they are needed."""
+        owner = self.basis.owner
+        weight = torch.diagonal(S, dim1=0, dim2=1)
+        dV = -self.m * c[:, owner]
+        inducing = self._from_inducing
+        dV[:, inducing] -= V[:, inducing] * weight[:, owner[inducing]]
+        kept = []
+        for l, own in enumerate(self.basis.columns):
+            DV = V[:, own] @ self.D[own]
+            dV += 2.0 * DV * S[:, l].mT[:, owner]
+            if self.deep:
+                kept.append(DV)
+        return dV, kept
+
+    @property
+    def _from_inducing(self) -> Tensor:
+        """The basis functions of inducing points, whose squares are missed no more."""
+        chosen = []
+        for part in self.basis.parts:
+            position = part.columns % max(part.used.shape[1], 1)
+            chosen.append(position < part.used.shape[1] - part.finite_size)
+        return torch.cat(chosen).nonzero()[:, 0]
+
+    def _by_component(self, x: Tensor) -> Tensor:
+        """Sums over the basis functions of each component, `(n, components)`."""
+        return x.new_zeros(len(x), len(self.basis.columns)).index_add_(1, self.basis.owner, x)
+
+    def _through_kernel(self, p: int, features: Features, dV: Tensor, weight: Tensor) -> Gradient:
+        """Derivatives of one chunk through k(x, Z), φ(x) and k(x, x)."""
+        part, prefix = self.basis.parts[p], self.basis.processes[p].prefix
+        filled = dV.new_zeros(part.used.numel(), len(dV))
+        filled[part.columns] = dV[:, self.basis.of_process(p)].mT
+        filled = filled.unflatten(0, part.used.shape).mT
+        width = filled.shape[-1] - part.finite_size
+        params = {key: value.requires_grad_() for key, value in _detached(part.params).items()}
+        x = _detached(features)
+        if self.deep:
+            x = {key: value.requires_grad_() for key, value in x.items()}
+        outputs, gradients = [], []
+        with torch.enable_grad():
+            rest, finite = part.split.rest, part.split.finite
+            if rest is not None:
+                own = rest.parameters(params)
+                outputs.append(rest.kernel.diagonal(own, x))
+                gradients.append(weight[:, self.basis.components[p]].mT)
+                if part.spectra:
+                    kernel = rest.kernel.covariance(own, x, part.inducing)
+                    self.roots[p] = self.roots[p] + kernel.detach().mT @ filled[..., :width]
+                    outputs.append(kernel)
+                    gradients.append(filled[..., :width] @ part.roots.mT)
+            if finite is not None:
+                outputs.append(finite.features(params).basis(x))
+                gradients.append(filled[..., width:])
+        return self._add(prefix, params, x if self.deep else {}, outputs, gradients, p)
+
+    def _add(
+        self,
+        prefix: str,
+        params: dict[str, Tensor],
+        x: dict[str, Tensor],
+        outputs: list[Tensor],
+        gradients: list[Tensor],
+        p: int = 0,
+    ) -> Gradient:
+        """Add what arrives at hyperparameters; return what arrives at kernel inputs."""
+        leaves = {("param", f"{prefix}.{key}"): value for key, value in params.items()}
+        leaves |= {("feature", p, key): value for key, value in x.items()}
+        found = torch.autograd.grad(outputs, list(leaves.values()), gradients, allow_unused=True)
+        own: Gradient = {}
+        for (place, leaf), grad in zip(leaves.items(), found, strict=True):
+            value = torch.zeros_like(leaf) if grad is None else grad
+            if place[0] == "feature":
+                own[place] = value
+            else:
+                self.total[place] = self.total[place] + value if place in self.total else value
+        return own
+
+    def _through_inducing(self, part: ProcessBasis, prefix: str, dR: Tensor) -> None:
+        """Derivatives through K_zz."""
+        rest = part.split.rest
+        assert rest is not None
+        params = {key: value.requires_grad_() for key, value in _detached(part.params).items()}
+        with torch.enable_grad():
+            K = rest.kernel.covariance(rest.parameters(params), part.inducing, part.inducing)
+        dK = torch.stack([s.pull_back(d) for s, d in zip(part.spectra, dR, strict=True)])
+        self._add(prefix, params, {}, [K], [dK])
+
+
+def _detached(tensors: Parameters) -> dict[str, Tensor]:
+    return {key: value.detach() for key, value in tensors.items()}

@@ -1,0 +1,150 @@
+"""Sums over shards of a log with `torch.distributed`: gloo between processes, NCCL between GPUs.
+
+Each process holds its own samples; the inducing points and hyperparameters must be those of all.
+
+    torchrun --nproc-per-node 2 script.py        # script.py starts with dist.init_process_group("gloo")
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from forcegp.errors import ModelError
+from forcegp.gp.basis import LatentBasis
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters
+from forcegp.gp.structured_covariance import Block
+from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
+
+Group = dist.ProcessGroup | None
+"""The processes that take part; all of them where it is `None`."""
+
+
+def shard(samples: int, rank: int, processes: int) -> slice:
+    """The samples of one process: equal runs of neighbouring ones, to within one.
+
+    Example:
+        >>> [shard(7, rank, 3) for rank in range(3)]
+        [slice(0, 3, None), slice(3, 5, None), slice(5, 7, None)]
+
+    Raises:
+        ModelError: there is no such process.
+    """
+    if not 0 <= rank < processes:
+        raise ModelError("no such process", expected=f"a rank from 0 to {processes - 1}", got=rank)
+    size, more = divmod(samples, processes)
+    first = rank * size + min(rank, more)
+    return slice(first, first + size + (rank < more))
+
+
+def reduce_sums(sums: Sums, group: Group = None) -> Sums:
+    """The sums of all processes added, the same in each of them."""
+    _require_processes()
+    flat = torch.cat([part.reshape(-1) for part in sums.tensors])
+    dist.all_reduce(flat, op=dist.ReduceOp.SUM, group=group)
+    pieces = flat.split([part.numel() for part in sums.tensors])
+    return Sums(*(new.reshape(old.shape) for new, old in zip(pieces, sums.tensors, strict=True)))
+
+
+def accumulate_shards(
+    basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_SAMPLES, group: Group = None
+) -> Sums:
+    """Sum over the samples of all processes, each of which gives its own.
+
+    The basis must be that of `share_basis`, or computed by each process on equal hardware: eigenvectors
+    are defined up to sign and rotation.
+
+    Args:
+        basis: basis functions.
+        blocks: whitened rows of this process.
+        chunk: samples whose basis functions are held at a time.
+        group: the processes that take part.
+
+    Raises:
+        ModelError: no group of processes has been initialised.
+    """
+    return reduce_sums(accumulate(basis, blocks, chunk), group)
+
+
+def share_basis(basis: LatentBasis, source: int = 0, group: Group = None) -> LatentBasis:
+    """The basis of one process in all of them, which must hold one of the same shapes.
+
+    Args:
+        basis: with the same processes and number of inducing points in every process.
+        source: whose hyperparameters, inducing points and eigenvectors are taken.
+        group: the processes that take part.
+
+    Raises:
+        ModelError: no group of processes has been initialised.
+    """
+    _require_processes()
+    dropped = [s.dropped for part in basis.parts for s in part.spectra]
+    counts = iter(_broadcast(torch.tensor(dropped), source, group).tolist())
+    parts = []
+    for part in basis.parts:
+        spectra = tuple(
+            dataclasses.replace(
+                s,
+                values=_broadcast(s.values, source, group),
+                vectors=_broadcast(s.vectors, source, group),
+                dropped=next(counts),
+            )
+            for s in part.spectra
+        )
+        params, Z = (share_tensors(given, source, group) for given in (part.params, part.inducing))
+        parts.append(dataclasses.replace(part, params=params, inducing=Z, spectra=spectra))
+    return LatentBasis(basis.processes, share_tensors(basis.params, source, group), tuple(parts))
+
+
+def share_tensors(tensors: Parameters | Features, source: int = 0, group: Group = None) -> dict[str, Tensor]:
+    """Named tensors of one process in all of them, which must hold some of the same shapes."""
+    _require_processes()
+    return {key: _broadcast(tensors[key], source, group) for key in sorted(tensors)}
+
+
+def gather_candidates(blocks: Sequence[Block], group: Group = None) -> list[Block]:
+    """Candidates for inducing points of all processes, in the order of their ranks.
+
+    Every process must give the same number of blocks, of the same numbers of samples and rows.
+    """
+    _require_processes()
+    found: list[list[Block]] = [[] for _ in range(dist.get_world_size(group))]
+    for block in blocks:
+        features = [_gather_named(f, group) for f in block.features]
+        operators = [_gather(W, group) for W in block.operators]
+        targets = _gather(block.target, group)
+        for rank, own in enumerate(found):
+            x, W = tuple(f[rank] for f in features), tuple(W[rank] for W in operators)
+            own.append(Block(x, W, targets[rank]))
+    return [block for own in found for block in own]
+
+
+def _gather_named(features: Features, group: Group) -> list[dict[str, Tensor]]:
+    gathered = {name: _gather(features[name], group) for name in features}
+    return [{name: x[rank] for name, x in gathered.items()} for rank in range(dist.get_world_size(group))]
+
+
+def _gather(x: Tensor, group: Group) -> list[Tensor]:
+    own = x.contiguous()
+    found = [torch.empty_like(own) for _ in range(dist.get_world_size(group))]
+    dist.all_gather(found, own, group=group)
+    return found
+
+
+def _broadcast(x: Tensor, source: int, group: Group) -> Tensor:
+    copy = x.detach().clone(memory_format=torch.contiguous_format)
+    dist.broadcast(copy, src=source, group=group)
+    return copy
+
+
+def _require_processes() -> None:
+    if not (dist.is_available() and dist.is_initialized()):
+        raise ModelError(
+            "no group of processes has been initialised",
+            hint='start with torchrun, and call torch.distributed.init_process_group("gloo") first',
+        )

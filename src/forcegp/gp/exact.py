@@ -1,0 +1,141 @@
+"""Exact posterior of latent processes given whitened rows (eqs. 11 and 22 to 24)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters, sub
+from forcegp.gp.likelihood import Conditioned, condition, target_of
+from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors
+from forcegp.gp.structured_covariance import Block, Process, cross_gram
+
+
+@dataclass(frozen=True, eq=False)
+class ExactPosterior:
+    """Latent processes conditioned on rows.
+
+    Attributes:
+        processes: kernels with the prefixes of their hyperparameters.
+        params: log-hyperparameters.
+        blocks: the rows.
+        alpha: (K + I)⁻¹ y `(rows,)`.
+    """
+
+    processes: tuple[Process, ...]
+    params: Parameters
+    blocks: list[Block]
+    alpha: Tensor
+
+    @classmethod
+    def of(cls, processes: Sequence[Process], params: Parameters, blocks: list[Block]) -> ExactPosterior:
+        """Condition on rows.
+
+        Raises:
+            NumericalError: the covariance of the rows is not positive definite.
+        """
+        fitted = condition(processes, params, blocks)
+        result = cls(tuple(processes), params, blocks, fitted.alpha)
+        result.__dict__["conditioned"] = fitted
+        return result
+
+    @cached_property
+    def conditioned(self) -> Conditioned:
+        """Factorisation of the covariance of the rows, computed when first needed after loading."""
+        return condition(self.processes, self.params, self.blocks)
+
+    def is_measured(self, p: int) -> bool:
+        """Whether any row depends on process p; where none does, its posterior is its prior."""
+        return self.measured[p]
+
+    @cached_property
+    def measured(self) -> tuple[bool, ...]:
+        """Whether any row depends on each process; the data change nothing about the others."""
+        return tuple(
+            any(bool(block.operators[p].any()) for block in self.blocks) for p in range(len(self.processes))
+        )
+
+    @cached_property
+    def _weights(self) -> list[list[Tensor]]:
+        """By process and block, `(components, n)`: the mean is k(x, X) times these weights."""
+        return self.weights_of(self.alpha[:, None], squeeze=True)
+
+    def weights_of(self, rows: Tensor, squeeze: bool = False) -> list[list[Tensor]]:
+        """Wᵀ applied to vectors over the rows `(rows, s)`, by process and block `(components, n, s)`."""
+        weights: list[list[Tensor]] = [[] for _ in self.processes]
+        first = 0
+        for block in self.blocks:
+            own = rows[first : first + block.rows].unflatten(0, block.target.shape)
+            first += block.rows
+            for p, W in enumerate(block.operators):
+                weighted = torch.einsum("nak,nas->kns", W, own)
+                weights[p].append(weighted[..., 0] if squeeze else weighted)
+        return weights
+
+    @cached_property
+    def kernels_to_data(self) -> list[list[Callable[[Features], Tensor]]]:
+        """By process and block, x ↦ k(x, X)."""
+        return [
+            [
+                process.kernel.towards(sub(self.params, process.prefix), block.features[p])
+                for block in self.blocks
+            ]
+            for p, process in enumerate(self.processes)
+        ]
+
+    def latent_mean(self, p: int, features: Features) -> Tensor:
+        """Posterior mean of process p at standardized features, `(n, components)`."""
+        parts = [
+            (kernel(features) @ w[..., None])[..., 0]
+            for kernel, w in zip(self.kernels_to_data[p], self._weights[p], strict=True)
+        ]
+        return sum(parts[1:], start=parts[0]).mT
+
+    def covariance(self, block: Block) -> Tensor:
+        """Posterior covariance of the rows of each sample of a block, `(n, r, r)`."""
+        n, d = block.target.shape
+        prior = sum(
+            torch.einsum("nak,kn,nbk->nab", W, self._prior_variance(p, block.features[p]), W)
+            for p, W in enumerate(block.operators)
+        )
+        cross = cross_gram(self.processes, self.params, self.blocks, [block])
+        V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
+        V = V.reshape(len(V), n, d).transpose(0, 1)
+        covariance = prior - V.mT @ V
+        return 0.5 * (covariance + covariance.mT)
+
+    def _prior_variance(self, p: int, features: Features) -> Tensor:
+        process = self.processes[p]
+        return process.kernel.diagonal(sub(self.params, process.prefix), features)
+
+    def log_likelihood(self) -> Tensor:
+        """log p(y) of the rows without their constant, −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π."""
+        return -self.conditioned.negative_log_likelihood(target_of(self.blocks))
+
+    def draw(self, count: int, generator: torch.Generator, features: int = FEATURES) -> FunctionSamples:
+        """Functions from the posterior by Matheron's rule: f(x) + k(x, X) Wᵀ(K + I)⁻¹(y − W f(X) − ε).
+
+        Args:
+            count: number of functions.
+            generator: source of randomness, on the CPU.
+            features: random features per component.
+        """
+        draws: PriorDraws = draw_priors(
+            self.processes, self.params, self.blocks, self.measured, count, generator, features
+        )
+        like = self.alpha
+        noise = torch.randn(len(like), count, dtype=torch.float64, generator=generator).to(like)
+        residual = target_of(self.blocks)[:, None] - draws.at_rows - noise
+        weights = self.weights_of(torch.cholesky_solve(residual, self.conditioned.L))
+        return FunctionSamples(
+            tuple(
+                (draw.basis, *(self.kernels_to_data[p] if self.measured[p] else ()))
+                for p, draw in enumerate(draws.draws)
+            ),
+            tuple((own, *(weights[p] if self.measured[p] else ())) for p, own in enumerate(draws.weights)),
+        )

@@ -1,0 +1,60 @@
+"""Kernel inputs: named features, side by side and standardized."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import UnknownNameError
+
+Features = Mapping[str, Tensor]
+"""Named kernel inputs: `(n, w)`, shared by all components, or `(n, k, w)`, one row for each component."""
+
+
+def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
+    """The named features side by side, `(n, w)`, or `(k, n, w)` where components have inputs of their own.
+
+    Raises:
+        UnknownNameError: a feature is not given.
+    """
+    names = tuple(x) if inputs is None else inputs
+    for name in names:
+        if name not in x:
+            raise UnknownNameError("kernel input", name, x)
+    parts = [x[name] for name in names]
+    if all(part.ndim == 2 for part in parts):
+        return torch.cat(parts, dim=-1)
+    k = next(part.shape[1] for part in parts if part.ndim == 3)
+    wide = [part if part.ndim == 3 else part[:, None].expand(-1, k, -1) for part in parts]
+    return torch.cat(wide, dim=-1).transpose(0, 1)
+
+
+@dataclass(frozen=True)
+class Standardization:
+    """Shift and scale of each named input, x ↦ (x − mean)/std, from training data.
+
+    Inputs that are constant to rounding keep the scale 1, and are listed in `constant`.
+    """
+
+    mean: Mapping[str, Tensor]
+    std: Mapping[str, Tensor]
+    constant: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, features: Mapping[str, Tensor]) -> Standardization:
+        """Mean and standard deviation of each column."""
+        mean = {name: x.mean(0) for name, x in features.items()}
+        std, constant = {}, []
+        for name, x in features.items():
+            spread = x.std(0, correction=0)
+            fixed = spread <= 1e-12 * (1.0 + mean[name].abs())
+            constant += [f"{name}[{i}]" for i in fixed.nonzero()[:, 0].tolist()]
+            std[name] = torch.where(fixed, 1.0, spread)
+        return cls(mean, std, tuple(constant))
+
+    def apply(self, features: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The standardized features."""
+        return {name: (x - self.mean[name]) / self.std[name] for name, x in features.items()}

@@ -1,0 +1,136 @@
+"""Where inducing points are and how many, from the data: greedy conditional variance.
+
+Each step adds the sample of which the points so far miss most, Σ_k S_kk Var(f_k(x) | f(Z)): what the trace
+term of the collapsed bound counts (pivoted partial Cholesky factorisation; Burt, Rasmussen & van der Wilk
+2020). Weights S = WᵀW put it in units of the noise variance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.gp.blocks import points, rows_of
+from forcegp.gp.decomposition import Part, split
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Parameters, sub
+from forcegp.gp.spectrum import TRUNCATION
+from forcegp.gp.structured_covariance import Block, Process
+
+CANDIDATES = 4000
+"""Samples among which points are chosen."""
+
+LIMIT = 100
+"""Most inducing points of one process."""
+
+SHARE = 0.02
+"""Missed variance of all rows, as a fraction of what the noise leaves of them, at which to stop.
+
+In units of the noise variance, M basis functions learned from noisy rows leave a variance of at most M in
+all rows together; what the points miss should be small beside it.
+"""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Chosen inducing points of one process.
+
+    Attributes:
+        points: their kernel inputs.
+        missed: by number of points, from none on, the missed prior variance of a row on average over the
+            candidates, in units of the noise variance `(points + 1,)`.
+    """
+
+    points: dict[str, Tensor]
+    missed: Tensor
+
+    @property
+    def relative(self) -> float:
+        """What is missed at the end as a fraction of the prior variance; 0 where there is none."""
+        return float(self.missed[-1] / self.missed[0]) if float(self.missed[0]) > 0.0 else 0.0
+
+
+def candidates(blocks: Iterable[Block], samples: int, count: int = CANDIDATES) -> list[Block]:
+    """About `count` of all samples, evenly spaced; streams over the blocks.
+
+    Args:
+        blocks: whitened rows; may be a generator.
+        samples: number of samples in all blocks.
+        count: how many to keep.
+    """
+    step, kept, seen = max(1, -(-samples // count)), [], 0
+    for block in blocks:
+        own = torch.arange(len(block.target), device=block.target.device)[-seen % step :: step]
+        seen += len(block.target)
+        if len(own):
+            kept.append(rows_of(block, own))
+    return kept
+
+
+@torch.no_grad()
+def select_inducing(
+    processes: Sequence[Process],
+    params: Parameters,
+    blocks: Sequence[Block],
+    rows: int | None = None,
+    limit: int = LIMIT,
+    share: float = SHARE,
+) -> list[Selection]:
+    """Choose inducing points of each process among the samples of blocks.
+
+    A process that no row shows, or whose kernel has a finite number of features, gets none.
+
+    Args:
+        processes: the processes.
+        params: log-hyperparameters.
+        blocks: candidates, as given by `candidates`.
+        rows: number of rows that will be conditioned on, of which these are a part; all by default.
+        limit: most points of one process.
+        share: missed variance of all rows, as a fraction of what the noise leaves of them, at which to stop.
+    """
+    own_rows = sum(block.rows for block in blocks)
+    tolerance = share / (own_rows if rows is None else rows)
+    chosen = []
+    for p, prior in enumerate(processes):
+        names = blocks[0].features[p]
+        x = {name: torch.cat([block.features[p][name] for block in blocks]) for name in names}
+        weight = torch.cat([(block.operators[p] ** 2).sum(1) for block in blocks]).mT / own_rows
+        rest = split(prior.kernel).rest
+        own = sub(params, prior.prefix)
+        chosen.append(_greedy(rest, own, x, weight, limit, tolerance))
+    return chosen
+
+
+def _greedy(
+    rest: Part | None, own: Parameters, x: Features, weight: Tensor, limit: int, tolerance: float
+) -> Selection:
+    """Pivoted partial Cholesky factorisation of every component with common pivots."""
+    none = Selection({name: value[:0] for name, value in x.items()}, weight.new_zeros(1))
+    if rest is None or not bool(weight.any()):
+        return none
+    params = rest.parameters(own)
+    prior = rest.kernel.diagonal(params, x)
+    left = prior.clone()
+    columns = prior.new_zeros(len(prior), min(limit, points(x)), points(x))
+    kept, functions, missed = [], 0, [float((weight * left).sum())]
+    while len(kept) < columns.shape[1] and missed[-1] > tolerance * functions:
+        i = int((weight * left).sum(0).argmax())
+        k = rest.kernel.covariance(params, x, {name: value[i : i + 1] for name, value in x.items()})[..., 0]
+        so_far = columns[:, : len(kept)]
+        k = k - (so_far[..., i, None].mT @ so_far)[:, 0]
+        # A component that the points know here already gains nothing from another one.
+        fresh = left[:, i] > TRUNCATION * prior[:, i]
+        if not bool(fresh.any()):
+            break
+        column = torch.where(fresh[:, None], k * left[:, i, None].clamp(min=1e-300).rsqrt(), 0.0)
+        columns[:, len(kept)] = column
+        left = (left - column**2).clamp(min=0.0)
+        left[:, i] = 0.0
+        kept.append(i)
+        functions += int(fresh.sum())
+        missed.append(float((weight * left).sum()))
+    index = torch.tensor(kept, dtype=torch.long, device=weight.device)
+    return Selection({name: value[index] for name, value in x.items()}, weight.new_tensor(missed))

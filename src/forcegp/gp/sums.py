@@ -1,0 +1,194 @@
+"""The two sums over samples that a sparse posterior consists of; they stream, add and are forgotten.
+
+Of whitened rows y_i = W_i f(x_i) + ε only S_i = W_iᵀW_i and W_iᵀy_i enter: Σ V_i S_i V_iᵀ and
+Σ V_i W_iᵀ y_i, with V_i the basis functions of each component at sample i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import ModelError
+from forcegp.gp.basis import LatentBasis
+from forcegp.gp.blocks import chunked
+from forcegp.gp.structured_covariance import Block
+
+CHUNK_SAMPLES = 1024
+"""Samples whose basis functions are held at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Sums over samples that are cheap to hold.
+
+    Attributes:
+        v: Σ V Wᵀy `(size,)`.
+        yy: Σ y² `()`.
+        rows: number of rows, less what is forgotten `()`.
+        prior: Σ tr W k Wᵀ of each process's part that inducing points approximate `(processes,)`.
+        missed: what of it the basis misses, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
+    """
+
+    v: Tensor
+    yy: Tensor
+    rows: Tensor
+    prior: Tensor
+    missed: Tensor
+
+    @property
+    def moments(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The sums."""
+        return self.v, self.yy, self.rows, self.prior, self.missed
+
+
+@dataclass(frozen=True, eq=False)
+class Sums(Moments):
+    """All sums over samples for one basis.
+
+    Attributes:
+        G: Σ V S Vᵀ `(size, size)`.
+    """
+
+    G: Tensor
+
+    @classmethod
+    def zero(cls, basis: LatentBasis, like: Tensor) -> Sums:
+        """Sums over no samples."""
+        n, p = basis.size, len(basis.parts)
+        return cls(*(like.new_zeros(shape) for shape in ((n,), (), (), (p,), (p,), (n, n))))
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All sums."""
+        return *self.moments, self.G
+
+    def __add__(self, other: Sums) -> Sums:
+        """Sums over the samples of both.
+
+        Raises:
+            ModelError: they belong to bases of different sizes.
+        """
+        self._check(other)
+        return Sums(*(a + b for a, b in zip(self.tensors, other.tensors, strict=True)))
+
+    def __sub__(self, other: Sums) -> Sums:
+        """Sums without the samples of the other, which must be among those of this one.
+
+        Raises:
+            ModelError: they belong to bases of different sizes, or the other has more rows.
+        """
+        self._check(other)
+        if float(other.rows) > float(self.rows):
+            raise ModelError(
+                "cannot remove more rows than there are", expected=f"≤ {float(self.rows):g}", got=other.rows
+            )
+        return Sums(*(a - b for a, b in zip(self.tensors, other.tensors, strict=True)))
+
+    def scaled(self, factor: float) -> Sums:
+        """Sums in which every sample counts `factor` times: exponential forgetting.
+
+        Raises:
+            ModelError: the factor is not between 0 and 1.
+        """
+        if not 0.0 <= factor <= 1.0:
+            raise ModelError("a forgetting factor must be between 0 and 1", got=factor)
+        return Sums(*(factor * a for a in self.tensors))
+
+    def _check(self, other: Sums) -> None:
+        if self.G.shape != other.G.shape or self.prior.shape != other.prior.shape:
+            raise ModelError(
+                "sums of different bases cannot be combined",
+                expected=f"{len(self.v)} basis functions of {len(self.prior)} processes",
+                got=f"{len(other.v)} of {len(other.prior)}",
+                hint="compute both with the same inducing points and hyperparameters",
+            )
+
+
+@torch.no_grad()
+def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_SAMPLES) -> Sums:
+    """Sum over the samples of blocks, in memory that does not depend on their number.
+
+    Args:
+        basis: basis functions.
+        blocks: whitened rows; may be a generator.
+        chunk: samples whose basis functions are held at a time.
+    """
+    total: Sums | None = None
+    for block in chunked(blocks, chunk):
+        total = Sums.zero(basis, block.target) if total is None else total
+        _add(basis, block, total)
+    if total is None:
+        like = next(iter(basis.params.values()))
+        return Sums.zero(basis, like)
+    total.G.copy_(torch.triu(total.G) + torch.triu(total.G, 1).mT)
+    return total
+
+
+def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
+    """Add a block in place; only the upper triangle of G."""
+    V, prior, missed = basis.evaluate(block.features)
+    W = torch.cat(block.operators, dim=-1)
+    S = (W.mT @ W).permute(1, 2, 0).contiguous()
+    c = (W.mT @ block.target[..., None])[..., 0]
+    weighted = torch.empty_like(V)
+    shown = [
+        k for k in range(len(S)) if basis.columns[k].stop > basis.columns[k].start and bool(S[k, k].any())
+    ]
+    for position, k in enumerate(shown):
+        own = basis.columns[k]
+        for l in shown[position:]:
+            torch.mul(V[:, basis.columns[l]], S[k, l, :, None], out=weighted[:, basis.columns[l]])
+        for run in _runs([basis.columns[l] for l in shown[position:]]):
+            into.G[own, run].addmm_(V[:, own].mT, weighted[:, run])
+        into.v[own] += V[:, own].mT @ c[:, k]
+    into.prior.add_(_by_process(basis, S, prior))
+    into.missed.add_(_by_process(basis, S, missed))
+    into.yy.add_((block.target**2).sum())
+    into.rows.add_(block.rows)
+
+
+def _by_process(basis: LatentBasis, S: Tensor, variance: Tensor) -> Tensor:
+    """Σ S_kk var_k of each process, `(processes,)`, with S `(k, k, n)` and variances `(n, k)`."""
+    traces = (torch.diagonal(S, dim1=0, dim2=1) * variance).sum(0)
+    return torch.stack([traces[own].sum() for own in basis.components])
+
+
+@torch.no_grad()
+def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> tuple[Moments, Tensor]:
+    """Moments with a few more samples, and the rows of these in terms of the basis functions.
+
+    The rows are formed as they stand, which is faster than `accumulate` for a few samples.
+
+    Returns:
+        The new moments, and Φ with rows W_i V_iᵀ `(rows, size)`.
+    """
+    rows = []
+    for block in blocks:
+        V, prior, missed = basis.evaluate(block.features)
+        W = torch.cat(block.operators, dim=-1)
+        S = (W.mT @ W).permute(1, 2, 0)
+        rows.append((W[:, :, basis.owner] * V[:, None, :]).flatten(0, 1))
+        y = block.target.reshape(-1)
+        moments = Moments(
+            torch.addmv(moments.v, rows[-1].mT, y),
+            moments.yy + y @ y,
+            moments.rows + block.rows,
+            moments.prior + _by_process(basis, S, prior),
+            moments.missed + _by_process(basis, S, missed),
+        )
+    return moments, torch.cat(rows)
+
+
+def _runs(columns: list[slice]) -> list[slice]:
+    """Neighbouring slices joined."""
+    runs: list[slice] = []
+    for own in columns:
+        if runs and runs[-1].stop == own.start:
+            runs[-1] = slice(runs[-1].start, own.stop)
+        else:
+            runs.append(own)
+    return runs

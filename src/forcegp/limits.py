@@ -1,0 +1,55 @@
+"""Bounds on what is read from files, in one place: each is checked before the work that it bounds.
+
+They leave room for every robot, log and model that we know of, and keep a file of a few kilobytes from
+taking more than about 1 GiB of memory or a few seconds.
+"""
+
+from __future__ import annotations
+
+KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
+
+HEADER_BYTES = MIB
+"""A JSON header."""
+HEADER_DEPTH = 64
+"""Objects and lists inside each other in a header."""
+
+TABLE_BYTES = 8 * GIB
+"""A table in memory, in bytes of float64."""
+FREE_TABLE_BYTES = 128 * MIB
+"""A table in memory, whatever the size of its file: columns that do not change compress without limit."""
+TABLE_EXPANSION = 64
+"""A larger table has at most so many times the bytes of its file."""
+COLUMNS = 4096
+"""Columns of a log."""
+JOINTS = 512
+"""Joints of a log or of a saved robot."""
+COLUMN_NAME = 1024
+"""Characters of a column's name."""
+SEGMENT_NUMBER = 2**53
+"""The number of a trajectory: the largest range in which float64 holds every integer."""
+
+SCENE_BYTES = MIB
+"""A scene file."""
+KEY_PARTS = 16
+"""Parts of a dotted key of a scene."""
+SCENE_DEPTH = 32
+"""Tables and lists inside each other in a scene."""
+SCENE_KEYS = 2000
+"""Keys and tables of a scene."""
+
+MODEL_BYTES = 16 * GIB
+"""The tensors of a saved model."""
+TENSORS = 10_000
+"""Tensors of a saved model or checkpoint."""
+CHECKPOINT_BYTES = GIB
+"""A checkpoint: the tensors that are learned, without the data."""
+CHECKPOINT_VALUE = 1e12
+"""A value in a checkpoint: hyperparameters are logarithms, and analytical parameters are SI figures."""
+
+LOGGED_VALUE = 1e100
+"""A number in a log or a state: its square, and the square of that, are finite."""
+
+NAMES_COMPARED = 500
+"""Names that a misspelt one is compared with."""
+NAME_COMPARED = 100
+"""Characters of a name up to which it is compared."""

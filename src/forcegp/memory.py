@@ -1,0 +1,86 @@
+"""Memory that work will need, said and refused before it is allocated."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+from forcegp.errors import MemoryLimitError
+
+LARGE = 0.5
+"""Share of the free memory above which a need is announced."""
+
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+class MemoryNeedWarning(UserWarning):
+    """Work needs more than half of the memory that is free."""
+
+
+def free_memory() -> int | None:
+    """Memory that can be allocated without swapping [bytes]: what is available, within the container's limit.
+
+    Returns:
+        `None` where the system does not say.
+    """
+    known = [value for value in (_available(), _left_in_container()) if value is not None]
+    return min(known) if known else None
+
+
+def announce_memory(needed: int, what: str, say: Callable[[str], None] | None = None) -> None:
+    """Say how much memory work will need if that is more than half of what is free, and refuse what is more.
+
+    Call it before the allocation, with an upper bound.
+
+    Args:
+        needed: [bytes].
+        what: the work, as the subject of a sentence: "the covariance of 20,000 points".
+        say: what to do with the sentence, by default a `MemoryNeedWarning`.
+
+    Raises:
+        MemoryLimitError: it needs more than is free.
+
+    Example:
+        >>> announce_memory(1000, "a small matrix")
+    """
+    free = free_memory()
+    if free is None or needed <= LARGE * free:
+        return
+    if needed > free:
+        raise MemoryLimitError(
+            f"{what} needs more memory than is free",
+            expected=f"at most {_gib(free)}",
+            got=_gib(needed),
+            hint="use less data or a smaller model, or free memory",
+        )
+    sentence = f"{what} needs {_gib(needed)} of {_gib(free)} of free memory"
+    if say is not None:
+        say(sentence)
+    else:
+        warnings.warn(sentence, MemoryNeedWarning, stacklevel=2)
+
+
+def _gib(value: int) -> str:
+    return f"{value / (1 << 30):.2f} GiB"
+
+
+def _available() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def _left_in_container() -> int | None:
+    """What the limit of the control group leaves (version 2, then 1)."""
+    for most, used in (
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    ):
+        try:
+            return max(0, int((_CGROUP / most).read_text()) - int((_CGROUP / used).read_text()))
+        except (OSError, ValueError):  # "max": no limit
+            continue
+    return None

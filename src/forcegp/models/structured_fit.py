@@ -1,0 +1,212 @@
+"""A fitted structured Gaussian process: forces conditioned on data, every quantity read off them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.identifiability import force_correlation
+from forcegp.forces.inference import force_posterior, jitter_of, log_likelihood
+from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
+from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.base import CONTACT, JOINT, ForcePrior
+from forcegp.forces.quantities import AffineMap, affine_maps, flat_states, stack
+from forcegp.forces.samples import draw_samples
+from forcegp.gp.optimise import Learned
+from forcegp.gp.pathwise import FEATURES
+from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
+from forcegp.models.structured_spec import Specification, pack
+from forcegp.storage.folder import Settings
+
+KIND = "structured_gp"
+CORRELATION_STATES = 50
+"""Training states at which the correlation of Q and Q_z is evaluated after a fit."""
+LARGE_JITTER = 0.01
+"""Jitter, relative to unit noise, from which a fit warns: the noise grows by half of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredFit(FittedModel):
+    """Priors on forces conditioned on data, with learned hyperparameters.
+
+    Attributes:
+        specification: what was fitted.
+        problem: the training data with the robot, priors and noise that explain them.
+        hyperparameters: all learned tensors, by name.
+        posterior: over latent forces.
+        result: how the fit went.
+        system: robot and contacts, with learned θ_A.
+    """
+
+    specification: Specification
+    problem: Problem
+    hyperparameters: Mapping[str, Tensor]
+    posterior: ForcePosterior
+    result: FitResult
+    system: ConstrainedSystem
+
+    kind = KIND
+    has_function_samples = True
+
+    @property
+    def training(self) -> Training:
+        """What the posterior is conditioned on."""
+        return self.problem.training
+
+    @torch.no_grad()
+    def predict(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str | Sequence[str] = "qdd",
+        *,
+        active: Tensor | None = None,
+        covariance: bool = True,
+        system: ConstrainedSystem | None = None,
+        noise: bool = False,
+    ) -> Prediction:
+        """Posterior mean and covariance of a quantity (eqs. 22 to 25).
+
+        Args:
+            q, qd, tau: `(*batch, nq)` states.
+            quantity: a name of `QUANTITIES`, or several for their joint distribution.
+            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            covariance: whether to compute the covariance, which costs more than the mean.
+            system: read the forces on another system, such as another surface or none at all.
+            noise: whether the covariance is that of a measurement, noise of torque and sensor included.
+
+        Returns:
+            Mean `(*batch, d)` and covariance `(*batch, d, d)`, without measurement noise by default.
+
+        Raises:
+            UnknownNameError: no such quantity.
+            ShapeError: a state or `active` does not fit the system.
+        """
+        system = system or self.system
+        flat = flat_states(system, q, qd, tau, active)
+        at = flat.at(system)
+        z, parts = stack(affine_maps(system, at, quantity))
+        mean = self.posterior.read_mean(system, at, z)
+        spread = self.posterior.read_covariance(system, at, z) if covariance else None
+        if spread is not None and noise:
+            spread = spread + self._noise_covariance(z, parts)
+        return Prediction(
+            mean.reshape(*flat.batch, z.o.shape[-1]),
+            None if spread is None else spread.reshape(*flat.batch, *spread.shape[-2:]),
+            parts,
+        )
+
+    def force_field(self) -> ForceField:
+        """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states."""
+        return self.posterior.total_force
+
+    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
+        """Force functions drawn from the posterior."""
+        return draw_samples(self.posterior, samples, generator, FEATURES).total_force
+
+    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+        return pack(self.specification, self.problem, self.hyperparameters, self.posterior, self.result)
+
+    @property
+    def torque_std(self) -> Tensor | None:
+        """Standard deviation of the motor torque's noise as it is predicted, `(nq,)`, or `None` for none."""
+        learned = self.hyperparameters.get(TORQUE_NOISE)
+        if self.problem.torque_std is not None:
+            return self.problem.torque_std
+        return None if learned is None else learned.exp()
+
+    def _noise_covariance(self, z: AffineMap, parts: Mapping[str, slice]) -> Tensor:
+        """B Σ_τ Bᵀ + Σ_q̈ of a measurement of the quantities, `(n, d, d)`."""
+        noise = z.o.new_zeros(*z.o.shape, z.o.shape[-1])
+        if self.torque_std is not None:
+            noise = noise + (z.B_Q * self.torque_std**2) @ z.B_Q.mT
+        for i, quantity in enumerate(self.training.quantities):
+            if quantity in parts:
+                std = self.problem.noise_at(self.hyperparameters, i)
+                std = std if std.ndim == 1 else std.square().mean(0).sqrt()
+                own = torch.zeros_like(z.o[0])
+                own[parts[quantity]] = std**2
+                noise = noise + torch.diag(own)
+        return noise
+
+
+def learned_system(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> ConstrainedSystem:
+    """The system with the learned robot, detached."""
+    if not analytical_parameters(hyperparameters):
+        return problem.system
+    with torch.no_grad():
+        return problem.system_at(hyperparameters)
+
+
+@torch.no_grad()
+def conditioned(
+    specification: Specification,
+    problem: Problem,
+    hyperparameters: Mapping[str, Tensor],
+    learned: Learned | None = None,
+    warnings: Sequence[str] = (),
+) -> StructuredFit:
+    """Condition forces on the data of a problem at given hyperparameters.
+
+    Args:
+        specification: what is conditioned.
+        problem: data, robot and inference.
+        hyperparameters: of priors, noise and robot.
+        learned: how they were learned.
+        warnings: doubts that have come up.
+
+    Raises:
+        NumericalError: the covariance of the data is not positive definite.
+    """
+    posterior = force_posterior(problem, hyperparameters)
+    system = learned_system(problem, hyperparameters)
+    likelihood = log_likelihood(posterior) - float(problem.rows(hyperparameters).constant)
+    learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
+    jitter = jitter_of(posterior)
+    result = FitResult.of(
+        learned,
+        log_marginal_likelihood=likelihood,
+        jitter=jitter,
+        constant_inputs=_constant_inputs(problem.priors, problem.training),
+        force_correlation=_mean_correlation(posterior, system, problem.training),
+        warnings=(*warnings, *_warnings(jitter)),
+    )
+    return StructuredFit(specification, problem, hyperparameters, posterior, result, system)
+
+
+def _constant_inputs(priors: Sequence[ForcePrior], training: Training) -> tuple[str, ...]:
+    pairs = zip(priors, training.scales, strict=True)
+    return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
+
+
+def _warnings(jitter: float) -> tuple[str, ...]:
+    if jitter < LARGE_JITTER:
+        return ()
+    return (
+        f"the covariance was factorised with a jitter of {jitter:.2g} times the noise variance: "
+        "drop duplicated rows, or state a larger noise",
+    )
+
+
+def _mean_correlation(
+    posterior: ForcePosterior, system: ConstrainedSystem, training: Training
+) -> float | None:
+    """Mean correlation of Q and Q_z over some of the training states, where both have priors."""
+    targets = {prior.target for prior in posterior.priors}
+    if not {JOINT, CONTACT} <= targets:
+        return None
+    few = training.thinned(min(CORRELATION_STATES, training.samples)).measurements
+    parts = [force_correlation(posterior, system, m.at(system)) for m in _in_contact(few)]
+    return float(torch.cat(parts).mean()) if parts else None
+
+
+def _in_contact(measurements: Sequence[Measurement]) -> list[Measurement]:
+    """The samples in which a contact is closed; elsewhere Q_z is zero."""
+    closed = [m[m.active.any(-1).nonzero()[:, 0]] for m in measurements]
+    return [m for m in closed if len(m.q)]

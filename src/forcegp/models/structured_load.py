@@ -1,0 +1,148 @@
+"""Reading structured Gaussian processes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ForceGPError, ModelError
+from forcegp.forces.learn import kernel_parameters
+from forcegp.forces.mean import AnalyticalMean
+from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.gp.exact import ExactPosterior
+from forcegp.gp.features import Standardization
+from forcegp.gp.sparse_tensors import posterior_of_tensors
+from forcegp.models.base import FitResult
+from forcegp.models.structured_fit import StructuredFit
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_spec import CLASSES, COLUMNS, Specification, StructuredSettings
+from forcegp.robot.parameters import AnalyticalParameters
+from forcegp.storage.descriptions import decode
+from forcegp.storage.folder import ModelHeader, settings_of
+from forcegp.storage.system import take_robot
+
+
+def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+
+
+def load_structured(
+    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+) -> StructuredGP:
+    """The model that `StructuredFit.save` wrote.
+
+    Raises:
+        ModelError: a tensor or setting is missing or not valid; names file and field.
+    """
+    settings = settings_of(header, StructuredSettings, source)
+    spec = _specification(settings, tensors, system, source)
+    model = StructuredGP.of(spec)
+    try:
+        for name, value in tensors.items():
+            finite = name.removeprefix("start.") in ("lower", "upper", "velocity_limit", "effort_limit")
+            if value.is_complex() or not (finite or bool(torch.isfinite(value).all())):
+                raise ValueError(f"tensor {name!r} holds values that are not finite real numbers")
+        training = _training(settings, spec, tensors)
+        hyper = _below(tensors, "hyper.")
+        _check_hyperparameters(spec, training, hyper)
+        model.adopt(_restored(spec, training, hyper, tensors, settings, system))
+    except (KeyError, RuntimeError, ValueError, IndexError) as cause:
+        raise ModelError(f"{source}: the model's tensors do not fit its settings", got=str(cause)) from cause
+    return model
+
+
+def _specification(
+    settings: StructuredSettings, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+) -> Specification:
+    priors = tuple(
+        decode(dict(prior), CLASSES, f"{source}: settings.priors.{i}")
+        for i, prior in enumerate(settings.priors)
+    )
+    original, parameters = take_robot(tensors, "start.", system.robot, source), None
+    system = system.with_robot(original)
+    if settings.analytical is not None:
+        try:
+            parameters = AnalyticalParameters(original, settings.analytical)
+        except ForceGPError as cause:
+            raise ModelError.at(f"{source}: field 'settings.analytical'", cause) from cause
+    return Specification(
+        system,
+        AnalyticalMean(settings.mean),
+        priors,
+        settings.noise_std,
+        settings.learn_noise,
+        parameters,
+        settings.torque_noise,
+        settings.inference,
+    )
+
+
+def _training(settings: StructuredSettings, spec: Specification, tensors: Mapping[str, Tensor]) -> Training:
+    measurements, noise = [], []
+    for i, quantity in enumerate(settings.measured):
+        m = Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in COLUMNS})
+        std = tensors[f"data.{i}.noise_std"]
+        if std.shape not in (m.values.shape, m.values.shape[-1:]) or not bool((std > 0.0).all()):
+            raise ValueError(f"noise of measurement {i} has shape {tuple(std.shape)}, or is not positive")
+        measurements.append(m)
+        noise.append(std)
+    scales = tuple(
+        Standardization(
+            _below(tensors, f"scale.{prior.name}.mean."),
+            _below(tensors, f"scale.{prior.name}.std."),
+            constant,
+        )
+        for prior, constant in zip(spec.priors, settings.constant, strict=True)
+    )
+    return Training(tuple(measurements), tuple(noise), scales)
+
+
+def _check_hyperparameters(spec: Specification, training: Training, hyper: Mapping[str, Tensor]) -> None:
+    """Raise `ValueError` or `KeyError` where hyperparameters are not those of the kernels."""
+    for prior, scale in zip(spec.priors, training.scales, strict=True):
+        widths = {name: x.shape[-1] for name, x in scale.mean.items()}
+        for key, value in prior.kernel.initial(prior.outputs(spec.system.robot), widths).items():
+            found = hyper[f"{prior.prefix}.{key}"]
+            if found.shape != value.shape:
+                raise ValueError(f"hyperparameter '{prior.prefix}.{key}' has shape {tuple(found.shape)}")
+
+
+@torch.no_grad()
+def _restored(
+    spec: Specification,
+    training: Training,
+    hyper: dict[str, Tensor],
+    tensors: Mapping[str, Tensor],
+    settings: StructuredSettings,
+    system: ConstrainedSystem,
+) -> StructuredFit:
+    """The fit with its weights as they were; the factorisation waits until a covariance is asked for."""
+    problem = dataclasses.replace(
+        spec.problem(training),
+        system=spec.system if spec.parameters is not None else system,
+        power=settings.power,
+        offsets=_below(tensors, "offset."),
+        torque_std=tensors.get("torque_std"),
+    )
+    params = kernel_parameters(hyper)
+    if "alpha" in tensors:
+        blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
+        rows = sum(block.rows for block in blocks)
+        if alpha.shape != (rows,):
+            raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
+        latent = ExactPosterior(problem.priors, params, blocks, alpha)
+    else:
+        latent = posterior_of_tensors(problem.priors, params, _below(tensors, "sparse."))
+    posterior = ForcePosterior(problem.priors, training.scales, problem.mean, latent, problem.offsets)
+    constant = tuple(
+        f"{p.name}.{name}"
+        for p, scale in zip(spec.priors, training.scales, strict=True)
+        for name in scale.constant
+    )
+    result = FitResult(**settings.result.model_dump(), constant_inputs=constant)
+    return StructuredFit(spec, problem, hyper, posterior, result, system)

@@ -1,0 +1,155 @@
+"""Trajectories in open loop (section 4): every model, from states of a motion that none of them has seen."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+
+from forcegp.data import Dataset
+from forcegp.paper.fits import Fit
+from forcegp.paper.profiles import Profile
+from forcegp.paper.stages import Advance, Stage, Stages
+from forcegp.paper.task import LOG, SCENE, Task, simulation_settings
+from forcegp.report.html import Finding
+from forcegp.report.rollout_data import RolloutData, rollout_data, with_bands
+from forcegp.report.style import label
+from forcegp.rollout import compare
+from forcegp.scene import load_scene
+from forcegp.simulate import simulate
+
+OTHER_MOTION = 1000
+"""Added to the task's seed for the motion that no model has seen."""
+BAND_SECONDS = 2.0
+"""Maximum duration of function samples [s]: each costs one more trajectory from every start."""
+HORIZON = 1.0
+"""Time at which tip errors are compared [s]."""
+FIFTH = 0.2
+"""Fraction of the other models' tip error that the S-GP with analytical mean should stay below."""
+HELD = (0.80, 0.97)
+"""Coverage of 90 % bands that counts as calibrated."""
+OURS = "sgp-mean"
+
+
+def trajectories(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]) -> RolloutData:
+    """The data of the section on trajectories, computed or taken from an earlier run.
+
+    Args:
+        stages: where results are kept.
+        sizes: length and number of the trajectories.
+        task: whose scene is simulated once more.
+        fits: the models.
+    """
+    simulated = _unseen_motion(stages, sizes, task)
+    return stages.data(
+        "figures/rollouts",
+        RolloutData,
+        lambda advance: _roll(sizes, task, fits, simulated, advance),
+        settings={
+            "seconds": sizes.rollout_seconds,
+            "starts": sizes.rollout_starts,
+            "samples": sizes.rollout_samples,
+            "calibration_starts": sizes.calibration_starts,
+            "band_seconds": BAND_SECONDS,
+        },
+        inputs=[simulated, *(fit.stage for fit in fits)],
+    )
+
+
+def _unseen_motion(stages: Stages, sizes: Profile, task: Task) -> Stage:
+    """The task with other waypoints, long enough for starts whose trajectories do not overlap."""
+    scene = load_scene(SCENE)
+    duration = sizes.rollout_starts * sizes.rollout_seconds
+    config = dataclasses.replace(scene.simulation, duration=duration, seed=task.seed + OTHER_MOTION)
+
+    def make(folder: Path, advance: Advance) -> None:
+        simulate(task.system, config, progress=lambda done, _: advance(done)).data.write(folder / LOG)
+
+    settings = simulation_settings(scene, config)
+    return stages.run("simulate/rollout", make, settings=settings, total=config.steps)
+
+
+def _roll(sizes: Profile, task: Task, fits: Sequence[Fit], simulated: Stage, advance: Advance) -> RolloutData:
+    """Mean trajectories from all starts over the whole time, and bands over the first part of it."""
+    models = {fit.name: fit.load() for fit in fits}
+    sampled = {name: model for name, model in models.items() if model.has_function_samples}
+    data, system, samples = Dataset.read(simulated / LOG), task.system, sizes.rollout_samples
+    seconds, starts = sizes.rollout_seconds, sizes.rollout_starts
+
+    def reported(what: str) -> Callable[[int, int], None]:
+        return lambda done, total: advance(done, total, what)
+
+    paths = compare(models, data, seconds, starts, system=system, progress=reported("means"))
+    seconds, note = min(BAND_SECONDS, seconds), reported("function samples")
+    bands = compare(sampled, data, seconds, starts, samples, system=system, progress=note)
+    seconds, note = min(seconds, sizes.stretch), reported("calibration")
+    rows = _calibration_starts(task, seconds, sizes.calibration_starts)
+    calibration = compare(sampled, task.data, seconds, rows, samples, system=system, progress=note)
+    return with_bands(rollout_data(paths), rollout_data(bands, calibration))
+
+
+def _calibration_starts(task: Task, seconds: float, most: int) -> torch.Tensor:
+    """Starts in held-out stretches, spread over the log and over the phases of a line of the motion."""
+    stretches, dt = task.stretches(), task.data.header.dt
+    assert dt is not None
+    chosen = torch.linspace(0, len(stretches) - 1, min(most, len(stretches))).round().long().tolist()
+    rows = []
+    for i, k in enumerate(chosen):
+        first, end = stretches[k]
+        spare = max(0, end - first - 1 - round(seconds / dt))
+        # Golden-ratio sequence: phases spread over [0, 1) without following the order of the stretches.
+        rows.append(first + round(spare * ((0.5 + i * 0.6180339887498949) % 1.0)))
+    return torch.tensor(rows)
+
+
+def tip_error(data: RolloutData) -> Finding | None:
+    """The S-GP with analytical mean against models that do not learn forces, one second ahead."""
+    if HORIZON not in data.horizons:
+        return None
+    at = data.horizons.index(HORIZON)
+    errors = {p.model: math.inf if (e := p.errors[at]) is None else e for p in data.models}
+    others = {m: e for m, e in errors.items() if not m.startswith("sgp")}
+    if OURS not in errors or not others:
+        return None
+    ours = errors[OURS]
+    ratios = {m: ours / e if math.isfinite(ours) else math.inf for m, e in others.items()}
+    listed = "; ".join(f"{label(m)} {_millimetres(e)}, ratio {ratios[m]:.2g}" for m, e in others.items())
+    structured = (m for m in errors if m.startswith("sgp") and m != OURS)
+    beside = "".join(f"; {label(m)} {_millimetres(errors[m])}" for m in structured)
+    text = (
+        f"Open loop, median over {data.starts} starts, {HORIZON:g} s ahead: {label(OURS)} "
+        f"{_millimetres(ours)} "
+        f"(target: at most a fifth of each of the following); {listed}{beside}."
+    )
+    return Finding("Tip error of trajectories", all(ratio <= FIFTH for ratio in ratios.values()), text)
+
+
+def bands(data: RolloutData) -> Finding | None:
+    """Whether bands over function samples have the right coverage of the simulated motion."""
+    sampled = [path for path in data.models if path.coverage is not None]
+    if not sampled:
+        return None
+    calibrated = all(path.calibrated_coverage is not None for path in sampled)
+    listed = []
+    for path in sampled:
+        text = f"{label(path.model)} {path.coverage:.3f}"
+        if path.calibrated_coverage is not None:
+            text += f", widened by {path.inflation:.2f} {path.calibrated_coverage:.3f}"
+        listed.append(text)
+    shares = {p.model: p.calibrated_coverage if calibrated else p.coverage for p in sampled}
+    outside = [label(m) for m, s in shares.items() if s is None or not HELD[0] <= s <= HELD[1]]
+    text = (
+        f"Share of simulated tip positions inside the {data.level:.0%} bands over function samples, "
+        f"{data.band_starts} starts, {data.band_seconds:.3g} s (target: {HELD[0]:.2f} to {HELD[1]:.2f}), "
+        + ("as drawn and widened by calibration on held-out stretches: " if calibrated else "")
+        + "; ".join(listed)
+        + (f"; outside: {', '.join(outside)}." if outside else ".")
+    )
+    return Finding("Bands of trajectories", not outside, text)
+
+
+def _millimetres(error: float) -> str:
+    return f"{1e3 * error:.3g} mm" if math.isfinite(error) else "diverged"

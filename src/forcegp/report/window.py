@@ -1,0 +1,158 @@
+"""Predicted accelerations of all joints over a few seconds, and their errors: data, computation, plots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.files import Header
+from forcegp.models.base import Model
+from forcegp.report.style import INK, Picture, colour, draw, label
+from forcegp.report.values import Series, as_tensor, columns, series
+
+WIDTH, ROW, MARGIN = 4.1, 0.92, 0.55
+"""Size of a plot with one row per joint [inch]."""
+GREY = "#9a9a9a"
+
+
+class WindowData(Header):
+    """Predictions of one model over a window of time.
+
+    Attributes:
+        model: registry name or kind.
+        noise_std: of the measured accelerations [rad/s²], if known.
+        t: [s].
+        joint_names: one per series.
+        measured, clean, mean, std: accelerations by joint [rad/s²]; `clean` and `std` may be unknown.
+    """
+
+    FORMAT: ClassVar[str] = "forcegp-window"
+    VERSION: ClassVar[int] = 1
+
+    model: str
+    noise_std: float | None
+    t: Series
+    joint_names: list[str]
+    measured: list[Series]
+    clean: list[Series] | None
+    mean: list[Series]
+    std: list[Series] | None
+
+    @property
+    def error(self) -> Tensor:
+        """Predicted less noise-free (or else measured) acceleration, `(nq, n)` [rad/s²]."""
+        return as_tensor(self.mean) - as_tensor(self.clean or self.measured)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the window [s]."""
+        return self.t[-1] - self.t[0]
+
+
+def opening(data: Dataset, seconds: float) -> Dataset:
+    """The first seconds of the first trajectory of a data set, sorted by time."""
+    own = (data.segment == data.segment[0]).nonzero()[:, 0]
+    own = own[data.t[own].argsort()]
+    return data[own[data.t[own] <= data.t[own[0]] + seconds]]
+
+
+@torch.no_grad()
+def predicted_window(model: Model, data: Dataset, name: str) -> WindowData:
+    """Mean and standard deviation of the accelerations at the samples of a window.
+
+    Args:
+        model: a fitted model.
+        data: the window, sorted by time.
+        name: what the plots call the model.
+
+    Returns:
+        The data of both plots.
+    """
+    predicted = model.predict(data.q, data.qd, data.tau, active=data.active(model.system.contact_names))
+    clean = data.extras.get("qdd_clean")
+    return WindowData(
+        model=name,
+        noise_std=data.header.noise_std,
+        t=series(data.t),
+        joint_names=list(data.joint_names),
+        measured=columns(data.qdd),
+        clean=None if clean is None else columns(clean),
+        mean=columns(predicted.mean),
+        std=None if predicted.std is None else columns(predicted.std),
+    )
+
+
+def draw_predictions(window: WindowData) -> Picture:
+    """Measured and predicted accelerations, one row per joint, with a band of ±2 standard deviations."""
+    name, joints = label(window.model), len(window.joint_names)
+    band = ", with the ±2σ band," if window.std else ""
+    alt = (
+        f"{name}: accelerations of {joints} joints over {window.seconds:.3g} s; measured in black, "
+        f"predicted{band} in colour."
+    )
+
+    def paint(figure: Figure) -> None:
+        _rows(figure, window, torch.zeros(len(window.t), dtype=torch.float64))
+
+    return draw(paint, (WIDTH, MARGIN + ROW * joints), alt, name)
+
+
+def draw_errors(window: WindowData, limit: float | None = None) -> Picture:
+    """Errors of the predictions: noise-free and measured acceleration less the predicted mean.
+
+    Args:
+        window: the predictions.
+        limit: half height of every row [rad/s²], to compare models at one scale; each row has its own
+            scale by default.
+    """
+    name, joints, error = label(window.model), len(window.joint_names), window.error.abs()
+    alt = (
+        f"{name}: error of the predicted accelerations of {joints} joints over {window.seconds:.3g} s, "
+        f"mean magnitude {error.mean():.2g}, largest {error.max():.2g} rad/s²."
+    )
+
+    def paint(figure: Figure) -> None:
+        _rows(figure, window, as_tensor(window.mean), limit)
+
+    return draw(paint, (WIDTH, MARGIN + ROW * joints), alt, name)
+
+
+def common_limit(windows: Sequence[WindowData]) -> float:
+    """A half height [rad/s²] that fits the noise and the errors of the better half of the models."""
+    if not windows:
+        return 0.5
+    largest = sorted(float(window.error.abs().quantile(0.995)) for window in windows)
+    return max(4.0 * (windows[0].noise_std or 0.0), 1.3 * largest[(len(largest) - 1) // 2])
+
+
+def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | None = None) -> None:
+    """One row per joint, everything drawn relative to `centre`."""
+    rows = figure.subplots(len(window.joint_names), 1, sharex=True, squeeze=False)[:, 0]
+    measured, mean = as_tensor(window.measured) - centre, as_tensor(window.mean) - centre
+    relative, shown = centre.dim() > 1, colour(window.model)
+    for i, axes in enumerate(rows):
+        ink = GREY if relative else INK
+        axes.plot(window.t, measured[i], color=ink, linewidth=0.6, label="measured")
+        if window.std is not None:
+            spread = 2.0 * as_tensor(window.std[i])
+            band = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ", "zorder": 3}
+            axes.fill_between(window.t, mean[i] - spread, mean[i] + spread, **band)
+        axes.plot(window.t, mean[i], color=shown, linewidth=1.1, label="predicted", zorder=4)
+        if relative and window.clean is not None:
+            clean = as_tensor(window.clean[i]) - centre[i]
+            axes.plot(window.t, clean, color=INK, linewidth=0.9, label="noise-free", zorder=5)
+        axes.set_ylabel(f"joint {i + 1}")
+        axes.margins(x=0.0)
+        axes.locator_params(axis="y", nbins=4)
+        if limit is not None:
+            axes.set_ylim(-limit, limit)
+    rows[-1].set_xlabel("time [s]")
+    figure.align_ylabels()
+    handles, names = rows[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=len(names))
+    figure.supylabel(f"acceleration{' less prediction' if relative else ''} [rad/s²]", fontsize=9)

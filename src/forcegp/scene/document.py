@@ -1,0 +1,245 @@
+"""TOML files validated against a schema: every error names the file, the line and the key."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from forcegp.errors import ForceGPError, SceneError
+from forcegp.files import depth
+from forcegp.limits import KEY_PARTS, SCENE_BYTES, SCENE_DEPTH, SCENE_KEYS
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+Key = tuple[str | int, ...]
+Schema = TypeVar("Schema", bound=BaseModel)
+T = TypeVar("T")
+
+_UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+_NAME = r"""(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')"""
+_DOTTED = rf"{_NAME}(?:\s*\.\s*{_NAME})*"
+_ARRAY = re.compile(rf"^\s*\[\[\s*({_DOTTED})\s*\]\]")
+_TABLE = re.compile(rf"^\s*\[\s*({_DOTTED})\s*\]")
+_KEY = re.compile(rf"^\s*({_DOTTED})\s*=")
+_BRACKET = re.compile(r"^[ \t]*\[", re.MULTILINE)
+_TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
+
+
+class Document:
+    """A parsed TOML file that knows the line of each key.
+
+    Args:
+        content: the bytes of the file.
+        source: its name, for messages.
+
+    Raises:
+        SceneError: the file is not TOML; the message names file and line.
+    """
+
+    def __init__(self, content: bytes, source: str) -> None:
+        self.source = source
+        if len(content) > SCENE_BYTES:
+            raise SceneError(
+                f"{source}: too large", expected=f"at most {SCENE_BYTES} bytes", got=len(content)
+            )
+        try:
+            text = content.decode("utf-8")
+        except UnicodeDecodeError as cause:
+            line = content[: cause.start].count(b"\n") + 1
+            raise SceneError(f"{source}:{line}: not UTF-8 text", got=str(cause)) from cause
+        _check_keys(text, source)
+        try:
+            self.data: dict[str, Any] = tomllib.loads(text)
+        except (ValueError, RecursionError) as cause:
+            found = re.search(r"line (\d+)", str(cause))
+            line = int(found[1]) if found else text.count("\n") + 1
+            raise SceneError(
+                f"{source}:{line}: not valid TOML", got=str(cause) or "brackets nested too deeply"
+            ) from cause
+        if depth(self.data) > SCENE_DEPTH:
+            raise SceneError(f"{source}: nested too deeply", expected=f"at most {SCENE_DEPTH} levels")
+        self._lines = _lines_of_keys(text)
+
+    def validated(self, schema: type[Schema]) -> Schema:
+        """The content as an instance of a schema.
+
+        Args:
+            schema: a pydantic model, whose fields may be models, data classes or unions with a `type`.
+
+        Raises:
+            SceneError: the first error in the content, with its line and key.
+        """
+        # In JSON mode, strict validation accepts a list for a tuple and an integer for a float.
+        text = json.dumps(self.data, default=str)
+        try:
+            return schema.model_validate_json(text)
+        except ValidationError as error:
+            # A misspelt key is also a missing one: the spelling is what has to be corrected.
+            errors = sorted(error.errors(), key=lambda found: found["type"] not in _UNKNOWN_KEY)
+            raise self._error(schema, errors[0]) from error
+
+    def at(self, key: Key, make: Callable[..., T], *args: object, **options: object) -> T:
+        """The result of `make(*args, **options)`, whose errors are reported at a key of this file.
+
+        Raises:
+            SceneError: `make` raised an error of this library.
+        """
+        try:
+            return make(*args, **options)
+        except ForceGPError as error:
+            raise SceneError.at(self.place(key), error) from error
+
+    def place(self, key: Key) -> str:
+        """`file:line: key` of a key, or of the nearest enclosing key that is in the file."""
+        known: Key = ()
+        value: Any = self.data
+        for part in key:
+            members: Any = dict(enumerate(value)) if isinstance(value, list) else value
+            if isinstance(members, dict) and part in members:
+                known, value = (*known, part), members[part]
+        line = next(
+            (self._lines[known[:n]] for n in range(len(known), 0, -1) if known[:n] in self._lines), None
+        )
+        where = self.source if line is None else f"{self.source}:{line}"
+        return f"{where}: {dotted(known)}" if known else where
+
+    def _error(self, schema: type[BaseModel], error: ErrorDetails) -> SceneError:
+        """The message of a validation error."""
+        key, kind, context = error["loc"], error["type"], error.get("ctx", {})
+        place, last = self.place(key), str(key[-1]) if key else ""
+        if isinstance(cause := context.get("error"), ForceGPError):
+            return SceneError.at(self.place(self._named(key, cause.message)), cause)
+        if kind in _UNKNOWN_KEY:
+            known = _known_keys(schema, key)
+            return SceneError(f"{place}: unknown key", expected=_one_of(known), hint=_near(last, known))
+        if kind == "missing" and isinstance(key[-1], int):
+            return SceneError(f"{place}: too few numbers", expected=f"more than {last}")
+        if kind == "missing":
+            return SceneError(f"{place}: key {last!r} is missing", expected=f"{last} = …")
+        if kind in ("union_tag_invalid", "union_tag_not_found"):
+            tags = re.findall(r"'(\w+)'", context.get("expected_tags", "")) or _tags(schema, key)
+            if kind == "union_tag_not_found":
+                return SceneError(f"{place}: key 'type' is missing", expected=_one_of(tags))
+            tag = str(context["tag"])
+            message = f"{self.place((*key, 'type'))}: unknown type {tag!r}"
+            return SceneError(message, expected=_one_of(tags), hint=_near(tag, tags))
+        return SceneError(f"{place}: {error['msg'][0].lower()}{error['msg'][1:]}", got=repr(error["input"]))
+
+    def _named(self, key: Key, message: str) -> Key:
+        """The key within a table that a message names, or the table."""
+        table: Any = self.data
+        for part in key:
+            members: Any = dict(enumerate(table)) if isinstance(table, list) else table
+            table = members.get(part, table)
+        found = (name for name in table if re.search(rf"\b{re.escape(name)}\b", message))
+        name = next(found, None)
+        return key if name is None else (*key, name)
+
+
+def _check_keys(text: str, source: str) -> None:
+    """Check the number of keys and of the parts of each: a parser takes quadratic time for either."""
+    keys = text.count("=") + len(_BRACKET.findall(text))
+    if keys > SCENE_KEYS:
+        raise SceneError(f"{source}: too many keys and tables", expected=f"at most {SCENE_KEYS}", got=keys)
+    parts, joined = 0, False
+    for token in _TOKEN.finditer(text):
+        name, dot, other = token.groups()
+        if name:
+            parts, joined = (parts + 1 if joined else 1), False
+        elif dot:
+            joined = True
+        elif other:
+            parts, joined = 0, False
+        if parts > KEY_PARTS:
+            line = text.count("\n", 0, token.start()) + 1
+            raise SceneError(f"{source}:{line}: a key of too many parts", expected=f"at most {KEY_PARTS}")
+
+
+def _one_of(names: list[str]) -> str:
+    return f"one of {', '.join(names)}"
+
+
+def _near(name: str, known: list[str]) -> str | None:
+    near = get_close_matches(name, known, n=1)
+    return f"did you mean {near[0]!r}?" if near else None
+
+
+def _known_keys(schema: type, key: Key) -> list[str]:
+    """The keys of the table that contains a key."""
+    return list(dict.fromkeys(name for table in _tables_at(schema, key[:-1]) for name in _hints(table)))
+
+
+def _tags(schema: type, key: Key) -> list[str]:
+    """The values of `type` that a table may have."""
+    return [tag for table in _tables_at(schema, key) for tag in get_args(_hints(table).get("type"))]
+
+
+def _tables_at(schema: type, key: Key) -> list[type]:
+    """The classes that may describe the table at a key."""
+    tables = [schema]
+    for part in key:
+        found = [_hints(table)[str(part)] for table in tables if str(part) in _hints(table)]
+        if found:
+            tables = [table for annotation in found for table in _tables_in(annotation)]
+        elif isinstance(part, str):  # the tag of a union, such as the type of a surface
+            tables = [table for table in tables if part in get_args(_hints(table).get("type"))]
+    return tables
+
+
+def _hints(table: type) -> dict[str, Any]:
+    """Annotation of each key of a table."""
+    if issubclass(table, BaseModel):
+        return {name: field.annotation for name, field in table.model_fields.items()}
+    hints = get_type_hints(table)
+    return {field.name: hints[field.name] for field in fields(table)}
+
+
+def _tables_in(annotation: Any) -> list[type]:
+    if isinstance(annotation, type) and (is_dataclass(annotation) or issubclass(annotation, BaseModel)):
+        return [annotation]
+    return [table for part in get_args(annotation) for table in _tables_in(part)]
+
+
+def dotted(key: Key) -> str:
+    """A key as people write it: `contact[0].surface`."""
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
+
+
+def _split(name: str) -> Key:
+    return tuple(part.strip("\"'") for part in re.findall(_NAME, name))
+
+
+def _lines_of_keys(text: str) -> dict[Key, int]:
+    """Line of each table and key; of keys in an inline table, only the line of the table."""
+    lines: dict[Key, int] = {}
+    counts: dict[Key, int] = {}
+    table: Key = ()
+    for number, line in enumerate(text.splitlines(), start=1):
+        if found := _ARRAY.match(line):
+            name = _split(found[1])
+            counts[name] = counts.get(name, -1) + 1
+            table = (*name, counts[name])
+            lines.setdefault(name, number)
+        elif found := _TABLE.match(line):
+            name = _split(found[1])
+            # A table below an array of tables belongs to the latest of them.
+            outer = next((name[:n] for n in range(len(name), 0, -1) if name[:n] in counts), None)
+            table = (*outer, counts[outer], *name[len(outer) :]) if outer else name
+        elif found := _KEY.match(line):
+            lines.setdefault((*table, *_split(found[1])), number)
+            continue
+        else:
+            continue
+        lines.setdefault(table, number)
+    return lines

@@ -1,0 +1,93 @@
+"""Frozen descriptions, such as kernels and force priors, as JSON and back.
+
+Only classes of a given table are written and read, field by field; a description that holds Python code (an
+operator, a function) has no JSON form and is refused. Reading checks names and types and runs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from forcegp.errors import ForceGPError, ModelError, UnknownNameError
+
+Classes = Mapping[str, type]
+"""The classes that may be written and read, by the name in the file."""
+
+MAX_DEPTH = 40
+"""Levels of nesting; a sum of many kernels has one level per term."""
+_CHECK = ConfigDict(arbitrary_types_allowed=True, strict=True, allow_inf_nan=False)
+
+
+def encode(value: Any, classes: Classes) -> Any:
+    """A description as what JSON can hold.
+
+    Raises:
+        ModelError: the description, or a part of it, is of a class that has no JSON form.
+    """
+    names = {kind: name for name, kind in classes.items()}
+    if type(value) in names:
+        own = {field.name: encode(getattr(value, field.name), classes) for field in fields(value)}
+        return {"type": names[type(value)], **own}
+    if isinstance(value, tuple | list):
+        return [encode(part, classes) for part in value]
+    if value is None or isinstance(value, str | int | float | bool):
+        return value
+    raise ModelError(
+        f"a {type(value).__name__} holds Python code and cannot be saved", expected=", ".join(sorted(classes))
+    )
+
+
+def decode(json: Any, classes: Classes, place: str, depth: int = 0) -> Any:
+    """The description that `encode` wrote.
+
+    Args:
+        json: what was read.
+        classes: as given to `encode`.
+        place: file and field, for messages.
+        depth: level of nesting.
+
+    Raises:
+        ModelError: a field is missing, unknown or has another type; names the place.
+        UnknownNameError: a class is not in the table.
+    """
+    if depth > MAX_DEPTH:
+        raise ModelError(f"{place}: nested too deeply", expected=f"at most {MAX_DEPTH} levels")
+    if isinstance(json, list):
+        return tuple(decode(part, classes, f"{place}.{i}", depth + 1) for i, part in enumerate(json))
+    if not isinstance(json, dict):
+        return json
+    name = str(json.get("type"))
+    if name not in classes:
+        raise UnknownNameError(f"type in {place}", name, classes)
+    kind = classes[name]
+    assert is_dataclass(kind)
+    known = {field.name for field in fields(kind)}
+    given = {key: value for key, value in json.items() if key != "type"}
+    if set(given) != known:
+        raise ModelError(f"{place}: wrong fields of {name!r}", expected=sorted(known), got=sorted(given))
+    hints = get_type_hints(kind)
+    values = {
+        key: _checked(decode(value, classes, f"{place}.{key}", depth + 1), hints[key], f"{place}.{key}")
+        for key, value in given.items()
+    }
+    try:
+        return kind(**values)
+    except ForceGPError as cause:
+        raise ModelError.at(place, cause) from cause
+
+
+def _checked(value: Any, hint: Any, place: str) -> Any:
+    """The value, of the type that its field declares."""
+    if isinstance(hint, type) and is_dataclass(hint):
+        if not isinstance(value, hint):
+            raise ModelError(f"{place} is not valid", expected=hint.__name__, got=type(value).__name__)
+        return value
+    try:
+        return TypeAdapter(hint, config=_CHECK).validate_python(value, strict=True)
+    except ValidationError as cause:
+        first = cause.errors()[0]
+        raise ModelError(f"{place} is not valid", expected=first["msg"], got=first["input"]) from cause

@@ -1,0 +1,115 @@
+"""Files and folders under construction: hidden, locked while their writer lives, swept once it is dead.
+
+A name is `.forcegp-new-<12 hex digits>-<name of the target>`. Its writer holds a lock (flock) on it, which
+ends with the process however it ends, so that the next writer of the same target knows litter from work.
+Where there is no flock (Windows, some network file systems) litter stays; no reader looks at it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import shutil
+import stat
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+NEW, ASIDE = ".forcegp-new-", ".forcegp-aside-"
+"""Prefixes of what is under construction, and of a folder that is moved aside to make room for another."""
+
+
+def hidden_name(target: Path, prefix: str) -> Path:
+    """A hidden, unused path beside a target with the same ending, as some writers go by the ending."""
+    return target.with_name(f"{prefix}{secrets.token_hex(6)}-{target.name}")
+
+
+def left_beside(target: Path, prefix: str) -> list[Path]:
+    """Everything beside a target that has a hidden name of it, the latest first."""
+    form = re.compile(re.escape(prefix) + "[0-9a-f]{12}-" + re.escape(target.name))
+    try:
+        with os.scandir(target.parent) as entries:
+            found = [entry for entry in entries if form.fullmatch(entry.name)]
+        found.sort(key=lambda entry: entry.stat(follow_symlinks=False).st_mtime_ns, reverse=True)
+    except OSError:
+        return []
+    return [Path(entry.path) for entry in found]
+
+
+class Temporary:
+    """An empty file or folder under construction, locked until `close`.
+
+    Args:
+        target: what it will replace; its parent folder exists.
+        folder: whether it is a folder.
+        mode: permissions, of which the umask takes away.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+
+    def __init__(self, target: Path, *, folder: bool, mode: int) -> None:
+        while True:
+            self.path = hidden_name(target, NEW)
+            if folder:
+                self.path.mkdir(mode=mode)
+            else:
+                os.close(os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode))
+            locked, self._descriptor = _lock(self.path)
+            # A sweep between the two steps has taken it for litter: make another.
+            if locked:
+                return
+
+    def close(self) -> None:
+        """Release the lock, and remove what is still there."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+        discard(self.path)
+
+
+def sweep(target: Path) -> None:
+    """Remove what killed writers of a target left beside it."""
+    for path in left_beside(target, NEW) if fcntl is not None else []:
+        locked, descriptor = _lock(path)
+        if descriptor is not None:
+            if locked:
+                discard(path)
+            os.close(descriptor)
+
+
+def discard(path: Path) -> None:
+    """Remove a file or folder, as far as it can be removed."""
+    try:
+        if stat.S_ISDIR(path.lstat().st_mode):
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+def _lock(path: Path) -> tuple[bool, int | None]:
+    """Whether we hold the lock of a path that still exists (or need none), and the descriptor."""
+    if fcntl is None:
+        return True, None
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return False, None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(descriptor), path.lstat()), descriptor
+    except BlockingIOError:
+        os.close(descriptor)
+        return False, None
+    except FileNotFoundError:
+        os.close(descriptor)
+        return False, None
+    except OSError:  # no flock on this file system
+        os.close(descriptor)
+        return True, None

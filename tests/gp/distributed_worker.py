@@ -1,0 +1,33 @@
+"""What each process of the test of distributed sums does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+from safetensors.torch import save_file
+
+from forcegp.gp.basis import latent_basis
+from forcegp.gp.blocks import rows_of
+from forcegp.gp.distributed import accumulate_shards, gather_candidates, shard, share_basis
+from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
+
+SAMPLES, POINTS = 61, 12
+
+
+def run(rank: int, processes: int, folder: str) -> None:
+    """Sum over this process's shard, from a basis that only the first process has right."""
+    torch.set_num_threads(1)
+    store = Path(folder) / "store"
+    dist.init_process_group("gloo", init_method=store.as_uri(), rank=rank, world_size=processes)
+    block = rows(SAMPLES)
+    own = rows_of(block, shard(SAMPLES, rank, processes))
+    wrong = {key: value + 0.1 * rank for key, value in parameters().items()}
+    mine = latent_basis(PROCESSES, wrong, first(rows(POINTS, seed=5 + rank), POINTS), COMPONENTS)
+    sums = accumulate_shards(share_basis(mine), [own])
+    found = gather_candidates([rows_of(own, slice(0, 3))])
+    kept = {f"sum.{i}": part.clone() for i, part in enumerate(sums.tensors)}
+    kept |= {f"candidates.{i}": block.features[1]["qd"].clone() for i, block in enumerate(found)}
+    save_file(kept, Path(folder) / f"{rank}.safetensors")
+    dist.destroy_process_group()

@@ -1,0 +1,38 @@
+"""Exact inference that does not fit is refused before anything is allocated."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from forcegp.errors import ModelError
+from forcegp.gp.capacity import available_bytes, exact_bytes, require_exact_fits
+from forcegp.gp.structured_covariance import Block
+
+
+def wide(samples: int) -> Block:
+    """Samples of seven rows that take no memory."""
+    zero = torch.zeros(1, dtype=torch.float64)
+    return Block(({"q": zero.expand(samples, 7)},), (zero.expand(samples, 7, 7),), zero.expand(samples, 7))
+
+
+def test_size_grows_with_the_square_of_the_rows() -> None:
+    small, large = exact_bytes([wide(1000)]), exact_bytes([wide(10_000)])
+    assert small > 2 * 8 * 7000**2
+    assert large == pytest.approx(100 * small, rel=1e-6)
+    assert exact_bytes([wide(500), wide(500)]) < small
+    assert exact_bytes([wide(1000)], learning=False) < small
+
+
+def test_a_long_log_is_refused_with_its_size_and_the_way_out() -> None:
+    with pytest.raises(ModelError, match=r"1000000 samples \(7000000 rows\)[\s\S]*GiB[\s\S]*sparse"):
+        require_exact_fits([wide(1_000_000)])
+    require_exact_fits([wide(10)])
+    needed = exact_bytes([wide(100)])
+    require_exact_fits([wide(100)], available=needed)
+    with pytest.raises(ModelError, match="does not fit"):
+        require_exact_fits([wide(100)], available=needed - 1)
+
+
+def test_available_memory_is_plausible() -> None:
+    assert 2**26 < available_bytes() < 2**50

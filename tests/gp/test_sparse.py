@@ -1,0 +1,187 @@
+"""The sparse posterior against dense textbook formulas, the exact posterior, and refits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from forcegp.errors import ModelError, NumericalError
+from forcegp.gp.basis import latent_basis
+from forcegp.gp.blocks import rows_of
+from forcegp.gp.kernels import sub
+from forcegp.gp.likelihood import condition
+from forcegp.gp.sparse import SparsePosterior, condition_sparse
+from forcegp.gp.structured_covariance import Block, cross_gram
+from forcegp.gp.sums import accumulate
+from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows, textbook
+
+ALGEBRA = 1e-8
+"""Two orders of summation and factorisation of matrices with condition numbers up to about 10⁶."""
+ROUNDING = 1e-10
+
+
+def fitted(
+    blocks: list[Block], inducing: list[dict[str, Tensor]] | None = None
+) -> tuple[SparsePosterior, dict[str, Tensor]]:
+    params = parameters()
+    Z = inducing if inducing is not None else first(blocks[0], 12)
+    return condition_sparse(PROCESSES, params, blocks, Z), params
+
+
+def mean_of(posterior: SparsePosterior, block: Block) -> Tensor:
+    """Posterior mean of rows `(n, d)`."""
+    latent = [posterior.latent_mean(p, features) for p, features in enumerate(block.features)]
+    return sum(
+        ((W @ f[..., None])[..., 0] for W, f in zip(block.operators, latent, strict=True)),
+        start=torch.zeros_like(block.target),
+    )
+
+
+def test_equals_the_dense_textbook_sparse_posterior() -> None:
+    blocks, test = [rows(30), rows(21, r=2, seed=1)], rows(9, r=4, seed=2)
+    Z = first(rows(12, seed=5), 12)
+    posterior, params = fitted(blocks, Z)
+    mean, covariance = textbook(blocks, Z, params).predict(test)
+    assert np.abs(mean_of(posterior, test).numpy() - mean).max() < ALGEBRA
+    assert np.abs(posterior.covariance(test).numpy() - covariance).max() < ALGEBRA
+    assert posterior.jitter == 0.0
+
+
+def test_equals_the_exact_posterior_where_inducing_points_are_the_data() -> None:
+    blocks, test = [rows(25), rows(15, r=2, seed=1)], rows(9, r=4, seed=2)
+    Z = [
+        {name: torch.cat([block.features[p][name] for block in blocks]) for name in ("q", "qd")}
+        for p in range(2)
+    ]
+    posterior, params = fitted(blocks, Z)
+    exact = condition(PROCESSES, params, blocks)
+    cross = cross_gram(PROCESSES, params, blocks, [test])
+    mean = (cross.mT @ exact.alpha).reshape(test.target.shape)
+    V = torch.linalg.solve_triangular(exact.L, cross, upper=False)
+    prior = cross_gram(PROCESSES, params, [test], [test])
+    full = (prior - V.mT @ V).unflatten(0, test.target.shape).unflatten(2, test.target.shape)
+    covariance = torch.stack([full[i, :, i] for i in range(len(test.target))])
+    assert torch.allclose(mean_of(posterior, test), mean, atol=1e-6, rtol=0)
+    assert torch.allclose(posterior.covariance(test), covariance, atol=1e-6, rtol=0)
+
+
+def test_a_process_that_no_row_shows_keeps_its_prior_and_needs_no_points() -> None:
+    shown, params = rows(20), parameters()
+    hidden = Block(shown.features, (shown.operators[0], torch.zeros_like(shown.operators[1])), shown.target)
+    Z = first(shown, 8)
+    posterior = condition_sparse(PROCESSES, params, [hidden], [Z[0], {k: x[:0] for k, x in Z[1].items()}])
+    assert posterior.measured == (True, False)
+    test = rows(6, seed=2)
+    assert torch.equal(posterior.latent_mean(1, test.features[1]), torch.zeros(6, 1, dtype=torch.float64))
+    latent = posterior.latent_covariance(test.features)
+    prior = PROCESSES[1].kernel.diagonal(sub(params, "contact"), test.features[1])[0]
+    assert torch.allclose(latent[:, 2, 2], prior, rtol=ROUNDING)
+    assert float(latent[:, 2, :2].abs().max()) == 0.0
+
+
+def test_chunks_and_shards_make_no_difference() -> None:
+    block, params = rows(70), parameters()
+    basis = latent_basis(PROCESSES, params, first(block, 12), COMPONENTS)
+    whole = accumulate(basis, [block])
+    halves = accumulate(basis, [rows_of(block, slice(0, 33))]) + accumulate(
+        basis, [rows_of(block, slice(33, None))]
+    )
+    chunked = accumulate(basis, (b for b in [block]), chunk=7)
+    for other in (halves, chunked):
+        for a, b in zip(whole.tensors, other.tensors, strict=True):
+            assert torch.allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("new", [1, 5, 40])
+def test_update_equals_refit(new: int) -> None:
+    old, more = rows(60), rows(new, seed=7)
+    Z = first(old, 12)
+    before, params = fitted([old], Z)
+    updated, refit = before.updated([more]), condition_sparse(PROCESSES, params, [old, more], Z)
+    test = rows(9, seed=2)
+    assert torch.allclose(mean_of(updated, test), mean_of(refit, test), atol=ALGEBRA, rtol=0)
+    assert torch.allclose(updated.covariance(test), refit.covariance(test), atol=ALGEBRA, rtol=0)
+    assert float(updated.sums.rows) == 3 * (60 + new)
+    assert torch.allclose(updated.sums.missed, refit.sums.missed, rtol=ROUNDING)
+
+
+def test_a_window_is_removed() -> None:
+    old, more = rows(60), rows(20, seed=7)
+    Z = first(old, 12)
+    kept, _ = fitted([old], Z)
+    both, _ = fitted([old, more], Z)
+    test = rows(9, seed=2)
+    moved = both.without([more])
+    assert torch.allclose(mean_of(moved, test), mean_of(kept, test), atol=ALGEBRA, rtol=0)
+    assert torch.allclose(moved.covariance(test), kept.covariance(test), atol=ALGEBRA, rtol=0)
+    with pytest.raises(ModelError, match="cannot remove more rows"):
+        kept.without([old, more])
+    with pytest.raises(NumericalError, match="not positive definite"):
+        kept.without([Block(more.features, tuple(9.0 * W for W in more.operators), more.target)])
+
+
+def test_forgetting_is_louder_noise_on_what_came_before() -> None:
+    """A sample that counts g times is one whose noise variance is 1/g times as large."""
+    old, g = rows(60), 0.3
+    Z, params = first(old, 12), parameters()
+    quiet = Block(old.features, tuple(g**0.5 * W for W in old.operators), g**0.5 * old.target)
+    forgetting = condition_sparse(PROCESSES, params, [old], Z).forgetting(g)
+    louder = condition_sparse(PROCESSES, params, [quiet], Z)
+    test = rows(9, seed=2)
+    assert torch.allclose(mean_of(forgetting, test), mean_of(louder, test), atol=ALGEBRA, rtol=0)
+    assert torch.allclose(forgetting.covariance(test), louder.covariance(test), atol=ALGEBRA, rtol=0)
+    with pytest.raises(ModelError, match="between 0 and 1"):
+        forgetting.forgetting(1.5)
+
+
+def test_large_scales_lose_no_digits() -> None:
+    """Against orthogonal factorisation of all rows, where those of one sample weigh 10⁵ noise deviations."""
+    block, test = rows(400), rows(9, seed=2)
+    sharp = Block(block.features, tuple(1e5 * W for W in block.operators), 1e5 * block.target)
+    posterior, _ = fitted([sharp], first(block, 40))
+    Phi = by_rows(posterior, sharp)
+    stacked = np.concatenate([Phi, np.eye(Phi.shape[1])])
+    target = np.concatenate([sharp.target.numpy().reshape(-1), np.zeros(Phi.shape[1])])
+    Q, R = np.linalg.qr(stacked)
+    own = by_rows(posterior, test)
+    mean = (own @ np.linalg.solve(R, Q.T @ target)).reshape(9, 3)
+    half = np.linalg.solve(R.T, own.T).T.reshape(9, 3, -1)
+    _, _, missed = posterior.basis.evaluate(test.features)
+    W = torch.cat(test.operators, dim=-1).numpy()
+    covariance = half @ half.transpose(0, 2, 1) + np.einsum("nak,nk,nbk->nab", W, missed.numpy(), W)
+    assert posterior.jitter == 0.0
+    assert np.abs(mean_of(posterior, test).numpy() - mean).max() < ALGEBRA
+    assert np.abs(posterior.covariance(test).numpy() - covariance).max() < ALGEBRA
+
+
+def by_rows(posterior: SparsePosterior, block: Block) -> np.ndarray:
+    """W_i V_iᵀ of all rows, a component at a time."""
+    V, _, _ = posterior.basis.evaluate(block.features)
+    W = torch.cat(block.operators, dim=-1)
+    parts = [W[:, :, k, None] * V[:, None, own] for k, own in enumerate(posterior.basis.columns)]
+    return torch.cat(parts, dim=-1).flatten(0, 1).numpy()
+
+
+def test_sums_of_different_bases_do_not_add() -> None:
+    block, params = rows(20), parameters()
+    one = accumulate(latent_basis(PROCESSES, params, first(block, 5), COMPONENTS), [block])
+    two = accumulate(latent_basis(PROCESSES, params, first(block, 6), COMPONENTS), [block])
+    with pytest.raises(ModelError, match="different bases"):
+        one + two
+    with pytest.raises(ModelError, match="nothing to condition on"):
+        condition_sparse(PROCESSES, params, [], first(block, 5))
+
+
+def test_diagnostics_tell_when_more_points_would_help() -> None:
+    block = rows(200)
+    few, _ = fitted([block], first(block, 2))
+    many, _ = fitted([block], first(block, 200))
+    assert few.diagnostics.more_points_would_help and not many.diagnostics.more_points_would_help
+    assert few.diagnostics.missed == pytest.approx(float(few.sums.missed.sum()))
+    Phi, y = by_rows(many, block), block.target.numpy().reshape(-1)
+    A = np.eye(Phi.shape[1]) + Phi.T @ Phi
+    smoother = Phi @ np.linalg.solve(A, Phi.T)
+    assert many.diagnostics.learned == pytest.approx(np.trace(smoother), rel=1e-6)
+    assert many.diagnostics.residual == pytest.approx(((y - smoother @ y) ** 2).mean(), rel=1e-6)

@@ -1,0 +1,85 @@
+"""A result is not computed for a place that cannot take it, and not lost if the place fails later."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from forcegp import destination
+from forcegp.destination import check_destination, write_or_keep
+from forcegp.errors import DestinationError, ModelError
+
+
+def test_a_place_that_can_be_written_is_left_as_it_was(tmp_path: Path) -> None:
+    check_destination(tmp_path / "a" / "b" / "model", folder=True, needed_bytes=1000)
+    check_destination(tmp_path / "run.parquet")
+    assert os.listdir(tmp_path) == []
+
+
+def test_kinds_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("precious")
+    with pytest.raises(DestinationError, match="is a file, and a folder"):
+        check_destination(tmp_path / "file", folder=True)
+    with pytest.raises(DestinationError, match="is a folder, and a file"):
+        check_destination(tmp_path)
+    with pytest.raises(DestinationError, match="cannot be written"):
+        check_destination(tmp_path / "file" / "model", folder=True)
+
+
+def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
+    own = ("model.json",)
+    check_destination(tmp_path, folder=True, own_files=own)
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(DestinationError, match=r"other files(.|\n)*model\.json(.|\n)*thesis\.tex"):
+        check_destination(tmp_path, folder=True, own_files=own)
+    (tmp_path / "model.json").write_text("{}")
+    check_destination(tmp_path, folder=True, own_files=own)
+
+
+def test_a_full_disk_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(DestinationError, match=r"not enough room(.|\n)*free"):
+        check_destination(tmp_path / "model", needed_bytes=shutil.disk_usage(tmp_path).total)
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(destination.os, "fsync", full)
+    with pytest.raises(DestinationError, match="No space left"):
+        check_destination(tmp_path / "model")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("kind", ["a file in the way", "a full disk"])
+def test_a_result_that_cannot_be_written_is_kept(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, spare = tmp_path / "results", tmp_path / "spare"
+    spare.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(spare))
+    place.write_text("in the way")
+
+    def write(path: Path) -> None:
+        if kind == "a full disk" and path.is_relative_to(place):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        path.mkdir()
+        (path / "model.json").write_text("the result")
+
+    with pytest.raises(DestinationError, match=r"could not be written there(.|\n)*it was kept in") as error:
+        write_or_keep(write, place / "model")
+    [kept] = spare.iterdir()
+    assert str(kept / "model") in str(error.value)
+    assert (kept / "model" / "model.json").read_text() == "the result"
+    assert kept.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_result_that_can_be_written_nowhere_says_why(tmp_path: Path) -> None:
+    def write(path: Path) -> None:
+        raise ModelError("a kernel in Python cannot be saved")
+
+    with pytest.raises(ModelError, match="cannot be saved"):
+        write_or_keep(write, tmp_path / "model")
