@@ -15,8 +15,7 @@ from pathlib import Path
 from forcegp.errors import MappingError, SceneError
 from forcegp.logs import units
 from forcegp.logs.sections import MappingSections, PerJoint, QuantitySection
-from forcegp.logs.validation import validated
-from forcegp.scene.toml import Document, Key
+from forcegp.scene.document import Document, Key
 
 BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "ur3_mat")
 """Mappings that come with the library: those of published logs, and of ROS topics with the robot's names."""
@@ -139,9 +138,9 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
     """
     try:
         document = Document(content, source)
+        mapping = Mapping(document.validated(MappingSections), document)
     except SceneError as error:
         raise MappingError(error.message, expected=error.expected, got=error.got, hint=error.hint) from error
-    mapping = Mapping(validated(MappingSections, document), document)
     _check(mapping)
     return mapping
 
