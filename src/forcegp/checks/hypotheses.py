@@ -121,15 +121,12 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
     """Gains, offsets, gravity, tool and masses: explanations with parameters."""
-    q, qd, qdd, tau = tensors(log, rows, "q", "qd", "qdd", "tau")
-    gains = _diagonal(tau.numpy())
+    gains = _diagonal(log.tau[rows])
     yield Hypothesis("gains", log.nq, log, gains, np.full(log.nq, 100.0), tuple(range(log.nq)))
     for j in range(log.nq):
         yield Hypothesis("gains", 1, log, gains[..., [j]], np.full(1, 100.0), (j,))
     for j in range(log.nq):
-        columns = _offset_column(system, j, q, qd, qdd)
-        # r = u(q) − τ, and u(q + δ) − τ vanishes: r = −∂u/∂q δ.
-        yield Hypothesis("encoder-offset", 1, log, -columns[..., None], np.full(1, 1.0), (j,))
+        yield encoder_hypothesis(system, log, rows, j)
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], log, columns, prior)
@@ -154,6 +151,12 @@ def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: s
     mass = robot.mass.numpy()[:, None]
     share = np.array([MASS_SHARE, *[MOMENT_ARM] * 3, *[MOMENT_ARM**2] * 6])
     return -Y, (np.maximum(mass, 0.01 * mass.max()) * share).ravel()
+
+
+def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j: int) -> Hypothesis:
+    """The encoder of joint j is off by δ: u(q + δ) − τ vanishes, so that r = u(q) − τ = −∂u/∂q δ."""
+    columns = _offset_column(system, j, *tensors(log, rows, "q", "qd", "qdd"))
+    return Hypothesis("encoder-offset", 1, log, -columns[..., None], np.full(1, 1.0), (j,))
 
 
 def _offset_column(system: ConstrainedSystem, j: int, *motion: torch.Tensor) -> Array:
