@@ -51,19 +51,19 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: Fit) -> bo
     return True
 
 
-def corrected(hypothesis: Hypothesis, fit: Fit) -> Log | None:
-    """The log without the fault, or `None` where the robot is at fault."""
-    log, joints = hypothesis.log, list(hypothesis.joints)
+def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
+    """The log without the fault; unchanged where the robot is at fault."""
+    joints = list(hypothesis.joints)
     if hypothesis.name == "gains":
         tau = log.tau.copy()
         # r = u − τ = g τ: the right torque is (1 + g) τ.
-        tau[:, joints] *= 1.0 + fit.theta[: len(joints)]
+        tau[:, joints] *= 1.0 + theta[: len(joints)]
         return log.replace(tau=tau)
     if hypothesis.name == "encoder-offset":
         q = log.q.copy()
-        q[:, joints] += fit.theta[:1]
+        q[:, joints] += theta[:1]
         return log.replace(q=q)
-    return log if hypothesis.columns is None else None
+    return hypothesis.change(log)
 
 
 def finding_of(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> list[Finding]:

@@ -8,8 +8,9 @@ second fault, so that one fault does not show as several.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import Fit, Problem, cross_validate, gain_of
 from forcegp.checks.hypotheses import (
     LAGS,
+    ROBOT,
     Hypothesis,
     continuous,
     discrete,
@@ -37,6 +39,8 @@ ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
 """Standard errors by which the held-out score must drop; there are about a hundred hypotheses."""
+SHARE = 0.1
+"""Share of the best drop that a simpler hypothesis may leave to a second round."""
 MATERIAL = 0.15
 """Drop of Σ_j log error that matters: 14 % less error in one joint."""
 MATERIAL_EACH = 0.05
@@ -50,6 +54,7 @@ class Explanation:
     Attributes:
         findings: faults found, the most telling first.
         log: the log without them.
+        repairs: what takes the faults out of a log, in order.
         problem: the torques that remain, over `rows`.
         robot: names of the accepted hypotheses about the robot, which stay in the model.
         columns, prior: their columns, and how large their parameters may be.
@@ -59,6 +64,7 @@ class Explanation:
 
     findings: list[Finding]
     log: Log
+    repairs: tuple[Callable[[Log], Log], ...]
     problem: Problem
     robot: tuple[str, ...]
     columns: Array
@@ -72,7 +78,7 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     rows = log.rows(ROWS, margin=max(LAGS))
     problem = _weighed(problem_of(system, log, rows))
     kept, prior = np.zeros((*problem.r.shape, 0)), np.zeros(0)
-    findings, taken, robot = [], set(), ()
+    findings, taken, robot, repairs = [], set(), (), []
     for _ in range(ROUNDS):
         chosen = _best(system, log, rows, problem, kept, prior, taken)
         if chosen is None:
@@ -81,28 +87,30 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
         found = finding_of(system, log, hypothesis, fit)
         findings += found
         taken.add((hypothesis.name, hypothesis.joints))
-        fixed = corrected(hypothesis, fit)
-        if fixed is not None and hypothesis.name == "encoder-offset":
-            fixed = _refined(system, fixed, rows, problem, hypothesis.joints)
-        if fixed is not None:
-            log = fixed
+        if hypothesis.name not in ROBOT:
+            theta = fit.theta
+            if hypothesis.name == "encoder-offset":
+                theta = _refined(system, log, rows, problem, hypothesis, theta[:1])
+            repairs.append(partial(corrected, hypothesis=hypothesis, theta=theta))
+            log = repairs[-1](log)
             problem = _weighed(problem_of(system, log, rows), kept, prior)
         else:
             assert hypothesis.columns is not None and hypothesis.prior is not None
             kept = np.concatenate([hypothesis.columns, kept], axis=-1)
             prior = np.concatenate([hypothesis.prior, prior])
             problem, robot = _weighed(problem, kept, prior), (hypothesis.name, *robot)
-    return Explanation(findings, log, problem, robot, kept, prior, cross_validate(problem, kept, prior), rows)
+    return Explanation(findings, log, tuple(repairs), problem, robot, kept, prior, cross_validate(problem, kept, prior), rows)
 
 
 def _refined(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem, joints: tuple[int, ...]
-) -> Log:
-    """The log after two more Gauss-Newton steps of an encoder offset, whose effect on the torque is not linear."""
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem, found: Hypothesis, theta: Array
+) -> Array:
+    """An encoder offset after two more Gauss-Newton steps, as its effect on the torque is not linear."""
     for _ in range(2):
-        again = encoder_hypothesis(system, log, rows, joints[0])
-        log = corrected(again, cross_validate(with_log(problem, system, log, rows), again.columns)) or log
-    return log
+        moved = corrected(log, found, theta)
+        again = encoder_hypothesis(system, moved, rows, found.joints[0])
+        theta = theta + cross_validate(with_log(problem, system, moved, rows), again.columns).theta
+    return theta
 
 
 def _weighed(problem: Problem, columns: Array | None = None, prior: Array | None = None) -> Problem:
@@ -135,10 +143,10 @@ def _best(
     if not good:
         return None
     best = min(good, key=lambda pair: pair[1].score.mean())
-    near = []
+    most, near = gain_of(best[1].score, null.score)[0], []
     for hypothesis, fit in good:
         loss, error = gain_of(best[1].score, fit.score)
-        if loss <= error + 1e-9:
+        if loss <= max(error, SHARE * most) + 1e-9:
             near.append((hypothesis, fit))
     return min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
 
@@ -148,7 +156,7 @@ def _fits(
 ) -> Iterator[tuple[Hypothesis, Fit]]:
     # Once the robot is at fault and its parameters are free, they bend to any sign and order.
     for hypothesis in _promising(system, log, rows, problem) if not len(prior) else ():
-        changed = with_log(problem, system, hypothesis.log, rows)
+        changed = with_log(problem, system, hypothesis.change(log), rows)
         yield hypothesis, cross_validate(changed)
     for hypothesis in continuous(system, log, rows):
         if len(prior) and hypothesis.joints:
@@ -164,5 +172,5 @@ def _promising(system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: P
     few = rows[::SCREENING]
     null = cross_validate(with_log(problem, system, log, few)).score.mean()
     for hypothesis in discrete(log):
-        if cross_validate(with_log(problem, system, hypothesis.log, few)).score.mean() < null:
+        if cross_validate(with_log(problem, system, hypothesis.change(log), few)).score.mean() < null:
             yield hypothesis

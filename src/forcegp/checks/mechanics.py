@@ -32,6 +32,8 @@ DISTURBANCE_SECONDS = 0.1
 """Length over which the residual is averaged [s]."""
 DISTURBANCE = 5.0
 """Robust standard deviations of the log residual from which a stretch of time stands out."""
+LOUD = 4.0
+"""Factor over the residual of the worst tenth of the motion from which it stands out as well."""
 MOVING = 0.05
 """Share of the largest speed from which an arm moves."""
 VISIBLE = 0.1
@@ -45,14 +47,16 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     found, log = _without_torque(log)
     if found:
         return found, log
-    log = smoothed(log)
-    told = explain(system, log)
+    smooth = smoothed(log)
+    told = explain(system, smooth)
     disturbed, rows = _disturbances(system, told)
     if disturbed:
         # What happened in these rows must pass neither for friction nor for a mass.
-        told = explain(system, log.mask(rows))
+        told = explain(system, smooth.mask(rows))
     found = [*told.findings, *_friction(told), *_offsets(told), *_unexplained(told)]
-    return [*found, *disturbed], told.log
+    for repair in told.repairs:
+        log = repair(log)
+    return [*found, *disturbed], log
 
 
 def _without_torque(log: Log) -> Outcome:
@@ -150,7 +154,7 @@ def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Fi
     middle = np.median(moving)
     spread = max(MAD_TO_STD * np.median(np.abs(moving - middle)), 0.2)
     visible = (np.abs(trace) > VISIBLE * told.problem.size).any(axis=1)
-    bad = level > middle + DISTURBANCE * spread
+    bad = level > min(middle + DISTURBANCE * spread, np.percentile(moving, 90) + 2.0 * np.log(LOUD))
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)
     mask = np.zeros(len(log), bool)

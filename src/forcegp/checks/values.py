@@ -120,7 +120,8 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
         scale = robust_std(inner) + resolution(value[log.usable]) + 1e-12 * np.abs(value[log.usable]).max()
         reach = np.ptp(np.percentile(value[log.usable], (0.5, 99.5), axis=0), axis=0)
         least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
-        outlier = (np.abs(own) > np.maximum(SPIKE * scale, least)) & (np.abs(own) > SPIKE_ALONE * around)
+        # Next to a contact switch values jump by nature.
+        outlier = ~_switches(log)[:, None] & (np.abs(own) > np.maximum(SPIKE * scale, least)) & (np.abs(own) > SPIKE_ALONE * around)
         # The neighbours of a spike are off as well, by less.
         for j in np.flatnonzero(outlier.any(axis=0)):
             peak = outlier[:, j] & (np.abs(own[:, j]) >= _neighbour_peak(np.abs(own[:, j])))
@@ -131,6 +132,15 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     rows = intervals(bad)
     text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}: {describe(rows)}"
     return [Finding("spike", text, rows, evidence={"rows": bad.sum()})], log.mask(bad)
+
+
+def _switches(log: Log) -> np.ndarray:
+    """`(n,)` bool, rows within two of a contact switch."""
+    near = np.zeros(len(log), bool)
+    for label in log.contact.values():
+        for k in np.flatnonzero(label[1:] != label[:-1]) + 1:
+            near[max(k - 2, 0) : k + 3] = True
+    return near
 
 
 def _neighbour_peak(x: Array) -> Array:
