@@ -26,6 +26,7 @@ LAYERS = (
     ("control",),
     ("simulate",),
     ("scene",),
+    ("checks",),
     ("rollout", "models"),
     ("evaluation",),
     ("report",),

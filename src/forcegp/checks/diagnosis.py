@@ -94,7 +94,7 @@ def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit
     evidence = {f"factor {name}": gain for name, gain in zip(names, gains, strict=True)}
     listed = ", ".join(f"{name} {gain:.3g}" for name, gain in zip(names, gains, strict=True))
     factor = np.exp(np.abs(np.log(np.abs(gains) + 1e-12)))
-    if len(names) > 1 and np.median(factor) > CURRENT:
+    if 2 * len(names) > log.nq > 1 and np.median(factor) > CURRENT:
         text = f"torques fit when multiplied by {listed}: currents, or torques on the motor side"
         return Finding("torque-current", text, log.all_rows, names, evidence=evidence)
     off = [k for k in range(len(names)) if factor[k] > 1.05]

@@ -24,7 +24,9 @@ from forcegp.checks.hypotheses import (
     continuous,
     discrete,
     encoder_hypothesis,
+    gain_hypothesis,
     problem_of,
+    robot_hypotheses,
     with_log,
 )
 from forcegp.checks.log import Log
@@ -39,7 +41,7 @@ ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
 """Standard errors by which the held-out score must drop; there are about a hundred hypotheses."""
-SHARE = 0.1
+SHARE = 0.03
 """Share of the best drop that a simpler hypothesis may leave to a second round."""
 MATERIAL = 0.15
 """Drop of Σ_j log error that matters: 14 % less error in one joint."""
@@ -135,10 +137,8 @@ def _best(
     ]
     good = []
     for hypothesis, fit in tried:
-        gain, error = gain_of(fit.score, null.score)
-        concerned = len(hypothesis.joints) or log.nq
-        least = max(MATERIAL, MATERIAL_EACH * concerned)
-        if gain > least and gain > SIGNIFICANT * error and plausible(system, hypothesis, fit):
+        gain = gain_of(fit.score, null.score)
+        if _significant(gain, len(hypothesis.joints) or log.nq) and plausible(system, hypothesis, fit):
             good.append((hypothesis, fit))
     if not good:
         return None
@@ -158,13 +158,30 @@ def _fits(
     for hypothesis in _promising(system, log, rows, problem) if not len(prior) else ():
         changed = with_log(problem, system, hypothesis.change(log), rows)
         yield hypothesis, cross_validate(changed)
-    for hypothesis in continuous(system, log, rows):
-        if len(prior) and hypothesis.joints:
-            continue
-        assert hypothesis.columns is not None and hypothesis.prior is not None
-        columns = np.concatenate([hypothesis.columns, kept], axis=-1)
-        gains = hypothesis.joints if hypothesis.name == "gains" else ()
-        yield hypothesis, cross_validate(problem, columns, np.concatenate([hypothesis.prior, prior]), gains)
+    tried = continuous(system, log, rows) if not len(prior) else robot_hypotheses(system, log, rows)
+    null, off = cross_validate(problem, kept, prior).score, []
+    for hypothesis in tried:
+        fit = _fit(problem, hypothesis, kept, prior)
+        yield hypothesis, fit
+        if hypothesis.name == "gains" and _significant(gain_of(fit.score, null), 1):
+            off += hypothesis.joints
+    if len(off) > 1:
+        together = gain_hypothesis(log, rows, tuple(off))
+        yield together, _fit(problem, together, kept, prior)
+
+
+def _fit(problem: Problem, hypothesis: Hypothesis, kept: Array, prior: Array) -> Fit:
+    """A hypothesis with parameters, beside those that the model holds already."""
+    assert hypothesis.columns is not None and hypothesis.prior is not None
+    columns = np.concatenate([hypothesis.columns, kept], axis=-1)
+    gains = hypothesis.joints if hypothesis.name == "gains" else ()
+    return cross_validate(problem, columns, np.concatenate([hypothesis.prior, prior]), gains)
+
+
+def _significant(gain: tuple[float, float], concerned: int) -> bool:
+    """Whether a drop of the score matters for the number of joints concerned, and is no chance."""
+    least = max(MATERIAL, MATERIAL_EACH * concerned)
+    return gain[0] > least and gain[0] > SIGNIFICANT * gain[1]
 
 
 def _promising(system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem) -> Iterator[Hypothesis]:

@@ -124,13 +124,21 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Gains, offsets, gravity, tool and masses: explanations with parameters."""
-    gains = _diagonal(log.tau[rows])
-    yield Hypothesis("gains", log.nq, unchanged, gains, np.full(log.nq, 100.0), tuple(range(log.nq)))
+    """Gains, encoder offsets, gravity, tool and masses: explanations with parameters."""
     for j in range(log.nq):
-        yield Hypothesis("gains", 1, unchanged, gains[..., [j]], np.full(1, 100.0), (j,))
-    for j in range(log.nq):
+        yield gain_hypothesis(log, rows, (j,))
         yield encoder_hypothesis(system, log, rows, j)
+    yield from robot_hypotheses(system, log, rows)
+
+
+def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypothesis:
+    """The torques of some joints have to be scaled: u − τ = g τ."""
+    columns = _diagonal(log.tau[rows])[..., list(joints)]
+    return Hypothesis("gains", len(joints), unchanged, columns, np.full(len(joints), 100.0), joints)
+
+
+def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
+    """Explanations by the robot file, which leave the log as it is."""
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
