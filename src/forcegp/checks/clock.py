@@ -28,7 +28,9 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
         if mask.any():
             rows = _after(mask)
             word = "repeats" if kind == "time-repeated" else "runs backward"
-            found.append(Finding(kind, f"time {word} in {describe(rows)}", rows, evidence={"steps": mask.sum()}))
+            found.append(
+                Finding(kind, f"time {word} in {describe(rows)}", rows, evidence={"steps": mask.sum()})
+            )
     wrong = np.concatenate([[False], log.steps <= 0.0])
     return found, log.mask(wrong) if found else log
 
@@ -44,7 +46,9 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     rows, longest = _after(gaps), float(np.nanmax(log.steps))
     missing = int(np.round(log.steps[gaps] / log.dt - 1.0).sum())
-    text = f"about {missing} samples are missing before {describe(rows)}; the longest gap takes {longest:.4g} s"
+    text = (
+        f"about {missing} samples are missing before {describe(rows)}; the longest gap takes {longest:.4g} s"
+    )
     evidence = {"missing_samples": missing, "longest_s": longest, "period_s": log.dt}
     return [Finding("time-gap", text, rows, evidence=evidence)], log
 

@@ -60,7 +60,9 @@ def tip_path(system: ConstrainedSystem, contact: SurfaceContact, log: Log) -> Pa
             q, qd = tensors(log, part, "q", "qd")
             p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
             path.p[part] = p.numpy()
-            path.v[part] = kinematics.point_velocity(system.robot, q, qd, contact.frame, contact.point).numpy()
+            path.v[part] = kinematics.point_velocity(
+                system.robot, q, qd, contact.frame, contact.point
+            ).numpy()
             path.c[part] = contact.surface.value(p).numpy()
             path.normal[part] = contact.surface.gradient(p).numpy()
     return path
@@ -88,7 +90,9 @@ def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Findin
     return [*found, *_labels(contact, path, closed, usable, distance, touch, log)]
 
 
-def _placement(contact: SurfaceContact, path: Path, closed: np.ndarray, log: Log) -> tuple[list[Finding], Array]:
+def _placement(
+    contact: SurfaceContact, path: Path, closed: np.ndarray, log: Log
+) -> tuple[list[Finding], Array]:
     """Displacement and tilt of the surface, and the distance from it once they are undone."""
     offset, tilt, shift = _fit_surface(contact, path, closed)
     rows = intervals(closed)
@@ -139,7 +143,13 @@ def _fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tup
 
 
 def _labels(
-    contact: SurfaceContact, path: Path, closed: np.ndarray, usable: np.ndarray, c: Array, touch: float, log: Log
+    contact: SurfaceContact,
+    path: Path,
+    closed: np.ndarray,
+    usable: np.ndarray,
+    c: Array,
+    touch: float,
+    log: Log,
 ) -> list[Finding]:
     """Rows labelled closed off the surface, by where in the interval they lie, and open ones that slide on it."""
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
@@ -149,7 +159,7 @@ def _labels(
         for a, b in intervals(off[start:stop], join=least):
             if b - a >= least:
                 kind = "contact-early" if a == 0 and b < stop - start else "contact-late"
-                inside = a > 0 and b < stop - start or (a == 0 and b == stop - start)
+                inside = (a > 0 and b < stop - start) or (a == 0 and b == stop - start)
                 runs["contact-far" if inside else kind].append((start + a, start + b))
     texts = {
         "contact-early": "labelled closed before the tip touches",
@@ -166,7 +176,9 @@ def _labels(
     return [*found, *_missed(contact, path, usable & ~closed, c, touch, log)]
 
 
-def _missed(contact: SurfaceContact, path: Path, open_: np.ndarray, c: Array, touch: float, log: Log) -> list[Finding]:
+def _missed(
+    contact: SurfaceContact, path: Path, open_: np.ndarray, c: Array, touch: float, log: Log
+) -> list[Finding]:
     """Rows labelled open in which the tip slides along the surface."""
     if not np.isfinite(log.dt):
         return []

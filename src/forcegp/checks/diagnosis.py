@@ -84,8 +84,12 @@ def finding_of(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit:
 def _delay(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
     seconds = abs(hypothesis.shift) * log.dt
     word = "after" if hypothesis.shift > 0 else "before"
-    text = f"the torque is logged about {1e3 * seconds:.3g} ms ({abs(hypothesis.shift)} rows) {word} the motion"
-    return Finding("torque-delay", text, log.all_rows, evidence={"rows": hypothesis.shift, "seconds": seconds})
+    text = (
+        f"the torque is logged about {1e3 * seconds:.3g} ms ({abs(hypothesis.shift)} rows) {word} the motion"
+    )
+    return Finding(
+        "torque-delay", text, log.all_rows, evidence={"rows": hypothesis.shift, "seconds": seconds}
+    )
 
 
 def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
@@ -99,7 +103,9 @@ def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit
         return Finding("torque-current", text, log.all_rows, names, evidence=evidence)
     off = [k for k in range(len(names)) if factor[k] > 1.05]
     text = f"torques fit when multiplied by {listed}"
-    return Finding("torque-gain", text, log.all_rows, tuple(names[k] for k in off) or names, evidence=evidence)
+    return Finding(
+        "torque-gain", text, log.all_rows, tuple(names[k] for k in off) or names, evidence=evidence
+    )
 
 
 def _encoder(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:

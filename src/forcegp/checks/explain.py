@@ -101,7 +101,9 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
             kept = np.concatenate([hypothesis.columns, kept], axis=-1)
             prior = np.concatenate([hypothesis.prior, prior])
             problem, robot = _weighed(problem, kept, prior), (hypothesis.name, *robot)
-    return Explanation(findings, log, tuple(repairs), problem, robot, kept, prior, cross_validate(problem, kept, prior), rows)
+    return Explanation(
+        findings, log, tuple(repairs), problem, robot, kept, prior, cross_validate(problem, kept, prior), rows
+    )
 
 
 def _refined(
@@ -126,7 +128,13 @@ def _weighed(problem: Problem, columns: Array | None = None, prior: Array | None
 
 
 def _best(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: Array, taken: set
+    system: ConstrainedSystem,
+    log: Log,
+    rows: np.ndarray,
+    problem: Problem,
+    kept: Array,
+    prior: Array,
+    taken: set,
 ) -> tuple[Hypothesis, Fit] | None:
     """The simplest hypothesis within one standard error of the best, if it explains enough."""
     null = cross_validate(problem, kept, prior)
@@ -184,7 +192,9 @@ def _significant(gain: tuple[float, float], concerned: int) -> bool:
     return gain[0] > least and gain[0] > SIGNIFICANT * gain[1]
 
 
-def _promising(system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem) -> Iterator[Hypothesis]:
+def _promising(
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem
+) -> Iterator[Hypothesis]:
     """Hypotheses without parameters that lower the error on a part of the rows."""
     few = rows[::SCREENING]
     null = cross_validate(with_log(problem, system, log, few)).score.mean()

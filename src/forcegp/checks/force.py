@@ -39,7 +39,9 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
                 found += _directions(contact, path, log)
                 if log.nq > 3:
                     force = _force(replace(system, contacts=[contact]), log, rows)
-                    found += _pulls(contact, path, force, rows, log) or _friction(contact, path, force, rows, log)
+                    found += _pulls(contact, path, force, rows, log) or _friction(
+                        contact, path, force, rows, log
+                    )
     return found, log
 
 
@@ -53,7 +55,9 @@ def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
 def _pulls(contact: SurfaceContact, path: Path, force: Array, rows: np.ndarray, log: Log) -> list[Finding]:
     normal = (force * path.normal[rows]).sum(axis=1)
     # Away from the mean the scatter is noise and true change alike; an arm that presses stays above it.
-    if not (np.median(normal) < 0.0 and (normal < 0.0).mean() > PULLS and -np.median(normal) > robust_std(normal)):
+    if not (
+        np.median(normal) < 0.0 and (normal < 0.0).mean() > PULLS and -np.median(normal) > robust_std(normal)
+    ):
         return []
     text = f"the force at {contact.name!r} pulls with {-np.median(normal):.3g} N along the normal"
     spans = intervals(log.contact[contact.name])
@@ -73,7 +77,10 @@ def _friction(contact: SurfaceContact, path: Path, force: Array, rows: np.ndarra
     press = np.maximum((force * n).sum(axis=1)[sliding], 0.0)
     block = blocks_of(len(drag))
     # One coefficient per block, so that the scatter between blocks tells how sure it is.
-    each = [(drag[block == k] @ press[block == k]) / max(press[block == k] @ press[block == k], 1e-12) for k in range(8)]
+    each = [
+        (drag[block == k] @ press[block == k]) / max(press[block == k] @ press[block == k], 1e-12)
+        for k in range(8)
+    ]
     mean, error = float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(8))
     if mean <= SIGNIFICANT * error:
         return []

@@ -30,7 +30,9 @@ def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
     """`(n, nq)` bool, rows at which a column jumps."""
     surplus = _surplus(x, rate, log)
     usable = log.usable
-    scale = robust_std(surplus[usable]) + resolution(x[usable]) + np.finfo(float).eps * np.abs(x[usable]).max()
+    scale = (
+        robust_std(surplus[usable]) + resolution(x[usable]) + np.finfo(float).eps * np.abs(x[usable]).max()
+    )
     change = np.zeros_like(x)
     change[1:] = np.abs(np.diff(x, axis=0))
     fastest = float(np.percentile(np.abs(rate[usable]), 99.9)) * log.dt

@@ -66,7 +66,9 @@ def match(log: Log, value: str, rate: str) -> Match | None:
     if sum(map(len, changes)) < 20:
         return None
     change, integral = _without_jumps(np.concatenate(changes), np.concatenate(integrals))
-    cross, own, other = ((a * b).sum(axis=0) for a, b in ((change, integral), (integral, integral), (change, change)))
+    cross, own, other = (
+        (a * b).sum(axis=0) for a, b in ((change, integral), (integral, integral), (change, change))
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         low, high, correlation = cross / own, other / cross, cross / np.sqrt(own * other)
     speed = np.sqrt(other)
@@ -175,7 +177,9 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
 def _coarse(log: Log, level: Match) -> np.ndarray:
     """Joints whose changes are of the size of encoder steps, so that nothing can be told of their rate."""
     size = np.sqrt((level.change**2).mean(axis=0))
-    steps = np.array([np.median(np.abs(x[x != 0.0])) if (x != 0.0).any() else 0.0 for x in np.diff(log.q, axis=0).T])
+    steps = np.array(
+        [np.median(np.abs(x[x != 0.0])) if (x != 0.0).any() else 0.0 for x in np.diff(log.q, axis=0).T]
+    )
     return size <= 3.0 * np.where((np.diff(log.q, axis=0) == 0.0).mean(axis=0) > 0.3, steps, 0.0)
 
 

@@ -25,7 +25,9 @@ OFTEN = 0.05
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
     """Lower and upper limits by column."""
     r = system.robot
-    low, high, speed, effort = (x.detach().cpu().numpy() for x in (r.lower, r.upper, r.velocity_limit, r.effort_limit))
+    low, high, speed, effort = (
+        x.detach().cpu().numpy() for x in (r.lower, r.upper, r.velocity_limit, r.effort_limit)
+    )
     return {"q": (low, high), "qd": (-speed, speed), "tau": (-effort, effort)}
 
 
@@ -43,7 +45,9 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
     largest = float(np.abs(q[:, turning]).max())
     if outside < OFTEN or still > 0.0 or largest < TURN:
         return [], log
-    text = f"angles reach {largest:.4g}, beyond the joint limits in {100 * outside:.0f} % of the rows: degrees"
+    text = (
+        f"angles reach {largest:.4g}, beyond the joint limits in {100 * outside:.0f} % of the rows: degrees"
+    )
     names = tuple(np.array(log.joint_names)[turning])
     factor = np.where(turning, DEGREE, 1.0)
     found = Finding("degrees", text, log.all_rows, names, evidence={"largest": largest})
@@ -75,7 +79,9 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
             rows = intervals(beyond.any(axis=1))
             joints = tuple(log.joint_names[j] for j in np.flatnonzero(beyond.any(axis=0)))
             text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in {describe(rows)}"
-            found.append(Finding(kinds[name], text, rows, joints, evidence={"rows": beyond.any(axis=1).sum()}))
+            found.append(
+                Finding(kinds[name], text, rows, joints, evidence={"rows": beyond.any(axis=1).sum()})
+            )
     return found, log
 
 

@@ -109,7 +109,9 @@ def _friction(told: Explanation) -> list[Finding]:
             continue
         index = np.flatnonzero(hit)
         joints = tuple(log.joint_names[j] for j in index)
-        listed = ", ".join(f"{log.joint_names[j]} {viscous[j]:.3g} N m s/rad, {coulomb[j]:.3g} N m" for j in index)
+        listed = ", ".join(
+            f"{log.joint_names[j]} {viscous[j]:.3g} N m s/rad, {coulomb[j]:.3g} N m" for j in index
+        )
         text = f"joints show {word} friction than the robot file declares (viscous, Coulomb): {listed}"
         evidence = {f"viscous {log.joint_names[j]}": viscous[j] for j in index}
         evidence |= {f"coulomb {log.joint_names[j]}": coulomb[j] for j in index}

@@ -75,6 +75,6 @@ def projector(J: Array, scale: Array) -> Array:
     if touching.any():
         # Jᵀ = U S Vᵀ; directions beyond the rank do not count.
         U, S, _ = np.linalg.svd(J[touching].transpose(0, 2, 1), full_matrices=False)
-        U = U * (S > 1e-9 * S[:, :1])[:, None, :]
+        U = U * (1e-9 * S[:, :1] < S)[:, None, :]
         eye[touching] -= U @ U.transpose(0, 2, 1)
     return eye

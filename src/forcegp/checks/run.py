@@ -9,7 +9,18 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from forcegp.checks import clock, contact, excitation, force, jumps, kinematics, limits, mechanics, noise, values
+from forcegp.checks import (
+    clock,
+    contact,
+    excitation,
+    force,
+    jumps,
+    kinematics,
+    limits,
+    mechanics,
+    noise,
+    values,
+)
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import SEVERITIES, Finding, Report
 from forcegp.checks.kinds import KINDS
@@ -60,7 +71,9 @@ CHECKS: tuple[tuple[str, Check], ...] = (
 """Every check in the order in which they run; each sees the log as those before it have corrected it."""
 
 _MOTION = frozenset({"velocity-mismatch"})
-_ROBOT = frozenset({"gravity-direction", "base-tilted", "payload-missing", "masses-mismatch", "torque-unexplained"})
+_ROBOT = frozenset(
+    {"gravity-direction", "base-tilted", "payload-missing", "masses-mismatch", "torque-unexplained"}
+)
 VOIDS = {"dynamics": _MOTION, "contact force": _MOTION | _ROBOT, "excitation": _MOTION}
 """Findings after which a check cannot judge."""
 

@@ -121,7 +121,11 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
         reach = np.ptp(np.percentile(value[log.usable], (0.5, 99.5), axis=0), axis=0)
         least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
         # Next to a contact switch values jump by nature.
-        outlier = ~_switches(log)[:, None] & (np.abs(own) > np.maximum(SPIKE * scale, least)) & (np.abs(own) > SPIKE_ALONE * around)
+        outlier = (
+            ~_switches(log)[:, None]
+            & (np.abs(own) > np.maximum(SPIKE * scale, least))
+            & (np.abs(own) > SPIKE_ALONE * around)
+        )
         # The neighbours of a spike are off as well, by less.
         for j in np.flatnonzero(outlier.any(axis=0)):
             peak = outlier[:, j] & (np.abs(own[:, j]) >= _neighbour_peak(np.abs(own[:, j])))

@@ -19,7 +19,9 @@ COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 def check(
     scene: SceneName,
-    data: Annotated[Path, typer.Option("--data", "-d", help="Log, .parquet or .csv; NaN and gaps are findings.")],
+    data: Annotated[
+        Path, typer.Option("--data", "-d", help="Log, .parquet or .csv; NaN and gaps are findings.")
+    ],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="HTML page with a picture of each finding.")
     ] = None,
@@ -72,7 +74,11 @@ def _print(report: Report) -> None:
             table.add_column(heading, no_wrap=heading in ("weight", "kind"), overflow="fold")
         for finding in report.findings:
             whole = finding.intervals == ((0, report.samples),)
-            rows = "all" if whole else describe(finding.intervals, most=2).removeprefix("rows ").removeprefix("row ")
+            rows = (
+                "all"
+                if whole
+                else describe(finding.intervals, most=2).removeprefix("rows ").removeprefix("row ")
+            )
             # Joint and parameter names may hold brackets, which are no markup.
             body = Text(f"{finding.message}\n").append(f"→ {finding.remedy}", style="dim")
             table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), finding.kind, rows, body)

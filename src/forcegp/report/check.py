@@ -50,7 +50,9 @@ def write_check(path: Path, title: str, report: Report, system: ConstrainedSyste
         for finding in report.findings
     ]
     overview = draw_overview(report) if report.findings else None
-    write_text(path, render("check.html.j2", title=title, report=report, sections=sections, overview=overview))
+    write_text(
+        path, render("check.html.j2", title=title, report=report, sections=sections, overview=overview)
+    )
     return path
 
 

@@ -138,7 +138,9 @@ def _acceleration(axes: Axes, log: Log, rows: slice, j: int) -> None:
 
 def _rates(axes: Axes, log: Log, rows: slice, j: int) -> None:
     with np.errstate(all="ignore"):
-        _line(axes, rows, np.gradient(log.q[rows, j]) / np.gradient(log.t[rows]), OTHER, "rate of change of q")
+        _line(
+            axes, rows, np.gradient(log.q[rows, j]) / np.gradient(log.t[rows]), OTHER, "rate of change of q"
+        )
     _line(axes, rows, log.qd[rows, j], COLOURS["error"], "qd")
     axes.legend(loc="upper right", ncols=2)
 
