@@ -76,7 +76,7 @@ MOVED = (
 
 
 def real_pendulum(folder: Path, run: int = 0, mended: bool = True) -> Case:
-    """A published log of a real double pendulum; `folder` takes its robot file, mended where it is wrong if wanted."""
+    """A published log of a real double pendulum; `folder` takes its robot file, mended if wanted."""
     source = REAL / "double_pendulum/design_C.1"
     text = (source / "model_1.1.urdf").read_text()
     start = text.index('<joint name="base_weld"')

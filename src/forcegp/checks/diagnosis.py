@@ -34,7 +34,7 @@ SMALL_GRAVITY = 0.05
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: Fit) -> bool:
-    """Whether the parameters of a hypothesis are what it says: a tool has a mass, an offset is not a trifle."""
+    """Whether the parameters are what a hypothesis says: a tool has a mass, an offset is not a trifle."""
     if hypothesis.name == "encoder-offset":
         return bool(abs(fit.theta[0]) > max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0]))
     if hypothesis.name == "gains":

@@ -64,7 +64,8 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     few = (turns < REVERSALS) & ~still
     if few.any():
         joints = tuple(log.joint_names[j] for j in np.flatnonzero(few))
-        text = f"{', '.join(joints)} changes direction fewer than {REVERSALS} times: friction looks like an offset"
+        why = "friction looks like an offset"
+        text = f"{', '.join(joints)} changes direction fewer than {REVERSALS} times: {why}"
         found.append(Finding("few-reversals", text, log.all_rows, joints))
     return found, log
 
@@ -94,8 +95,8 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
     """Standard deviation of each base parameter after the log over that before it.
 
-    Before: the robot file, with masses known to 30 % and centres of mass to 0.1 m. After: that and the torques
-    of the rows, with noise of a hundredth of each joint's torque.
+    Before: the robot file, with masses known to 30 % and centres of mass to 0.1 m. After: that and the
+    torques of the rows, with noise of a hundredth of each joint's torque.
     """
     robot = system.robot
     base = base_parameters(robot)

@@ -1,4 +1,4 @@
-"""Which one fault explains the torque best: greedy choice by cross-validation with the one-standard-error rule.
+"""Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
 
 Round by round the simplest hypothesis within one standard error of the best is taken (Breiman, Friedman,
 Olshen, Stone, *Classification and Regression Trees*, 1984, sec. 3.4.3), as long as it lowers the held-out

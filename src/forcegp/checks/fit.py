@@ -1,4 +1,4 @@
-"""How well a hypothesis explains the torque: least squares on all blocks of a log but one, tested on that one."""
+"""How well a hypothesis explains the torque: least squares on all blocks of a log but one."""
 
 from __future__ import annotations
 

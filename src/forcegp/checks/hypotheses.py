@@ -1,4 +1,4 @@
-"""What may be wrong with a log or a robot file, one hypothesis each, and the log or the torque that follows."""
+"""What may be wrong with a log or a robot file, one hypothesis each."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ ROBOT = ("gravity", "payload", "masses")
 
 
 def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
-    """Torque `(n, nq, p)` per unit of each parameter of the robot that may be off, and how far it may be `(p,)`."""
+    """Torque `(n, nq, p)` per unit of each parameter that may be off, and how far it may be `(p,)`."""
     robot = system.robot
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     if name == "gravity":

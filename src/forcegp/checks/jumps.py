@@ -42,7 +42,7 @@ def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
 
 
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Positions that jump where the velocity does not account for it: rows are missing, or a joint wrapped."""
+    """Positions that jump beyond what the velocity accounts for: rows are missing, or a joint wrapped."""
     if not log.stretches or "qd" in log.derived:
         return [], log
     jumps = _jumps(log.q, log.qd, log)

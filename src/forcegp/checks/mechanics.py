@@ -168,8 +168,8 @@ def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Fi
     worst = int(np.argmax((np.abs(trace) / scale)[bad].max(axis=0)))
     peak = float(np.abs(trace[bad][:, worst]).max())
     text = (
-        f"torque of up to {peak:.3g} N m at {log.joint_names[worst]} that neither robot nor labelled contacts "
-        f"explain, in {describe(whole)}"
+        f"torque of up to {peak:.3g} N m at {log.joint_names[worst]} that neither robot nor labelled "
+        f"contacts explain, in {describe(whole)}"
     )
     evidence = {"peak_Nm": peak}
     return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence=evidence)], mask

@@ -1,7 +1,8 @@
 """Is the noise on the acceleration white, and as large as the header says?
 
-The departure of a sample from the cubic through its neighbours at distances k and 2k shows the noise around the
-frequency 1/(2 k dt), and hardly any motion. White noise shows alike at k = 1 and k = 3; filtered noise does not.
+The departure of a sample from the cubic through its neighbours at distances k and 2k shows the noise around
+the frequency 1/(2 k dt), and hardly any motion. White noise shows alike at k = 1 and k = 3; filtered noise
+does not.
 """
 
 from __future__ import annotations
@@ -60,8 +61,9 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
     if filtered.mean() > 0.5:
         joints = tuple(log.joint_names[j] for j in np.flatnonzero(filtered))
         text = (
-            f"the acceleration is filtered: at the highest frequencies it holds {100 * np.median(top / middle):.2g} %"
-            " of the noise that it holds at a third of them, so its noise is not white"
+            f"the acceleration is filtered: at the highest frequencies it holds "
+            f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them, "
+            "so its noise is not white"
         )
         return [Finding("noise-filtered", text, log.all_rows, joints, evidence=evidence, weight=weight)], log
     return (_stated(log, top, stated, evidence) if stated is not None else []), log
@@ -74,6 +76,7 @@ def _stated(log: Log, found: Array, stated: float, evidence: dict[str, float]) -
         if wrong.any():
             joints = tuple(log.joint_names[j] for j in np.flatnonzero(wrong))
             worst = found[wrong].max() if kind == "noise-understated" else found[wrong].min()
-            text = f"the noise of qdd is {worst:.3g} rad/s² at {', '.join(joints)}, and the header states {stated:.3g}"
+            place = f"{worst:.3g} rad/s² at {', '.join(joints)}"
+            text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
             result.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
     return result

@@ -81,8 +81,8 @@ VOIDS = {"dynamics": _MOTION, "contact force": _MOTION | _ROBOT, "excitation": _
 def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress | None = None) -> Report:
     """Check a log against a scene before a model is fitted to it.
 
-    Each check is silent on a log that is in order. A fault that is found is undone for the checks after it, so
-    that one fault is reported once; the log itself is not changed.
+    Each check is silent on a log that is in order. A fault that is found is undone for the checks after it,
+    so that one fault is reported once; the log itself is not changed.
 
     Args:
         system: robot and contacts.

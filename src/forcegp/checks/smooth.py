@@ -1,7 +1,7 @@
 """The same filter on positions, velocities, accelerations and torques, before torques are explained.
 
-Noise ε on q̈ enters the explained torque as M ε. A fit then gains by shrinking the inertia, as any regression on
-noisy columns does; a filter of a tenth of a second takes that away. A linear filter on all columns leaves
+Noise ε on q̈ enters the explained torque as M ε. A fit then gains by shrinking the inertia, as any regression
+on noisy columns does; a filter of a tenth of a second takes that away. A linear filter on all columns leaves
 M q̈ = Q true up to the change of M and of the bias force within the window.
 """
 

@@ -27,10 +27,10 @@ def check(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check a log against a scene before fitting: clock, values, units, signs, masses, contact, noise, motion.
+    """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise, motion.
 
-    The last line says whether to go on. The exit code is 0 where a model can be fitted, 1 where a finding makes
-    a fit worthless, and 2 where scene or log cannot be read.
+    The last line says whether to go on. The exit code is 0 where a model can be fitted, 1 where a finding
+    makes a fit worthless, and 2 where scene or log cannot be read.
 
     [bold]Examples[/bold]
 

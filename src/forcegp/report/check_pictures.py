@@ -64,6 +64,8 @@ def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture
         "excitation": (_position, "q"),
     }
     paint, label = painters.get(family, (_position, "q"))
+    if finding.message.startswith("qd "):
+        paint, label = painters["kinematics"]
     column = next((name for name in ("tau", "qdd", "qd", "q") if f"{name}." in finding.message), None)
     if family == "values" and (column or finding.kind in ("torque-saturated", "torque-limit")):
         name = column or "tau"
