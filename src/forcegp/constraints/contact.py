@@ -7,30 +7,29 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from torch import Tensor
 
 from forcegp import kinematics
 from forcegp.constraints.surface import Surface, check_point
+from forcegp.errors import ParameterError
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
 
 
 class ContactPoint(NamedTuple):
-    """The point of the robot that touches a surface.
+    """The point of the robot that touches a surface; of a rounded tip, the material point that touches now.
 
     Attributes:
         position, velocity: `(*batch, 3)` in the world [m], [m/s].
-        bias: `(*batch, 3)` acceleration at q̈ = 0 [m/s²].
         jacobian: J_E `(*batch, 3, nq)`, world axes.
         normal: ∇c `(*batch, 3)` at the point.
     """
 
     position: Tensor
     velocity: Tensor
-    bias: Tensor
     jacobian: Tensor
     normal: Tensor
 
@@ -72,27 +71,40 @@ class Constraint(ABC):
 
 
 def _moving_point(
-    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor, frame: str, point: Sequence[float]
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Position, velocity, bias acceleration and Jacobian of a point fixed in a frame."""
+    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, frame: str, point: Sequence[float]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Position, bias acceleration `(*batch, 6)` and Jacobian `(*batch, 6, nq)` of a point fixed in a frame.
+
+    Angular rows come before linear ones.
+    """
     index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
-    J = kinematics.jacobian_of_poses(robot, poses, index, x)[..., 3:, :]
-    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)[..., 3:]
-    position = kinematics.point_of_poses(robot, poses, index, x) + robot.base_position
-    return position, (J @ qd[..., None])[..., 0], bias, J
+    J = kinematics.jacobian_of_poses(robot, poses, index, x)
+    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)
+    return kinematics.point_of_poses(robot, poses, index, x) + robot.base_position, bias, J
 
 
 @dataclass(frozen=True)
 class SurfaceContact(Constraint):
-    """A point of the robot that slides on a surface, c(q) = c_surface(p(q)).
+    """A point or a ball of the robot that slides on a surface, c(q) = c_surface(p(q)) − r.
 
-    A = ∇cᵀ J_E and b = −(∇cᵀ J̇_E q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force where |∇c| = 1.
+    A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force where |∇c| = 1. A rounded
+    tip is a ball of radius r around p. It touches in p − r n, whose material velocity is ṗ + ω × (−r n), so
+    J_E = J_p + r [n]ₓ J_ω: friction at a rounded tip has the lever arm −r n, the normal force has none.
 
     Args:
         name: name of the contact, as in `contact.<name>` of a data set.
         frame: link or frame that carries the point.
-        point: coordinates in that frame [m].
+        point: coordinates in that frame [m]; of a rounded tip, its centre.
         surface: the surface, in the world.
+        radius: r of a rounded tip; 0 is a sharp one [m].
+
+    Raises:
+        ParameterError: the radius is negative, or the surface is not a signed distance.
+
+    Example:
+        >>> tip = SurfaceContact("table", "tool0", (0.0, 0.0, 0.08), Plane(offset=0.05), radius=0.015)
+        >>> tip.center_surface
+        Plane(normal=(0.0, 0.0, 1.0), offset=0.065)
     """
 
     name: str
@@ -100,23 +112,44 @@ class SurfaceContact(Constraint):
     point: Sequence[float]
     surface: Surface
     rows: int = 1
+    radius: float = field(default=0.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.radius < float("inf"):
+            raise ParameterError(
+                f"the tip of contact {self.name!r} has no such radius",
+                expected="a finite length, 0 or above [m]",
+                got=self.radius,
+            )
+        _ = self.center_surface
+
+    @property
+    def center_surface(self) -> Surface:
+        """The surface that `point` moves on: that of the contact, raised by the radius of the tip."""
+        return self.surface.raised(self.radius) if self.radius else self.surface
 
     def check(self, robot: RobotModel) -> None:
         robot.frame_index(self.frame)
         check_point(self.point, f"the touching point of {self.name!r}")
 
-    def contact_point(
-        self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor
-    ) -> ContactPoint:
-        """Position, velocity, bias acceleration, Jacobian and surface normal at the touching point."""
-        p, v, bias, J = _moving_point(robot, poses, motion, qd, self.frame, self.point)
-        return ContactPoint(p, v, bias, J, self.surface.gradient(p))
-
     def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
-        at = self.contact_point(robot, poses, motion, qd)
-        A = at.normal[..., None, :] @ at.jacobian
-        b = -((at.normal * at.bias).sum(-1) + self.surface.curvature(at.position, at.velocity))
-        return ConstraintTerms(self.surface.value(at.position)[..., None], A, b[..., None], at)
+        surface = self.center_surface
+        p, bias, J = _moving_point(robot, poses, motion, self.frame, self.point)
+        v = (J[..., 3:, :] @ qd[..., None])[..., 0]
+        normal = surface.gradient(p)
+        A = normal[..., None, :] @ J[..., 3:, :]
+        b = -((normal * bias[..., 3:]).sum(-1) + surface.curvature(p, v))
+        at = ContactPoint(p, v, J[..., 3:, :], normal)
+        if self.radius:
+            at = _rounded(at, J[..., :3, :], qd, self.radius)
+        return ConstraintTerms(surface.value(p)[..., None], A, b[..., None], at)
+
+
+def _rounded(center: ContactPoint, angular: Tensor, qd: Tensor, radius: float) -> ContactPoint:
+    """The material point of a ball that touches, from the ball's centre and angular Jacobian."""
+    arm = -radius * center.normal
+    J = center.jacobian - kinematics.skew(arm) @ angular
+    return ContactPoint(center.position + arm, (J @ qd[..., None])[..., 0], J, center.normal)
 
 
 @dataclass(frozen=True)
@@ -144,8 +177,9 @@ class PointConnection(Constraint):
             check_point(point, f"an end of {self.name!r}")
 
     def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
-        p, _, bias, J = _moving_point(robot, poses, motion, qd, self.frame, self.point)
+        p, bias, J = _moving_point(robot, poses, motion, self.frame, self.point)
+        bias, J = bias[..., 3:], J[..., 3:, :]
         if self.other_frame is None:
             return ConstraintTerms(p - kinematics.as_point(robot, self.other_point), J, -bias)
-        p2, _, bias2, J2 = _moving_point(robot, poses, motion, qd, self.other_frame, self.other_point)
-        return ConstraintTerms(p - p2, J - J2, bias2 - bias)
+        p2, bias2, J2 = _moving_point(robot, poses, motion, self.other_frame, self.other_point)
+        return ConstraintTerms(p - p2, J - J2[..., 3:, :], bias2[..., 3:] - bias)

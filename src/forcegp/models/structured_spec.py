@@ -15,9 +15,10 @@ from forcegp.forces.learn import Problem, analytical_parameters
 from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import NoiseStd, Training
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.normal_force import NormalForcePrior
+from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.gp import kernels, stationary
 from forcegp.models.base import FitResult
 from forcegp.robot.parameters import AnalyticalParameters
