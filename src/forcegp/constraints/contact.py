@@ -94,8 +94,8 @@ class Constraint(ABC):
         """Check that the constraint fits a robot.
 
         Raises:
-            UnknownNameError: a frame is not the robot's.
-            ForceGPError: a point has not three finite coordinates.
+            UnknownNameError: the robot has no such frame.
+            ParameterError: a point does not have three finite coordinates.
         """
 
 

@@ -100,6 +100,6 @@ def import_mujoco() -> Any:
         import mujoco
     except ImportError:
         raise MissingDependencyError(
-            "the engine 'mujoco' needs the package mujoco", hint="pip install mujoco"
+            "the engine 'mujoco' needs the package mujoco", hint='pip install "forcegp[mujoco]"'
         ) from None
     return mujoco
