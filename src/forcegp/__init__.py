@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from forcegp import compiled, derivatives, dynamics, identification, kinematics
+    from forcegp.checks import check
     from forcegp.constraints import (
         Baumgarte,
         ConstrainedSystem,
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from forcegp.evaluation import Evaluation, evaluate
     from forcegp.forces.mean import AnalyticalMean
     from forcegp.forces.measurements import Observation
-    from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+    from forcegp.forces.priors.contact import ContactForcePrior
     from forcegp.forces.priors.joint import JointForcePrior
     from forcegp.forces.priors.normal_force import NormalForcePrior
     from forcegp.forces.priors.operator import OperatorForcePrior
@@ -65,9 +66,10 @@ _HOME = {
     "Scene": "scene",
     "Sphere": "constraints",
     "StructuredGP": "models.structured_gp",
-    "SlidingFrictionPrior": "forces.priors.contact",
+    "SlidingFrictionPrior": "forces.priors.sliding_friction",
     "SurfaceContact": "constraints",
     "TaskSpaceControl": "rollout",
+    "check": "checks",
     "compiled": "",
     "contact_loss_probability": "rollout",
     "derivatives": "",
@@ -112,6 +114,7 @@ __all__ = [
     "StructuredGP",
     "SurfaceContact",
     "TaskSpaceControl",
+    "check",
     "compiled",
     "contact_loss_probability",
     "derivatives",

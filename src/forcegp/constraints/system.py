@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -116,6 +117,8 @@ class ConstrainedSystem:
         n, device = len(self.contacts), self.robot.device
         if active is None:
             return torch.ones(*batch, self.m, dtype=torch.bool, device=device)
+        if not isinstance(active, Tensor):
+            raise ShapeError("active is no tensor", expected="a bool tensor", got=type(active).__name__)
         sizes = zip(reversed(active.shape), reversed((*batch, n)), strict=False)
         fits = (
             0 < active.ndim <= len(batch) + 1 and active.shape[-1] == n and all(a in (1, b) for a, b in sizes)
@@ -146,20 +149,36 @@ class ConstrainedSystem:
         poses = kinematics.link_poses(robot, q)
         motion = kinematics.link_motion(robot, poses, qd)
         links = dynamics.link_inertia(robot, poses)
-        terms = self._terms(poses, motion, qd)
+        return self._assembled(
+            q,
+            qd,
+            active,
+            self._terms(poses, motion, qd),
+            M=dynamics.mass_matrix_of_poses(robot, poses, links),
+            Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
+            Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
+            poses=poses,
+            motion=motion,
+        )
+
+    def _assembled(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        active: Tensor | None,
+        terms: dict[str, ConstraintTerms],
+        **mechanics: Any,
+    ) -> Equations:
+        """The equations of motion from the constraints' terms and the mechanics of the robot."""
         c, cd, A, b = self._rows(q, qd, terms, active)
         return Equations(
-            M=dynamics.mass_matrix_of_poses(robot, poses, links),
             A=A,
             b=b,
             c=c,
             cd=cd,
-            Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
-            Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
-            Q_D=dynamics.damping_force(robot, qd),
+            Q_D=dynamics.damping_force(self.robot, qd),
             contact_points={name: term.point for name, term in terms.items() if term.point is not None},
-            poses=poses,
-            motion=motion,
+            **mechanics,
         )
 
     def linearize(

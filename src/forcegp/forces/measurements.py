@@ -145,7 +145,10 @@ def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
 
 def _checked_noise(noise: NoiseStd, quantity: str, values: Tensor) -> Tensor:
     """A noise as a tensor `(d,)` or `(n, d)`."""
-    std = torch.as_tensor(noise, dtype=values.dtype, device=values.device)
+    try:
+        std = torch.as_tensor(noise, dtype=values.dtype, device=values.device)
+    except (TypeError, ValueError, RuntimeError) as cause:
+        raise ModelError("a noise standard deviation is a number, or one per component", got=noise) from cause
     if std.shape not in ((), (1,), values.shape[-1:], values.shape):
         raise ModelError(
             f"the noise of {quantity!r} does not match its components",
@@ -238,7 +241,13 @@ def training_of(
     Raises:
         ModelError, DataError: there are no data, or they do not fit the system.
     """
-    observations = [Observation(data)] if isinstance(data, Dataset) else list(data)
+    observations = [Observation(data)] if isinstance(data, Dataset) else data
+    if not isinstance(observations, Sequence) or not all(isinstance(o, Observation) for o in observations):
+        raise ModelError(
+            "these are no data to learn from",
+            expected="a Dataset, or a list of Observation",
+            got=type(data).__name__,
+        )
     if not observations:
         raise ModelError(
             "there are no samples to learn from", expected="at least one observation", got="none"
@@ -251,5 +260,6 @@ def training_of(
             scales.append(kept[prior.name])
             continue
         features = [prior.features(system, a) for a in at]
-        scales.append(Standardization.of({k: torch.cat([f[k] for f in features]) for k in features[0]}))
+        together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
+        scales.append(Standardization.of(together, prior.vectors))
     return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales))

@@ -17,8 +17,8 @@ from forcegp.scene.document import Document
 from forcegp.scene.sections import SceneSections
 from forcegp.simulate.config import SimulationConfig
 
-BUNDLED = ("kuka_plane",)
-"""Scenes that come with the library: the paper's task."""
+BUNDLED = ("kuka_plane", "ur5_wiping")
+"""Scenes that come with the library: the paper's task, and a UR5 with undeclared friction."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Scene:
         robot, sections, at = self.robot(dtype, device), self.sections, self.document.at
         constraints: list[Constraint] = []
         for i, c in enumerate(sections.contact):
-            constraints.append(SurfaceContact(c.name, c.frame, c.point, c.surface))
+            constraints.append(SurfaceContact(c.name, c.frame, c.point, c.surface, radius=c.radius))
             at(("contact", i, "frame"), constraints[-1].check, robot)
         for i, c in enumerate(sections.connection):
             constraints.append(PointConnection(c.name, c.frame, c.point, c.other_frame, c.other_point))
@@ -88,7 +88,7 @@ def load_scene(source: str | Path) -> Scene:
     """Read a scene file.
 
     Args:
-        source: a path, or the name of a bundled scene (`kuka_plane`).
+        source: a path, or the name of a bundled scene (`kuka_plane`, `ur5_wiping`).
 
     Returns:
         The scene; nothing but its file has been read yet.
