@@ -24,6 +24,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
+from results_page import table, write_section
 from torch import Tensor
 
 from forcegp.forces.priors.default import REMAINING
@@ -197,6 +198,40 @@ def two_against_one(samples: int) -> dict:
     }
 
 
+def markdown(result: dict) -> str:
+    """The section of the page of results."""
+    rows = [
+        [
+            f"{run['samples']:,}",
+            f"{run['seconds']:.1f}",
+            f"{run['processor_seconds']:.1f}",
+            f"{run['peak_mib']:.0f}",
+        ]
+        for run in result["conditioning"]
+    ]
+    one, processes = result["predictions"], result["processes"]
+    parts = [
+        "## Sparse posterior",
+        f"Synthetic rows, seven per sample, one thread, float64, {result['machine']}; "
+        "`python benchmarks/sparse.py --json FILE --docs docs/benchmarks.md` measures it again.",
+        table(["samples", "wall [s]", "processor [s]", "peak memory [MiB]"], rows),
+        f"With {one['basis_functions']} basis functions, in ms of processor time: mean of one state "
+        f"{one['one_mean_ms']['processor']:.2f}, with covariance "
+        f"{one['one_mean_and_covariance_ms']['processor']:.2f}, covariances of 1000 states "
+        f"{one['thousand_covariances_ms']['processor']:.0f}, update with one sample "
+        f"{one['update_one_sample_ms']['processor']:.2f}. Two processes of one thread are "
+        f"{processes['ratio']:.2f} times as fast as one.",
+    ]
+    if "exact" in result:
+        exact = result["exact"]
+        parts.append(
+            f"Exact inference on {exact['samples']} samples takes {exact['condition_seconds']:.1f} s to "
+            f"condition, {exact['likelihood_seconds']:.1f} s for one likelihood with gradient, and "
+            f"{exact['peak_mib']:.0f} MiB."
+        )
+    return "\n\n".join(parts)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -204,6 +239,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, nargs="*", default=[100_000, 1_000_000])
     parser.add_argument("--exact", type=int, default=1000, help="samples of the exact comparison; 0 for none")
     parser.add_argument("--json", type=Path, help="write all results to this file")
+    parser.add_argument("--docs", type=Path, help="write the tables into this Markdown file")
     options = parser.parse_args()
     result: dict = {"machine": platform.processor() or platform.machine(), "threads": 1}
 
@@ -223,6 +259,8 @@ def main() -> None:
         note("exact", alone(exact, (options.exact,))[0])
     if options.json is not None:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    if options.docs is not None:
+        write_section(options.docs, "sparse", markdown(result))
 
 
 if __name__ == "__main__":

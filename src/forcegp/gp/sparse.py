@@ -11,15 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-import scipy.linalg.lapack
 import torch
 from torch import Tensor
 
-from forcegp.errors import ModelError, NumericalError
+from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.blocks import chunked, components_of
 from forcegp.gp.diagnostics import Diagnostics
+from forcegp.gp.factor import extended
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.pathwise import FEATURES, FunctionSamples
@@ -33,9 +32,6 @@ CHUNK_PREDICTIONS = 256
 
 UPDATE_FRACTION = 0.25
 """New rows, as a fraction of the basis functions, above which a factor is computed afresh."""
-
-PANEL = 16
-"""Columns that LAPACK's triangular-pentagonal QR takes at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +183,7 @@ class SparsePosterior:
         if rows > UPDATE_FRACTION * self.basis.size or self.L.device.type != "cpu":
             return SparsePosterior.of(self.basis, self.sums + accumulate(self.basis, blocks))
         moments, Phi = add_rows(self.basis, self.moments, blocks)
-        return SparsePosterior(self.basis, moments, _extended(self.L, Phi), self.jitter)
+        return SparsePosterior(self.basis, moments, extended(self.L, Phi), self.jitter)
 
     def forgetting(self, factor: float) -> SparsePosterior:
         """With every sample so far counting `factor` times; with 0 the prior is left.
@@ -205,19 +201,6 @@ class SparsePosterior:
             NumericalError: the samples were not among them.
         """
         return SparsePosterior.of(self.basis, self.sums - accumulate(self.basis, blocks))
-
-
-def _extended(L: Tensor, rows: Tensor) -> Tensor:
-    """Lower factor of L Lᵀ + rowsᵀ rows, from the QR factorisation of Lᵀ above the rows.
-
-    Its diagonal may be negative, which solves do not mind.
-    """
-    upper, below = np.array(L.numpy().T, order="F"), np.array(rows.numpy(), order="F")
-    (tpqrt,) = scipy.linalg.lapack.get_lapack_funcs(("tpqrt",), (upper,))
-    R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below, overwrite_a=1, overwrite_b=1)
-    if info != 0:
-        raise NumericalError("a Cholesky factor could not be updated", got=f"LAPACK tpqrt info {info}")
-    return torch.from_numpy(R).mT
 
 
 def condition_sparse(

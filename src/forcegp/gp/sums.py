@@ -84,7 +84,9 @@ class Sums(Moments):
         self._check(other)
         if float(other.rows) > float(self.rows):
             raise ModelError(
-                "cannot remove more rows than there are", expected=f"≤ {float(self.rows):g}", got=other.rows
+                "cannot remove more rows than there are",
+                expected=f"at most {float(self.rows):g}",
+                got=float(other.rows),
             )
         return Sums(*(a - b for a, b in zip(self.tensors, other.tensors, strict=True)))
 

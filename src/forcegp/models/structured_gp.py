@@ -251,9 +251,7 @@ class StructuredGP(Model[StructuredFit]):
         return self.fitted.training
 
 
-def _key(
-    spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None
-) -> str:
+def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:
     """Identifies the learning of some tensors, on these data and this system, with these options."""
     training = problem.training
     data = [value for m in training.measurements for value in m.tensors]
