@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from forcegp.evaluation import Evaluation, evaluate
     from forcegp.forces.mean import AnalyticalMean
     from forcegp.forces.measurements import Observation
-    from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+    from forcegp.forces.priors.contact import ContactForcePrior
     from forcegp.forces.priors.joint import JointForcePrior
     from forcegp.forces.priors.normal_force import NormalForcePrior
     from forcegp.forces.priors.operator import OperatorForcePrior
@@ -66,7 +66,7 @@ _HOME = {
     "Scene": "scene",
     "Sphere": "constraints",
     "StructuredGP": "models.structured_gp",
-    "SlidingFrictionPrior": "forces.priors.contact",
+    "SlidingFrictionPrior": "forces.priors.sliding_friction",
     "SurfaceContact": "constraints",
     "TaskSpaceControl": "rollout",
     "check": "checks",

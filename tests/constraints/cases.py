@@ -35,6 +35,8 @@ CONSTRAINTS: dict[str, tuple[Constraint, ...]] = {
         SurfaceContact("plane", "tool", (0.1, 0.0, 0.2), Plane((0.2, 0.3, 1.0), 0.1)),
         SurfaceContact("ball", "tool", (0.0, 0.1, 0.0), Sphere((3.0, 1.0, 0.5), 0.5)),
     ),
+    "rounded": (SurfaceContact("round", "tool", (0.1, 0.0, 0.2), Plane((0.2, 0.3, 1.0), 0.1), radius=0.07),),
+    "balls": (SurfaceContact("ball", "tool", (0.0, 0.1, 0.0), Sphere((3.0, 1.0, 0.5), 0.5), radius=0.2),),
     "pin": (PointConnection("pin", "tool", (0.1, 0.2, 0.0), None, (0.5, 0.1, 0.2)),),
     "redundant": (
         SurfaceContact("plane", "tool", (0.1, 0.0, 0.2), Plane((0.2, 0.3, 1.0), 0.1)),

@@ -9,9 +9,10 @@ from torch import Tensor
 
 import forcegp
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.default import REMAINING
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.gp.kernels import Linear
 from forcegp.gp.stationary import SquaredExponential
 

@@ -63,7 +63,7 @@ def tip_path(system: ConstrainedSystem, contact: SurfaceContact, log: Log) -> Pa
             path.v[part] = kinematics.point_velocity(
                 system.robot, q, qd, contact.frame, contact.point
             ).numpy()
-            path.c[part] = contact.surface.value(p).numpy()
+            path.c[part] = contact.center_surface.value(p).numpy()
             path.normal[part] = contact.surface.gradient(p).numpy()
     return path
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from forcegp import kinematics
 from forcegp.constraints.surface import Surface, check_point
+from forcegp.errors import ParameterError
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
 
@@ -29,27 +30,29 @@ class MovingPoint(NamedTuple):
         position, velocity: `(*batch, 3)` in the world [m], [m/s].
         bias: `(*batch, 3)` acceleration at q̈ = 0 [m/s²].
         jacobian: J `(*batch, 3, nq)`, world axes.
+        angular_velocity: `(*batch, 3)` of the frame [rad/s].
+        angular_jacobian: `(*batch, 3, nq)` of the frame.
     """
 
     position: Tensor
     velocity: Tensor
     bias: Tensor
     jacobian: Tensor
+    angular_velocity: Tensor
+    angular_jacobian: Tensor
 
 
 class ContactPoint(NamedTuple):
-    """The point of the robot that touches a surface.
+    """The point of the robot that touches a surface; of a rounded tip, the material point that touches now.
 
     Attributes:
         position, velocity: `(*batch, 3)` in the world [m], [m/s].
-        bias: `(*batch, 3)` acceleration at q̈ = 0 [m/s²].
         jacobian: J_E `(*batch, 3, nq)`, world axes.
         normal: ∇c `(*batch, 3)` at the point.
     """
 
     position: Tensor
     velocity: Tensor
-    bias: Tensor
     jacobian: Tensor
     normal: Tensor
 
@@ -104,23 +107,35 @@ def _moving_point(
 ) -> MovingPoint:
     """The motion of a point fixed in a frame, from the motion of the links."""
     index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
-    J = kinematics.jacobian_of_poses(robot, poses, index, x)[..., 3:, :]
-    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)[..., 3:]
+    J = kinematics.jacobian_of_poses(robot, poses, index, x)
+    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)
     position = kinematics.point_of_poses(robot, poses, index, x) + robot.base_position
-    return MovingPoint(position, (J @ qd[..., None])[..., 0], bias, J)
+    twist = (J @ qd[..., None])[..., 0]
+    return MovingPoint(position, twist[..., 3:], bias[..., 3:], J[..., 3:, :], twist[..., :3], J[..., :3, :])
 
 
 @dataclass(frozen=True)
 class SurfaceContact(Constraint):
-    """A point of the robot that slides on a surface, c(q) = c_surface(p(q)).
+    """A point or a ball of the robot that slides on a surface, c(q) = c_surface(p(q)) − r.
 
-    A = ∇cᵀ J_E and b = −(∇cᵀ J̇_E q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force where |∇c| = 1.
+    A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force where |∇c| = 1. A rounded
+    tip is a ball of radius r around p. It touches in p − r n, whose material velocity is ṗ + ω × (−r n), so
+    J_E = J_p + r [n]ₓ J_ω: friction at a rounded tip has the lever arm −r n, the normal force has none.
 
     Args:
         name: name of the contact, as in `contact.<name>` of a data set.
         frame: link or frame that carries the point.
-        point: coordinates in that frame [m].
+        point: coordinates in that frame [m]; of a rounded tip, its centre.
         surface: the surface, in the world.
+        radius: r of a rounded tip; 0 is a sharp one [m].
+
+    Raises:
+        ParameterError: the radius is negative, or the surface is not a signed distance.
+
+    Example:
+        >>> tip = SurfaceContact("table", "tool0", (0.0, 0.0, 0.08), Plane(offset=0.05), radius=0.015)
+        >>> tip.center_surface
+        Plane(normal=(0.0, 0.0, 1.0), offset=0.065)
     """
 
     name: str
@@ -128,6 +143,21 @@ class SurfaceContact(Constraint):
     point: Sequence[float]
     surface: Surface
     rows: int = 1
+    radius: float = field(default=0.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.radius < float("inf"):
+            raise ParameterError(
+                f"the tip of contact {self.name!r} has no such radius",
+                expected="a finite length, 0 or above [m]",
+                got=self.radius,
+            )
+        _ = self.center_surface
+
+    @property
+    def center_surface(self) -> Surface:
+        """The surface that `point` moves on: that of the contact, raised by the radius of the tip."""
+        return self.surface.raised(self.radius) if self.radius else self.surface
 
     def check(self, robot: RobotModel) -> None:
         robot.frame_index(self.frame)
@@ -139,10 +169,21 @@ class SurfaceContact(Constraint):
 
     def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
         (tip,) = points
-        at = ContactPoint(*tip, self.surface.gradient(tip.position))
+        surface = self.center_surface
+        at = ContactPoint(tip.position, tip.velocity, tip.jacobian, surface.gradient(tip.position))
         A = at.normal[..., None, :] @ at.jacobian
-        b = -((at.normal * at.bias).sum(-1) + self.surface.curvature(at.position, at.velocity))
-        return ConstraintTerms(self.surface.value(at.position)[..., None], A, b[..., None], at)
+        b = -((at.normal * tip.bias).sum(-1) + surface.curvature(tip.position, tip.velocity))
+        if self.radius:
+            at = _rounded(at, tip, self.radius)
+        return ConstraintTerms(surface.value(tip.position)[..., None], A, b[..., None], at)
+
+
+def _rounded(center: ContactPoint, tip: MovingPoint, radius: float) -> ContactPoint:
+    """The material point of a ball that touches, from the motion of the ball's centre."""
+    arm = -radius * center.normal
+    J = center.jacobian - kinematics.skew(arm) @ tip.angular_jacobian
+    velocity = center.velocity + torch.linalg.cross(tip.angular_velocity, arm)
+    return ContactPoint(center.position + arm, velocity, J, center.normal)
 
 
 @dataclass(frozen=True)
@@ -175,9 +216,9 @@ class PointConnection(Constraint):
         return (first,) if self.other_frame is None else (first, (self.other_frame, self.other_point))
 
     def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
-        p, _, bias, J = points[0]
+        p, bias, J = points[0].position, points[0].bias, points[0].jacobian
         if self.other_frame is None:
             place = torch.as_tensor(self.other_point, dtype=p.dtype, device=p.device)
             return ConstraintTerms(p - place, J, -bias)
-        p2, _, bias2, J2 = points[1]
-        return ConstraintTerms(p - p2, J - J2, bias2 - bias)
+        other = points[1]
+        return ConstraintTerms(p - other.position, J - other.jacobian, other.bias - bias)

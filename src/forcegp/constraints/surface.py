@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import torch
@@ -37,6 +37,21 @@ class Surface(ABC):
     @abstractmethod
     def curvature(self, p: Vector3, v: Vector3) -> Scalars:
         """vᵀ ∇²c(p) v, `(*batch,)`."""
+
+    def raised(self, distance: float) -> Surface:
+        """The surface at a distance above this one, c(p) − distance, where c is a signed distance.
+
+        Args:
+            distance: along the normal [m].
+
+        Raises:
+            ParameterError: the surface does not know its distance.
+        """
+        raise ParameterError(
+            f"{type(self).__name__} cannot be raised by {distance} m",
+            expected="a plane, a sphere or a cylinder, whose c is the signed distance",
+            hint="define raised() in a subclass",
+        )
 
 
 def _vector(values: Sequence[float], like: Tensor) -> Tensor:
@@ -95,6 +110,9 @@ class Plane(Surface):
                 "the plane's offset is not a distance", expected="a finite number [m]", got=self.offset
             )
 
+    def raised(self, distance: float) -> Plane:
+        return replace(self, offset=self.offset + distance)
+
     def value(self, p: Vector3) -> Scalars:
         return p @ _vector(self.normal, p) - self.offset
 
@@ -124,6 +142,9 @@ class Sphere(Surface):
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _point(self.center, "the sphere's center"))
         _positive(self.radius, "the sphere's radius")
+
+    def raised(self, distance: float) -> Sphere:
+        return replace(self, radius=self.radius + distance)
 
     def value(self, p: Vector3) -> Scalars:
         return torch.linalg.vector_norm(p - _vector(self.center, p), dim=-1) - self.radius
@@ -164,6 +185,9 @@ class Cylinder(Surface):
     def _across(self, x: Tensor) -> Tensor:
         a = _vector(self.axis, x)
         return x - (x @ a)[..., None] * a
+
+    def raised(self, distance: float) -> Cylinder:
+        return replace(self, radius=self.radius + distance)
 
     def value(self, p: Vector3) -> Scalars:
         r = self._across(p - _vector(self.center, p))

@@ -79,7 +79,7 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
     frame, point = (contact.frame, contact.point) if contact else (config.frame, config.point)
     frame = robot.frame_names[-1] if frame is None else frame
     center = kinematics.as_point(robot, config.center)
-    chart = Chart.about(center, contact.surface if contact else None)
+    chart = Chart.about(center, contact.center_surface if contact else None)
     reference = _draw_reference(chart, config, generator)
     rotation = tool_rotation(chart.axes[2], chart.axes[0], _tool_axis(kinematics.as_point(robot, point)))
     draws = 2.0 * torch.rand(STARTS, robot.nq, dtype=torch.float64, generator=generator) - 1.0

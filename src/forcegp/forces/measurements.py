@@ -260,5 +260,6 @@ def training_of(
             scales.append(kept[prior.name])
             continue
         features = [prior.features(system, a) for a in at]
-        scales.append(Standardization.of({k: torch.cat([f[k] for f in features]) for k in features[0]}))
+        together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
+        scales.append(Standardization.of(together, prior.vectors))
     return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales))

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from forcegp.errors import UnknownNameError
+
+FLOOR = 0.01
+"""Smallest scale of a column, in units of the typical one of its input. It is below what a motion through the
+workspace gives (0.034 for the torque of an arm's joint 5), and above what drift gives."""
 
 Features = Mapping[str, Tensor]
 """Named kernel inputs: `(n, w)`, shared by all components, or `(n, k, w)`, one row for each component."""
@@ -36,7 +40,12 @@ def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
 class Standardization:
     """Shift and scale of each named input, x ↦ (x − mean)/std, from training data.
 
-    Inputs that are constant to rounding keep the scale 1, and are listed in `constant`.
+    A column that hardly varies says nothing of the scale on which a function varies along it. So no scale is
+    below `FLOOR` times the root mean square of the standard deviations of all columns of its input, and the
+    columns of a vector share that mean: neither turning its axes nor a step off a plane changes much.
+
+    Columns that are constant to rounding keep the scale 1, or that of their vector, and are listed in
+    `constant`.
     """
 
     mean: Mapping[str, Tensor]
@@ -44,15 +53,24 @@ class Standardization:
     constant: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, features: Mapping[str, Tensor]) -> Standardization:
-        """Mean and standard deviation of each column."""
+    def of(cls, features: Mapping[str, Tensor], vectors: Collection[str] = ()) -> Standardization:
+        """Mean and standard deviation of each column.
+
+        Args:
+            features: named inputs `(n, w)`.
+            vectors: inputs whose columns are components of one vector.
+        """
         mean = {name: x.mean(0) for name, x in features.items()}
         std, constant = {}, []
         for name, x in features.items():
             spread = x.std(0, correction=0)
             fixed = spread <= 1e-12 * (1.0 + mean[name].abs())
             constant += [f"{name}[{i}]" for i in fixed.nonzero()[:, 0].tolist()]
-            std[name] = torch.where(fixed, 1.0, spread)
+            whole = spread.square().mean().sqrt()
+            if name in vectors and not bool(fixed.all()):
+                std[name] = whole.expand_as(spread).clone()
+            else:
+                std[name] = torch.where(fixed, 1.0, spread.clamp(min=FLOOR * whole))
         return cls(mean, std, tuple(constant))
 
     def apply(self, features: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -21,7 +21,7 @@ def distance(signals: Signals, system: ConstrainedSystem, contact: SurfaceContac
     for start in range(0, len(signals), CHUNK):
         rows = slice(start, start + CHUNK)
         q = torch.from_numpy(np.ascontiguousarray(signals.vectors["q"][rows]))
-        c[rows] = contact.surface.value(_tip(system, contact, q)).numpy()
+        c[rows] = contact.center_surface.value(_tip(system, contact, q)).numpy()
     return c
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,8 @@ from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import CONTACT, JOINT, ForcePrior
-from forcegp.forces.quantities import AffineMap, affine_maps, flat_states, stack
+from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states, stack
+from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.samples import draw_samples
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
@@ -90,7 +92,7 @@ class StructuredFit(FittedModel):
         """
         system = system or self.system
         flat = flat_states(system, q, qd, tau, active)
-        at = flat.at(system)
+        at = self._with_acceleration(system, flat.at(system)) if covariance else flat.at(system)
         z, parts = stack(affine_maps(system, at, quantity))
         mean = self.posterior.read_mean(system, at, z)
         spread = self.posterior.read_covariance(system, at, z) if covariance else None
@@ -101,6 +103,13 @@ class StructuredFit(FittedModel):
             None if spread is None else spread.reshape(*flat.batch, *spread.shape[-2:]),
             parts,
         )
+
+    def _with_acceleration(self, system: ConstrainedSystem, at: States) -> States:
+        """The states with the predicted acceleration, which errors of the inertia are multiplied by."""
+        if not any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
+            return at
+        qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
+        return dataclasses.replace(at, qdd=qdd)
 
     def force_field(self) -> ForceField:
         """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states."""

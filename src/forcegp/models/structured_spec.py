@@ -17,11 +17,12 @@ from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import NoiseStd, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.priors.normal_force import NormalForcePrior
+from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.gp import kernels, stationary
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.sparse import SparsePosterior

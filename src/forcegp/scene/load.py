@@ -76,7 +76,7 @@ class Scene:
         robot, sections, at = self.robot(dtype, device), self.sections, self.document.at
         constraints: list[Constraint] = []
         for i, c in enumerate(sections.contact):
-            constraints.append(SurfaceContact(c.name, c.frame, c.point, c.surface))
+            constraints.append(SurfaceContact(c.name, c.frame, c.point, c.surface, radius=c.radius))
             at(("contact", i, "frame"), constraints[-1].check, robot)
         for i, c in enumerate(sections.connection):
             constraints.append(PointConnection(c.name, c.frame, c.point, c.other_frame, c.other_point))

@@ -31,12 +31,13 @@ class RobotSection(Section):
 
 
 class ContactSection(Section):
-    """`[[contact]]`: a point of the robot that may touch a surface."""
+    """`[[contact]]`: a point of the robot that may touch a surface, or a ball of some `radius` around it."""
 
     name: str
     frame: str
     point: Vector = (0.0, 0.0, 0.0)
     surface: SurfaceSchema
+    radius: float = 0.0
 
 
 class ConnectionSection(Section):

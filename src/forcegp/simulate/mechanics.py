@@ -104,7 +104,10 @@ class Mechanics:
         state = torch.from_numpy(q), torch.from_numpy(qd)
         M, Q_C, Q_G, *points = self._blocks(*state)
         frames = [points[i : i + POINT] for i in range(0, len(points), POINT)]
-        moving = [MovingPoint(p, J[3:] @ state[1], bias[3:], J[3:]) for _, p, J, bias in frames]
+        qd_ = state[1]
+        moving = [
+            MovingPoint(p, J[3:] @ qd_, bias[3:], J[3:], J[:3] @ qd_, J[:3]) for _, p, J, bias in frames
+        ]
         found = [
             contact.terms_of([moving[k] for k in places])
             for contact, places in zip(self.contacts, self._places, strict=True)

@@ -40,10 +40,11 @@ class SurfaceContactRecord(Record):
     frame: str
     point: Point
     surface: SurfaceSchema
+    radius: float = 0.0
 
     def build(self) -> Constraint:
         """The constraint."""
-        return SurfaceContact(self.name, self.frame, self.point, self.surface)
+        return SurfaceContact(self.name, self.frame, self.point, self.surface, radius=self.radius)
 
 
 class PointConnectionRecord(Record):

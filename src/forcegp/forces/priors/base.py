@@ -30,6 +30,8 @@ class ForcePrior(ABC):
     name: str
     kernel: Kernel
     target: str
+    vectors: tuple[str, ...] = ()
+    """Inputs whose components are standardized by one scale, as turning the axes must change nothing."""
 
     @property
     def prefix(self) -> str:

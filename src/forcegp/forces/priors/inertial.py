@@ -80,9 +80,9 @@ class InertialPrior(ForcePrior):
     def updated(self, robot: RobotModel, mean: Tensor, precision: Tensor) -> tuple[RobotModel, Tensor]:
         """The physically consistent robot that is most probable given δ ~ N(mean, precision⁻¹).
 
-        It minimises ½ (δ − mean)ᵀ precision (δ − mean) + Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] over the log-Cholesky
+        It minimises ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] over the log-Cholesky
         coordinates of the pseudo-inertias J of the links; the second term (the divergence of Lee, Wensing and Park,
-        2019, with the weight of one nat) keeps a link that the log does not determine from losing all its inertia.
+        2019, with the weight γ = 0.01) keeps a link that the log does not determine from losing all its inertia.
 
         Args:
             robot: with π₀.
@@ -110,7 +110,7 @@ class InertialPrior(ForcePrior):
             ratio = inverse @ from_log_cholesky(x)
             log_det = 8.0 * x[:, 0] + 2.0 * x[:, 1:4].sum(-1)
             divergence = ratio.diagonal(dim1=-2, dim2=-1).sum(-1) - log_det
-            return 0.5 * apart @ (precision @ apart) + divergence.sum()
+            return 0.5 * apart @ (precision @ apart) + DIVERGENCE * divergence.sum()
 
         if not bool(sound.any()):
             return robot, torch.zeros_like(mean)
@@ -126,5 +126,7 @@ class InertialPrior(ForcePrior):
         return moved, delta_of(found).detach()
 
 
+DIVERGENCE = 0.01
+"""Weight of the divergence [nats]: enough to keep a link that the log does not determine from vanishing."""
 CONSISTENT = LearningOptions(tolerance=1e-12, max_evaluations=500)
 """How the consistent robot is found."""
