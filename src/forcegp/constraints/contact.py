@@ -10,12 +10,31 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from forcegp import kinematics
 from forcegp.constraints.surface import Surface, check_point
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
+
+Anchor = tuple[str, Sequence[float]]
+"""A frame, and a point in its coordinates [m]."""
+
+
+class MovingPoint(NamedTuple):
+    """The motion of a point fixed in a frame of the robot.
+
+    Attributes:
+        position, velocity: `(*batch, 3)` in the world [m], [m/s].
+        bias: `(*batch, 3)` acceleration at q̈ = 0 [m/s²].
+        jacobian: J `(*batch, 3, nq)`, world axes.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    bias: Tensor
+    jacobian: Tensor
 
 
 class ContactPoint(NamedTuple):
@@ -57,29 +76,38 @@ class Constraint(ABC):
     name: str
     rows: int
 
+    @property
     @abstractmethod
+    def anchors(self) -> tuple[Anchor, ...]:
+        """The points of the robot that the constraint reads, each with its frame."""
+
+    @abstractmethod
+    def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
+        """c, A and b from the motion of the anchors."""
+
     def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
         """c, A and b at a state whose link motion is known."""
+        return self.terms_of([_moving_point(robot, poses, motion, qd, *anchor) for anchor in self.anchors])
 
     @abstractmethod
     def check(self, robot: RobotModel) -> None:
         """Check that the constraint fits a robot.
 
         Raises:
-            UnknownNameError: a frame is not the robot's.
-            ForceGPError: a point has not three finite coordinates.
+            UnknownNameError: the robot has no such frame.
+            ParameterError: a point does not have three finite coordinates.
         """
 
 
 def _moving_point(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor, frame: str, point: Sequence[float]
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Position, velocity, bias acceleration and Jacobian of a point fixed in a frame."""
+) -> MovingPoint:
+    """The motion of a point fixed in a frame, from the motion of the links."""
     index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
     J = kinematics.jacobian_of_poses(robot, poses, index, x)[..., 3:, :]
     bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)[..., 3:]
     position = kinematics.point_of_poses(robot, poses, index, x) + robot.base_position
-    return position, (J @ qd[..., None])[..., 0], bias, J
+    return MovingPoint(position, (J @ qd[..., None])[..., 0], bias, J)
 
 
 @dataclass(frozen=True)
@@ -105,15 +133,13 @@ class SurfaceContact(Constraint):
         robot.frame_index(self.frame)
         check_point(self.point, f"the touching point of {self.name!r}")
 
-    def contact_point(
-        self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor
-    ) -> ContactPoint:
-        """Position, velocity, bias acceleration, Jacobian and surface normal at the touching point."""
-        p, v, bias, J = _moving_point(robot, poses, motion, qd, self.frame, self.point)
-        return ContactPoint(p, v, bias, J, self.surface.gradient(p))
+    @property
+    def anchors(self) -> tuple[Anchor, ...]:
+        return ((self.frame, self.point),)
 
-    def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
-        at = self.contact_point(robot, poses, motion, qd)
+    def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
+        (tip,) = points
+        at = ContactPoint(*tip, self.surface.gradient(tip.position))
         A = at.normal[..., None, :] @ at.jacobian
         b = -((at.normal * at.bias).sum(-1) + self.surface.curvature(at.position, at.velocity))
         return ConstraintTerms(self.surface.value(at.position)[..., None], A, b[..., None], at)
@@ -143,9 +169,15 @@ class PointConnection(Constraint):
         for point in (self.point, self.other_point):
             check_point(point, f"an end of {self.name!r}")
 
-    def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
-        p, _, bias, J = _moving_point(robot, poses, motion, qd, self.frame, self.point)
+    @property
+    def anchors(self) -> tuple[Anchor, ...]:
+        first = (self.frame, self.point)
+        return (first,) if self.other_frame is None else (first, (self.other_frame, self.other_point))
+
+    def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
+        p, _, bias, J = points[0]
         if self.other_frame is None:
-            return ConstraintTerms(p - kinematics.as_point(robot, self.other_point), J, -bias)
-        p2, _, bias2, J2 = _moving_point(robot, poses, motion, qd, self.other_frame, self.other_point)
+            place = torch.as_tensor(self.other_point, dtype=p.dtype, device=p.device)
+            return ConstraintTerms(p - place, J, -bias)
+        p2, _, bias2, J2 = points[1]
         return ConstraintTerms(p - p2, J - J2, bias2 - bias)

@@ -10,13 +10,15 @@ from torch import Tensor
 
 from forcegp.errors import UnknownNameError
 from forcegp.forces.learn import Problem, kernel_parameters
-from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.posterior import ForcePosterior, LatentPosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.gp.bound import bound_of
 from forcegp.gp.decomposition import split
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.inducing import candidates, select_inducing
+from forcegp.gp.kernels import Parameters
 from forcegp.gp.sparse import SparsePosterior, condition_sparse
+from forcegp.gp.structured_covariance import Block
 
 METHODS = ("auto", "exact", "sparse")
 EXACT_SAMPLES = 1000
@@ -71,12 +73,19 @@ def force_posterior(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> 
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
-    params, blocks = kernel_parameters(hyperparameters), problem.rows(hyperparameters).blocks
+    scales, params = problem.training.scales, kernel_parameters(hyperparameters)
+    latent = _conditioned(problem, params, problem.rows(hyperparameters).blocks)
+    if not problem.pinned:
+        return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets)
+    known = problem.of_means().rows(hyperparameters).blocks
+    central = _conditioned(problem, params, problem.silenced(known))
+    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central)
+
+
+def _conditioned(problem: Problem, params: Parameters, blocks: list[Block]) -> LatentPosterior:
     if problem.inducing is None:
-        latent = ExactPosterior.of(problem.priors, params, blocks)
-    else:
-        latent = condition_sparse(problem.priors, params, blocks, problem.inducing)
-    return ForcePosterior(problem.priors, problem.training.scales, problem.mean, latent, problem.offsets)
+        return ExactPosterior.of(problem.priors, params, blocks)
+    return condition_sparse(problem.priors, params, blocks, problem.inducing)
 
 
 def log_likelihood(posterior: ForcePosterior) -> float:

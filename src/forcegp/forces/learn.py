@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -26,7 +26,8 @@ from forcegp.forces.start import (
 from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
+from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
+from forcegp.gp.structured_covariance import Block
 
 Tensors = dict[str, Tensor]
 TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
@@ -62,6 +63,8 @@ class Problem:
         torque_std: standard deviation of the white noise of the motor torque, `(nq,)`, unless it is learned.
         power: κ, which the likelihood is raised to; below 1 where samples are correlated.
         offsets: prior means of latent forces, by prior.
+        pinned: priors whose force has mean zero from here on, since the robot contains it; the others are
+            conditioned on that, and only the uncertainty of the pinned ones remains.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
     """
 
@@ -74,6 +77,7 @@ class Problem:
     power: float = 1.0
     offsets: Mapping[str, Tensor] = field(default_factory=dict)
     inducing: tuple[Features, ...] | None = None
+    pinned: tuple[str, ...] = ()
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """The system with the robot at the analytical parameters among the tensors."""
@@ -114,6 +118,22 @@ class Problem:
                 for i, m in enumerate(self.training.measurements)
             ]
         ).tempered(self.power)
+
+    def of_means(self) -> Problem:
+        """The problem that posterior means are read from, in which pinned forces are known to be zero."""
+        return dataclasses.replace(self, offsets={}, pinned=())
+
+    def silenced(self, blocks: Sequence[Block]) -> list[Block]:
+        """Rows that pinned forces do not act on."""
+        keep = [prior.name not in self.pinned for prior in self.priors]
+        return [
+            Block(
+                b.features,
+                tuple(W if k else torch.zeros_like(W) for W, k in zip(b.operators, keep, strict=True)),
+                b.target,
+            )
+            for b in blocks
+        ]
 
     @cached_property
     def fixed_rows(self) -> WhitenedRows:
@@ -177,11 +197,13 @@ class Search:
         start: default initial values of what is learned, and centre of the weak priors.
         held: values that are not learned.
         options: optimiser and its limits.
+        recorded: wraps the objective, such as `Checkpoint.recorded`.
     """
 
     start: Tensors
     held: Tensors
     options: LearningOptions
+    recorded: Callable[[Objective], Objective] = lambda objective: objective
 
     def solve(
         self,
@@ -236,6 +258,6 @@ class Search:
             if progress is not None:
                 progress(evaluations, value + constant, best)
 
-        learned = minimise(objective, begin, self.options, analytical, bounds, whole)
+        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, whole)
         history = [value + constant for value in learned.history]
         return dataclasses.replace(learned, value=learned.value + constant, history=history)

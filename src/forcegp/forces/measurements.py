@@ -145,7 +145,10 @@ def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
 
 def _checked_noise(noise: NoiseStd, quantity: str, values: Tensor) -> Tensor:
     """A noise as a tensor `(d,)` or `(n, d)`."""
-    std = torch.as_tensor(noise, dtype=values.dtype, device=values.device)
+    try:
+        std = torch.as_tensor(noise, dtype=values.dtype, device=values.device)
+    except (TypeError, ValueError, RuntimeError) as cause:
+        raise ModelError("a noise standard deviation is a number, or one per component", got=noise) from cause
     if std.shape not in ((), (1,), values.shape[-1:], values.shape):
         raise ModelError(
             f"the noise of {quantity!r} does not match its components",
@@ -238,7 +241,13 @@ def training_of(
     Raises:
         ModelError, DataError: there are no data, or they do not fit the system.
     """
-    observations = [Observation(data)] if isinstance(data, Dataset) else list(data)
+    observations = [Observation(data)] if isinstance(data, Dataset) else data
+    if not isinstance(observations, Sequence) or not all(isinstance(o, Observation) for o in observations):
+        raise ModelError(
+            "these are no data to learn from",
+            expected="a Dataset, or a list of Observation",
+            got=type(data).__name__,
+        )
     if not observations:
         raise ModelError(
             "there are no samples to learn from", expected="at least one observation", got="none"

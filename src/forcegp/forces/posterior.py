@@ -51,6 +51,7 @@ class ForcePosterior:
         mean: prior mean of Q.
         latent: the conditioned processes.
         offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
+        central: processes that means are read from, where some forces are pinned to zero; `latent` by default.
     """
 
     priors: tuple[ForcePrior, ...]
@@ -58,14 +59,31 @@ class ForcePosterior:
     mean: ForceMean
     latent: LatentPosterior
     offsets: Mapping[str, Tensor] = field(default_factory=dict)
+    central: LatentPosterior | None = None
 
     def latent_mean(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | None:
         """Posterior mean of the force of prior p, `(n, components)`; `None` where it is zero."""
+        if self.central is not None:
+            if not self.central.is_measured(p):
+                return None
+            return self.central.latent_mean(p, self.features_of(p, system, at))
+        return self._own_mean(p, system, at)
+
+    def _own_mean(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | None:
+        """Posterior mean where no force is pinned."""
         offset = self.offsets.get(self.priors[p].name)
         if not self.latent.is_measured(p):
             return None if offset is None else offset.expand(len(at.q), -1)
         mean = self.latent.latent_mean(p, self.features_of(p, system, at))
         return mean if offset is None else mean + offset
+
+    def shift(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | float:
+        """What samples of the latent force of prior p must be moved by to have the mean that is predicted."""
+        if self.central is None:
+            return self.offsets.get(self.priors[p].name, 0.0)
+        mean, own = self.latent_mean(p, system, at), self._own_mean(p, system, at)
+        offset = self.offsets.get(self.priors[p].name, 0.0)
+        return (0.0 if mean is None else mean) - (0.0 if own is None else own) + offset
 
     def features_of(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         """Standardized kernel inputs of prior p at states."""

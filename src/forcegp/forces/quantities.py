@@ -210,11 +210,11 @@ def affine_maps(system: ConstrainedSystem, at: States, quantity: str | Sequence[
         UnknownNameError: no such quantity.
         ModelError: none is named.
     """
-    names = [quantity] if isinstance(quantity, str) else list(quantity)
+    names = list(quantity) if isinstance(quantity, Sequence) and not isinstance(quantity, str) else [quantity]
     if not names:
         raise ModelError("no quantity is named", expected="one of " + ", ".join(QUANTITIES))
     for name in names:
-        if name not in QUANTITIES:
+        if not isinstance(name, str) or name not in QUANTITIES:
             raise UnknownNameError("quantity", name, QUANTITIES)
     return {name: QUANTITIES[name](system, at) for name in names}
 

@@ -21,7 +21,7 @@ from forcegp.forces.measurements import NoiseStd, Observation, Training, trainin
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
-from forcegp.gp.optimise import LearningOptions, Progress
+from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import in_motion, prepared, solve
@@ -114,6 +114,7 @@ class StructuredGP(Model[StructuredFit]):
         begin: Mapping[str, Tensor] | None = None,
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
+        keep_checkpoint: bool = False,
     ) -> StructuredFit:
         """Learn hyperparameters (and analytical parameters) by maximum a posteriori, then condition.
 
@@ -126,8 +127,9 @@ class StructuredGP(Model[StructuredFit]):
             begin: `hyperparameters` of a fit of the same kind of model, such as one to less data, where
                 learning begins; by default it begins on fewer samples (`options.warm_start`).
             progress: called after each evaluation.
-            checkpoint: file that keeps the best values of a long fit; a fit that finds it resumes from
-                there, and removes it at its end.
+            checkpoint: file that records the evaluations of a long fit; a fit that finds it resumes
+                there, to the same bits as one without a break, and removes it at its end.
+            keep_checkpoint: leave the file, to be removed once the model is saved.
 
         Returns:
             The fitted model, which is also kept as `fitted`.
@@ -153,16 +155,17 @@ class StructuredGP(Model[StructuredFit]):
             if progress is not None:
                 progress(evaluations, options.max_evaluations, value)
 
-        note: Progress = report
-        saved = None
+        search, saved = Search(free, held, options), None
         if checkpoint is not None:
-            saved = Checkpoint(Path(checkpoint), _key(problem, options, free))
-            found = saved.read(free)
-            begin, note = begin if found is None else found, saved.noting(report)
-        lesson = solve(spec, problem, Search(free, held, options), note, begin)
+            saved = Checkpoint(Path(checkpoint), _key(spec, problem, search, begin))
+            saved.read(free)
+            search = dataclasses.replace(search, recorded=saved.recorded)
+        lesson = solve(spec, problem, search, report, begin)
+        if saved is not None:
+            saved.write()
         doubts = (*doubts, *lesson.warnings)
         fitted = self.adopt(conditioned(spec, lesson.problem, lesson.hyperparameters, lesson.learned, doubts))
-        if saved is not None:
+        if saved is not None and not keep_checkpoint:
             saved.remove()
         return fitted
 
@@ -248,13 +251,14 @@ class StructuredGP(Model[StructuredFit]):
         return self.fitted.training
 
 
-def _key(problem: Problem, options: LearningOptions, free: Mapping[str, Tensor]) -> str:
+def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:
     """Identifies the learning of some tensors, on these data and this system, with these options."""
     training = problem.training
     data = [value for m in training.measurements for value in m.tensors]
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
     record, robot = pack_system(problem.system)
+    named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
     return Checkpoint.key_of(
-        problem.mean, priors, options, list(free), training.quantities, *data, *training.noise_std,
-        record, *robot.values(),
+        problem.mean, priors, spec.inference, search.options, training.quantities, *data, *training.noise_std,
+        record, *robot.values(), *(part for pair in named for part in pair),
     )  # fmt: skip

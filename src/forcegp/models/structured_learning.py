@@ -27,9 +27,12 @@ from forcegp.forces.inference import (
 )
 from forcegp.forces.learn import TORQUE_NOISE, Problem, Search
 from forcegp.forces.measurements import Training
+from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.gp.optimise import Learned, Progress
+from forcegp.gp.structured_covariance import Block
 from forcegp.models.structured_spec import Specification
+from forcegp.robot.model import RobotModel
 
 LEARN_SAMPLES = 800
 """Samples that hyperparameters are learned on where priors are finite features."""
@@ -142,15 +145,35 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
     for p, prior in enumerate(problem.priors):
         if isinstance(prior, InertialPrior) and problem.parameters is None:
             posterior = force_posterior(problem, values)
-            m = problem.training.measurements[0]
-            one = m[torch.zeros(1, dtype=torch.int64, device=m.q.device)]
-            latent = posterior.latent_mean(p, problem.system, one.at(problem.system))
-            if latent is not None:
-                robot, moved = prior.updated(problem.system.robot, latent[0])
-                # The prior keeps the scale of the file's parameters, not that of the updated ones.
-                return dataclasses.replace(
-                    problem,
-                    system=problem.system.with_robot(robot),
-                    offsets={**problem.offsets, prior.name: -moved},
-                )
+            features = _one_row(posterior, problem)
+            mean = posterior.latent.latent_mean(p, features[p])[0]
+            robot, moved = prior.updated(
+                problem.system.robot, mean, _precision(posterior, features, p, problem.system.robot)
+            )
+            # The prior keeps the scale of the file's parameters, not that of the updated ones.
+            return dataclasses.replace(
+                problem,
+                system=problem.system.with_robot(robot),
+                priors=tuple(prior.around(problem.system.robot) if q is prior else q for q in problem.priors),
+                offsets={**problem.offsets, prior.name: -moved},
+                pinned=(prior.name,),
+            )
     return problem
+
+
+def _one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
+    """Kernel inputs of every prior at the first sample; constants have the same value everywhere."""
+    m = problem.training.measurements[0]
+    at = m[torch.zeros(1, dtype=torch.int64, device=m.q.device)].at(problem.system)
+    return [posterior.features_of(p, problem.system, at) for p in range(len(problem.priors))]
+
+
+def _precision(
+    posterior: ForcePosterior, features: list[dict[str, Tensor]], p: int, robot: RobotModel
+) -> Tensor:
+    """Inverse posterior covariance of the components of prior p, all others marginalised."""
+    widths = [prior.outputs(robot) for prior in posterior.priors]
+    eye = torch.eye(widths[p], dtype=robot.dtype, device=robot.device)
+    operators = [eye[None] if q == p else eye.new_zeros(1, widths[p], w) for q, w in enumerate(widths)]
+    block = Block(tuple(features), tuple(operators), eye[:1])
+    return torch.linalg.inv(posterior.latent.covariance(block)[0])

@@ -43,10 +43,7 @@ def load_structured(
     spec = _specification(settings, tensors, system, source)
     model = StructuredGP.of(spec)
     try:
-        for name, value in tensors.items():
-            finite = name.removeprefix("start.") in ("lower", "upper", "velocity_limit", "effort_limit")
-            if value.is_complex() or not (finite or bool(torch.isfinite(value).all())):
-                raise ValueError(f"tensor {name!r} holds values that are not finite real numbers")
+        _check_types(tensors)
         training = _training(settings, spec, tensors)
         hyper = _below(tensors, "hyper.")
         _check_hyperparameters(spec, training, hyper)
@@ -82,10 +79,24 @@ def _specification(
     )
 
 
+def _check_types(tensors: Mapping[str, Tensor]) -> None:
+    """Raise `ValueError` where a tensor is not of real numbers, or contacts are not flags."""
+    for name, value in tensors.items():
+        is_flag = name.startswith("data.") and name.endswith(".active")
+        fits = value.dtype == torch.bool if is_flag else value.is_floating_point()
+        if not fits:
+            raise ValueError(f"tensor {name!r} has type {value.dtype}")
+
+
 def _training(settings: StructuredSettings, spec: Specification, tensors: Mapping[str, Tensor]) -> Training:
     measurements, noise = [], []
     for i, quantity in enumerate(settings.measured):
         m = Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in COLUMNS})
+        n, nq = len(m.values) if m.values.ndim == 2 else -1, spec.system.robot.nq
+        shapes = {"q": (n, nq), "qd": (n, nq), "tau": (n, nq), "active": (n, len(spec.system.contacts))}
+        for name, shape in shapes.items():
+            if getattr(m, name).shape != shape:
+                raise ValueError(f"tensor 'data.{i}.{name}' has shape {tuple(getattr(m, name).shape)}")
         std = tensors[f"data.{i}.noise_std"]
         if std.shape not in (m.values.shape, m.values.shape[-1:]) or not bool((std > 0.0).all()):
             raise ValueError(f"noise of measurement {i} has shape {tuple(std.shape)}, or is not positive")

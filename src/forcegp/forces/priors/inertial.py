@@ -8,6 +8,7 @@ the updated parameters; what remains uncertain acts through Y at the predicted a
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 
 import torch
@@ -17,8 +18,15 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.priors.base import JOINT, ForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
+from forcegp.gp.optimise import LearningOptions, minimise
 from forcegp.identification import regressor
-from forcegp.robot.inertia import inertial_parameters
+from forcegp.robot.inertia import (
+    from_log_cholesky,
+    from_pseudo_inertia,
+    inertial_parameters,
+    log_cholesky,
+    pseudo_inertia,
+)
 from forcegp.robot.model import RobotModel
 
 PER_LINK = 10
@@ -35,6 +43,7 @@ class InertialPrior(ForcePrior):
             inertia [m].
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
+        masses: of the links, which the scale is relative to; those of the robot by default [kg].
     """
 
     mass: float = 0.3
@@ -42,6 +51,11 @@ class InertialPrior(ForcePrior):
     kernel: Kernel = field(default_factory=lambda: Constant(group=PER_LINK))
     name: str = "inertial"
     target: str = JOINT
+    masses: tuple[float, ...] | None = None
+
+    def around(self, robot: RobotModel) -> InertialPrior:
+        """The prior with the masses of this robot as its scale, whatever robot it is read on."""
+        return dataclasses.replace(self, masses=tuple(robot.mass.tolist()))
 
     def outputs(self, robot: RobotModel) -> int:
         return PER_LINK * robot.nq
@@ -58,59 +72,59 @@ class InertialPrior(ForcePrior):
 
     def scale(self, robot: RobotModel) -> Tensor:
         """S `(10 nq,)`: standard deviations of π before a link's scale is learned."""
-        m, r = robot.mass, self.length
+        m = robot.mass if self.masses is None else robot.mass.new_tensor(self.masses)
+        r = self.length
         parts = [self.mass * m, *3 * [m * r], *6 * [m * r * r]]
         return torch.stack(parts, dim=-1).flatten().detach()
 
-    def updated(self, robot: RobotModel, latent: Tensor) -> tuple[RobotModel, Tensor]:
-        """The robot at π₀ + S δ, moved no further than where every link stays physically consistent.
+    def updated(self, robot: RobotModel, mean: Tensor, precision: Tensor) -> tuple[RobotModel, Tensor]:
+        """The physically consistent robot that is most probable given δ ~ N(mean, precision⁻¹).
+
+        It minimises ½ (δ − mean)ᵀ precision (δ − mean) + Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] over the log-Cholesky
+        coordinates of the pseudo-inertias J of the links; the second term (the divergence of Lee, Wensing and Park,
+        2019, with the weight of one nat) keeps a link that the log does not determine from losing all its inertia.
 
         Args:
             robot: with π₀.
-            latent: δ `(10 nq,)`.
+            mean: of δ, `(10 nq,)`.
+            precision: of δ, `(10 nq, 10 nq)`.
 
         Returns:
-            The robot, and the δ that it contains `(10 nq,)`.
+            The robot, and the δ that it contains `(10 nq,)`. Links that are not physically consistent in the file
+            stay as they are.
         """
-        pi = inertial_parameters(robot.mass, robot.com, robot.inertia)
-        step = (self.scale(robot) * latent).unflatten(0, (robot.nq, PER_LINK))
-        kept = torch.stack([_consistent_share(p, d) for p, d in zip(pi, step, strict=True)])
-        mass, com, inertia = _bodies(pi + kept[:, None] * step)
-        share = kept.repeat_interleave(PER_LINK)
-        return robot.replace(mass=mass, com=com, inertia=inertia), share * latent
+        J0 = pseudo_inertia(robot.mass, robot.com, robot.inertia)
+        sound = torch.linalg.eigvalsh(J0)[:, 0] > 0.0
+        pi0 = inertial_parameters(robot.mass, robot.com, robot.inertia)
+        scale = self.scale(robot).unflatten(0, (robot.nq, PER_LINK))
+        inverse = torch.linalg.inv(J0[sound])
+
+        def delta_of(x: Tensor) -> Tensor:
+            bodies = from_pseudo_inertia(from_log_cholesky(x))
+            delta = torch.zeros_like(pi0).index_put((sound.nonzero()[:, 0],), inertial_parameters(*bodies))
+            return torch.where(sound[:, None], (delta - pi0) / scale, 0.0).flatten()
+
+        def objective(tensors: dict[str, Tensor]) -> Tensor:
+            x = tensors["x"]
+            apart = delta_of(x) - mean
+            ratio = inverse @ from_log_cholesky(x)
+            log_det = 8.0 * x[:, 0] + 2.0 * x[:, 1:4].sum(-1)
+            divergence = ratio.diagonal(dim1=-2, dim2=-1).sum(-1) - log_det
+            return 0.5 * apart @ (precision @ apart) + divergence.sum()
+
+        if not bool(sound.any()):
+            return robot, torch.zeros_like(mean)
+        with torch.enable_grad():
+            found = minimise(objective, {"x": log_cholesky(J0[sound])}, CONSISTENT).tensors["x"]
+        rows = (sound.nonzero()[:, 0],)
+        mass, com, inertia = from_pseudo_inertia(from_log_cholesky(found))
+        moved = robot.replace(
+            mass=robot.mass.index_put(rows, mass),
+            com=robot.com.index_put(rows, com),
+            inertia=robot.inertia.index_put(rows, inertia),
+        )
+        return moved, delta_of(found).detach()
 
 
-MARGIN = 1e-6
-"""Smallest eigenvalue of a pseudo-inertia, relative to its trace, that counts as consistent."""
-HALVINGS = 30
-
-
-def _consistent_share(pi: Tensor, step: Tensor) -> Tensor:
-    """Largest share 2⁻ᵏ of a step that keeps a link's pseudo-inertia positive definite; 0 for none."""
-    share = torch.ones((), dtype=pi.dtype, device=pi.device)
-    for _ in range(HALVINGS):
-        J = _pseudo(pi + share * step)
-        if bool(torch.linalg.eigvalsh(J)[0] > MARGIN * J.diagonal().sum()):
-            return share
-        share = 0.5 * share
-    return torch.zeros_like(share)
-
-
-def _pseudo(pi: Tensor) -> Tensor:
-    """Pseudo-inertia `(4, 4)` of π `(10,)`."""
-    xx, xy, xz, yy, yz, zz = pi[4:].unbind(-1)
-    I = torch.stack([torch.stack(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
-    Sigma = 0.5 * I.diagonal().sum() * torch.eye(3, dtype=pi.dtype, device=pi.device) - I
-    top = torch.cat([Sigma, pi[1:4, None]], dim=-1)
-    return torch.cat([top, torch.cat([pi[1:4], pi[:1]])[None]], dim=0)
-
-
-def _bodies(pi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mass, centre of mass, and inertia about it, of π `(n, 10)`."""
-    m, com = pi[:, 0], pi[:, 1:4] / pi[:, :1]
-    xx, xy, xz, yy, yz, zz = pi[:, 4:].unbind(-1)
-    rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    I = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    eye = torch.eye(3, dtype=pi.dtype, device=pi.device)
-    square = (com * com).sum(-1)[:, None, None] * eye - com[:, :, None] * com[:, None, :]
-    return m, com, I - m[:, None, None] * square
+CONSISTENT = LearningOptions(tolerance=1e-12, max_evaluations=500)
+"""How the consistent robot is found."""
