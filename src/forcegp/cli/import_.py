@@ -61,7 +61,7 @@ def import_(
     if out is None or out.suffix.lower() != ".parquet":
         raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
     with progress_bar(f"reading {log.name}", 1) as advance:
-        imported = import_log(log, system, mapping, progress=lambda done, total: advance(done, total))
+        imported = import_log(log, system, mapping, progress=advance)
     imported.data.write(out)
     result = _json(imported) if as_json else _summary(imported)
     if fit_surface is not None:
