@@ -125,7 +125,7 @@ def _detect(
         values = evidence.distance(signals, system, contact)
         high = section.threshold if section.threshold is not None else TOUCHING
         low = section.release if section.release is not None else high
-        closed = hysteresis(-values, -high, -low, signals.segment)
+        closed = hysteresis(-np.abs(values), -high, -low, signals.segment)
     else:
         if section.source == "wrench":
             values = evidence.normal_force(signals, system, mapping, contact)
