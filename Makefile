@@ -6,7 +6,7 @@ READY  := $(VENV)/.ready
 PROFILE ?= quick
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce test lint types benchmark clean
+.PHONY: help setup reproduce test lint types package benchmark clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -20,7 +20,7 @@ $(READY): pyproject.toml constraints.txt
 	@echo "[setup] PyTorch"
 	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt torch
 	@echo "[setup] forcegp and the tools that test it"
-	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt -e ".[pybullet,test,dev]"
+	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt -e ".[mujoco,pybullet,test,dev]"
 	@touch $(READY)
 	@echo "[setup] done"
 
@@ -35,6 +35,9 @@ test: lint types $(READY)  ## lint, types and tests
 lint: $(READY)   ## ruff, check and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+package: $(READY)  ## build the wheel and try it in an environment of its own
+	sh .ci/wheel $(BIN)/python
 
 types: $(READY)  ## pyright
 	$(BIN)/pyright

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
+from results_page import table, write_section
 from torch import Tensor
 
 from forcegp.forces.priors.default import REMAINING
@@ -79,15 +80,16 @@ def basis() -> LatentBasis:
     return latent_basis([Prior()], params, [selection.points], [JOINTS])
 
 
-def median_ms(function: Callable[[], object], repeats: int = REPEATS) -> float:
-    """Median milliseconds of a call, after one that warms up."""
+def median_ms(function: Callable[[], object], repeats: int = REPEATS) -> dict[str, float]:
+    """Median milliseconds of a call, after one that warms up, on the clock and of the processor."""
     function()
-    seconds = []
+    wall, processor = [], []
     for _ in range(repeats):
-        began = time.perf_counter()
+        began, used = time.perf_counter(), time.process_time()
         function()
-        seconds.append(time.perf_counter() - began)
-    return 1e3 * statistics.median(seconds)
+        wall.append(time.perf_counter() - began)
+        processor.append(time.process_time() - used)
+    return {"wall": 1e3 * statistics.median(wall), "processor": 1e3 * statistics.median(processor)}
 
 
 def peak_mib() -> float:
@@ -99,13 +101,14 @@ def conditioning(samples: int) -> dict:
     """Seconds and peak memory of conditioning on a stream of samples."""
     functions = basis()
     accumulate(functions, stream(0, CHUNK))
-    before, began = peak_mib(), time.perf_counter()
+    before, began, used = peak_mib(), time.perf_counter(), time.process_time()
     posterior = SparsePosterior.of(functions, accumulate(functions, stream(0, samples)))
     posterior.weights  # noqa: B018  (computed here, so that the time includes it)
     seconds = time.perf_counter() - began
     return {
         "samples": samples,
         "seconds": seconds,
+        "processor_seconds": time.process_time() - used,
         "basis_functions": functions.size,
         "before_mib": before,
         "peak_mib": peak_mib(),
@@ -152,11 +155,11 @@ def shards(samples: int, rank: int, processes: int, store: str) -> dict:
     functions, own = basis(), shard(samples, rank, processes)
     accumulate(functions, stream(0, CHUNK))
     dist.barrier()
-    began = time.perf_counter()
+    began, used = time.perf_counter(), time.process_time()
     total = reduce_sums(accumulate(functions, stream(own.start, own.stop)))
-    seconds = time.perf_counter() - began
+    seconds, processor = time.perf_counter() - began, time.process_time() - used
     dist.destroy_process_group()
-    return {"seconds": seconds, "rows": float(total.rows)}
+    return {"seconds": seconds, "processor_seconds": processor, "rows": float(total.rows)}
 
 
 def _call(function: Callable[..., dict], arguments: tuple, results: object) -> None:
@@ -179,13 +182,54 @@ def alone(function: Callable[..., dict], *calls: tuple) -> list[dict]:
 
 def two_against_one(samples: int) -> dict:
     """How much faster two processes of one thread are than one."""
-    seconds = []
+    seconds, processor = [], []
     for count in (1, 2):
         with tempfile.TemporaryDirectory() as folder:
             store = str(Path(folder) / "store")
             found = alone(shards, *((samples, rank, count, store) for rank in range(count)))
         seconds.append(max(result["seconds"] for result in found))
-    return {"samples": samples, "one": seconds[0], "two": seconds[1], "ratio": seconds[0] / seconds[1]}
+        processor.append(max(result["processor_seconds"] for result in found))
+    return {
+        "samples": samples,
+        "one": seconds[0],
+        "two": seconds[1],
+        "ratio": seconds[0] / seconds[1],
+        "ratio_of_processor_time": processor[0] / processor[1],
+    }
+
+
+def markdown(result: dict) -> str:
+    """The section of the page of results."""
+    rows = [
+        [
+            f"{run['samples']:,}",
+            f"{run['seconds']:.1f}",
+            f"{run['processor_seconds']:.1f}",
+            f"{run['peak_mib']:.0f}",
+        ]
+        for run in result["conditioning"]
+    ]
+    one, processes = result["predictions"], result["processes"]
+    parts = [
+        "## Sparse posterior",
+        f"Synthetic rows, seven per sample, one thread, float64, {result['machine']}; "
+        "`python benchmarks/sparse.py --json FILE --docs docs/benchmarks.md` measures it again.",
+        table(["samples", "wall [s]", "processor [s]", "peak memory [MiB]"], rows),
+        f"With {one['basis_functions']} basis functions, in ms of processor time: mean of one state "
+        f"{one['one_mean_ms']['processor']:.2f}, with covariance "
+        f"{one['one_mean_and_covariance_ms']['processor']:.2f}, covariances of 1000 states "
+        f"{one['thousand_covariances_ms']['processor']:.0f}, update with one sample "
+        f"{one['update_one_sample_ms']['processor']:.2f}. Two processes of one thread are "
+        f"{processes['ratio']:.2f} times as fast as one.",
+    ]
+    if "exact" in result:
+        exact = result["exact"]
+        parts.append(
+            f"Exact inference on {exact['samples']} samples takes {exact['condition_seconds']:.1f} s to "
+            f"condition, {exact['likelihood_seconds']:.1f} s for one likelihood with gradient, and "
+            f"{exact['peak_mib']:.0f} MiB."
+        )
+    return "\n\n".join(parts)
 
 
 def main() -> None:
@@ -195,6 +239,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, nargs="*", default=[100_000, 1_000_000])
     parser.add_argument("--exact", type=int, default=1000, help="samples of the exact comparison; 0 for none")
     parser.add_argument("--json", type=Path, help="write all results to this file")
+    parser.add_argument("--docs", type=Path, help="write the tables into this Markdown file")
     options = parser.parse_args()
     result: dict = {"machine": platform.processor() or platform.machine(), "threads": 1}
 
@@ -205,8 +250,8 @@ def main() -> None:
     note("conditioning", [alone(conditioning, (samples,))[0] for samples in options.samples])
     runs = result["conditioning"]
     if len(runs) > 1:
-        rate = [run["seconds"] / run["samples"] for run in runs]
-        note("seconds_per_sample_last_to_first", rate[-1] / rate[0])
+        rate = [run["processor_seconds"] / run["samples"] for run in runs]
+        note("processor_seconds_per_sample_last_to_first", rate[-1] / rate[0])
         note("peak_mib_last_minus_first", runs[-1]["peak_mib"] - runs[0]["peak_mib"])
     note("predictions", alone(predictions, (min(options.samples),))[0])
     note("processes", two_against_one(min(options.samples)))
@@ -214,6 +259,8 @@ def main() -> None:
         note("exact", alone(exact, (options.exact,))[0])
     if options.json is not None:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    if options.docs is not None:
+        write_section(options.docs, "sparse", markdown(result))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from forcegp import compiled, derivatives, dynamics, identification, kinematics
+    from forcegp.checks import check
     from forcegp.constraints import (
         Baumgarte,
         ConstrainedSystem,
@@ -68,6 +69,7 @@ _HOME = {
     "SlidingFrictionPrior": "forces.priors.sliding_friction",
     "SurfaceContact": "constraints",
     "TaskSpaceControl": "rollout",
+    "check": "checks",
     "compiled": "",
     "contact_loss_probability": "rollout",
     "derivatives": "",
@@ -112,6 +114,7 @@ __all__ = [
     "StructuredGP",
     "SurfaceContact",
     "TaskSpaceControl",
+    "check",
     "compiled",
     "contact_loss_probability",
     "derivatives",

@@ -28,6 +28,23 @@ COLUMN_NAME = 1024
 SEGMENT_NUMBER = 2**53
 """The number of a trajectory: the largest range in which float64 holds every integer."""
 
+LOG_VALUES = 1 << 28
+"""Numbers read from the log of another program: 2 GiB of float64."""
+LOG_STREAMS = 1024
+"""Topics, groups or arrays of different length in a log."""
+LOG_FILES = 20_000
+"""Files of a folder that is read as one log."""
+LOG_MESSAGES = 20_000_000
+"""Messages of a bag."""
+LOG_NAME = 200
+"""Characters of a column's name, beyond which it is cut."""
+MESSAGE_BYTES = MIB
+"""A message of a bag: a joint state takes less than a kilobyte."""
+LINE_BYTES = MIB
+"""A line of a text table."""
+GROUP_DEPTH = 16
+"""Groups or structs inside each other in a log."""
+
 SCENE_BYTES = MIB
 """A scene file."""
 KEY_PARTS = 16

@@ -132,6 +132,33 @@ def test_redundant_rows_share_the_multiplier_and_the_rank_is_reported() -> None:
     assert close(multiplier[:, 0], multiplier[:, 1], KKT)
 
 
+CONSISTENT = 1e4
+"""|A q̈ − b| in units of ε times the largest term of A q̈: the digits that M (condition 1e4) costs."""
+FLANGE = "lbr_iiwa_link_7"
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize(
+    "normals", [((0, 0, 1),) * 3, ((0, 0, 1), (0, 0, -1), (0, 1, 0))], ids=["same", "opposed"]
+)
+def test_redundant_contacts_hold_in_both_precisions(dtype: torch.dtype, normals: tuple) -> None:
+    """In single precision, three identical contacts once left |A q̈ − b| of 674 m/s² without an error."""
+    robot = forcegp.load_robot("kuka_iiwa", dtype=dtype)
+    point = (0.02, 0.01, 0.1)
+    contacts = [SurfaceContact(f"{i}", FLANGE, point, Plane(normal)) for i, normal in enumerate(normals)]
+    system = ConstrainedSystem(robot, contacts)
+    q, qd, Q = (x.to(dtype) for x in random_state(system_of("two", 0), 200))
+    eom = system.equations(q, qd)
+    assert eom.rank.tolist() == [len({tuple(map(abs, normal)) for normal in normals})] * 200
+    qdd = eom.acceleration(Q)
+    error = times(eom.A, qdd) - eom.b
+    terms = (eom.A.abs() @ qdd.abs()[..., None])[..., 0] + eom.b.abs()
+    assert float((error / terms).abs().max()) < CONSISTENT * torch.finfo(dtype).eps
+    exact = ConstrainedSystem(robot.to(dtype=torch.float64), contacts).equations(q.double(), qd.double())
+    relative = (qdd - exact.acceleration(Q.double())).abs().max() / exact.acceleration(Q.double()).abs().max()
+    assert float(relative) < CONSISTENT * torch.finfo(dtype).eps
+
+
 def test_contacts_are_open_or_closed_sample_by_sample() -> None:
     system = system_of("two", 1)
     q, qd, Q = random_state(system, 4)

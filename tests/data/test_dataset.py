@@ -15,7 +15,7 @@ import torch
 
 import forcegp
 from forcegp import limits
-from forcegp.data import Dataset, NotLoggedError, RobotMismatchWarning
+from forcegp.data import DataHeader, Dataset, NotLoggedError, RobotMismatchWarning
 from forcegp.data.table import IgnoredColumnsWarning
 from forcegp.errors import DataError, UnknownNameError
 from logs import JOINTS, random_log
@@ -78,6 +78,8 @@ def test_rows_by_slice_mask_and_indices() -> None:
         ([-11], "no such row"),
         ([0.5], "a slice, a mask or a list"),
         (3, "a slice, a mask or a list"),
+        (["a"], "a slice, a mask or a list"),
+        ("t", "a slice, a mask or a list"),
     ],
 )
 def test_rows_that_do_not_exist(rows: object, message: str) -> None:
@@ -94,6 +96,38 @@ def test_selecting_joints_reorders_every_joint_vector() -> None:
         log.select(("wirst",))
 
 
+def test_rows_in_any_order_make_a_data_set_of_points() -> None:
+    """Selecting points needs no header: the data set itself records that time does not increase."""
+    log = random_log(segments=2)
+    assert log[3:].header.ordered and log[[1, 4, 7]].header.ordered
+    assert same(log[::-1], log[list(range(len(log)))[::-1]])
+    for points in (log[[7, 4, 1]], log[::-1], log[[2, 2]], log[[5, 1, 3]][torch.tensor([0, 1])]):
+        assert not points.header.ordered
+    order = torch.arange(len(log) - 1, -1, -1)
+    fields = {name: getattr(log, name)[order] for name in ("t", "q", "qd", "tau", "qdd", "segment")}
+    with pytest.raises(DataError, match=r"'t' does not increase(.|\n)*data\[rows\](.|\n)*ordered=False"):
+        Dataset(**fields, joint_names=log.joint_names)
+    points = Dataset(**fields, joint_names=log.joint_names, header=DataHeader(ordered=False))
+    assert torch.equal(points.q, log[::-1].q)
+
+
+def test_the_summary_is_short_and_true() -> None:
+    log = random_log(segments=3)
+    text = repr(log)
+    closed = float(log.contact["table"].double().mean())
+    parts = [log.t[log.segment == k] for k in range(3)]
+    seconds = sum(float(t.max() - t.min()) for t in parts)
+    assert text.startswith(
+        f"<Dataset of 'arm': {len(log)} samples of {log.nq} joints; {seconds:.4g} s in 3 seg"
+    )
+    assert f"contact table ({closed:.0%} closed)" in text and text.endswith("; float64 on cpu>")
+    assert all(name in text for name in (*log.extras, *log.contact_extras))
+    assert len(text) < 250 and "tensor" not in text
+    assert "2 samples of" in repr(log[[4, 1]]) and "not in order of time" in repr(log[[4, 1]])
+    assert repr(log[:0]).startswith("<Dataset of 'arm': 0 samples")
+    assert repr(log.replace(header=DataHeader())).startswith(f"<Dataset: {len(log)} samples")
+
+
 def test_concatenation_keeps_segments_apart() -> None:
     a, b = random_log(10, segments=2), random_log(5, seed=1)
     joined = Dataset.concatenate([a, b, a])
@@ -102,7 +136,7 @@ def test_concatenation_keeps_segments_apart() -> None:
     assert joined.header.noise_std == 0.1 and joined.header.seed is None
     with pytest.raises(DataError, match="extras of data set 1 differ"):
         Dataset.concatenate([a, b.replace(extras={})])
-    with pytest.raises(DataError, match="nothing to concatenate"):
+    with pytest.raises(DataError, match="no data sets to concatenate"):
         Dataset.concatenate([])
 
 

@@ -33,6 +33,30 @@ def test_equals_the_exact_likelihood_where_inducing_points_are_the_data() -> Non
     assert float(sparse.detach()) > float(exact) - 1e-6
 
 
+def test_gradient_equals_the_exact_one_where_inducing_points_are_the_data() -> None:
+    """In hyperparameters, operators and targets, by two closed forms that share no formula."""
+    block, params = rows(20), parameters()
+    leaves = [x.clone().requires_grad_() for x in (*params.values(), *block.operators, block.target)]
+    moved = Block(block.features, tuple(leaves[-3:-1]), leaves[-1])
+    named = dict(zip(params, leaves, strict=False))
+    sparse = negative_bound(PROCESSES, named, [moved], list(block.features))
+    exact, _ = negative_log_likelihood(PROCESSES, named, [moved])
+    pairs = zip(torch.autograd.grad(sparse, leaves), torch.autograd.grad(exact, leaves), strict=True)
+    for one, other in pairs:
+        assert torch.allclose(one, other, rtol=1e-8, atol=1e-8)
+
+
+def test_components_may_have_inputs_of_their_own() -> None:
+    block, params = rows(15), parameters()
+    generator = torch.Generator().manual_seed(4)
+    own = torch.randn(15, 2, 2, generator=generator, dtype=torch.float64)
+    features = ({**block.features[0], "q": own}, block.features[1])
+    block = Block(features, block.operators, block.target)
+    exact, _ = negative_log_likelihood(PROCESSES, params, [block])
+    sparse = negative_bound(PROCESSES, params, [block], list(block.features))
+    assert float(sparse) == pytest.approx(float(exact), abs=1e-6)
+
+
 def test_bound_falls_as_points_are_added() -> None:
     block, params = rows(40), parameters()
     values = [float(negative_bound(PROCESSES, params, [block], first(block, m))) for m in (4, 8, 16, 32)]

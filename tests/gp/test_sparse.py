@@ -10,6 +10,7 @@ from torch import Tensor
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.blocks import rows_of
+from forcegp.gp.bound import bound_of
 from forcegp.gp.kernels import sub
 from forcegp.gp.likelihood import condition
 from forcegp.gp.sparse import SparsePosterior, condition_sparse
@@ -185,3 +186,12 @@ def test_diagnostics_tell_when_more_points_would_help() -> None:
     smoother = Phi @ np.linalg.solve(A, Phi.T)
     assert many.diagnostics.learned == pytest.approx(np.trace(smoother), rel=1e-6)
     assert many.diagnostics.residual == pytest.approx(((y - smoother @ y) ** 2).mean(), rel=1e-6)
+
+
+def test_bound_follows_updates() -> None:
+    old, more = rows(30), rows(4, r=2, seed=1)
+    Z = first(rows(12, seed=5), 12)
+    posterior, params = fitted([old], Z)
+    dense = textbook([old, more], Z, params).negative_bound()
+    updated = posterior.updated([more])
+    assert float(bound_of(updated.sums, updated)) == pytest.approx(dense, rel=1e-9)

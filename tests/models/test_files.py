@@ -139,7 +139,7 @@ def test_a_flipped_bit_is_noticed(saved: Callable[[str], Path], tmp_path: Path) 
         ("gp", "settings.noise_std", [0.1, -1.0], "'settings.noise_std"),
         ("gp", "settings.colour", "red", "'settings.colour'"),
         ("nn", "settings.hidden", [81], "'network.0.weight' does not fit"),
-        ("nn", "settings.hidden", [0], "does not fit"),
+        ("nn", "settings.hidden", [0], "at least one unit"),
         ("analytical", "settings.learn", {"weight": []}, "unknown quantity"),
         ("analytical", "settings.relative", None, "'settings.relative'"),
         ("analytical", "system.robot.parents", [0] * 7, "system.robot.parents.0"),

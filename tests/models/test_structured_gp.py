@@ -470,7 +470,7 @@ class Interrupted(Exception):
 def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data, path = logged(two_contacts(), 12), tmp_path / "fit.safetensors"
     monkeypatch.setattr("forcegp.storage.checkpoint.INTERVAL", 0.0)
-    seen: list[float] = []
+    options, seen = forcegp.LearningOptions(max_evaluations=12), list[float]()
 
     def stop(evaluations: int, most: int, value: float) -> None:
         seen.append(value)
@@ -479,17 +479,22 @@ def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.M
 
     model = forcegp.StructuredGP(two_contacts())
     with pytest.raises(Interrupted):
-        model.fit(data, progress=stop, checkpoint=path)
+        model.fit(data, options=options, progress=stop, checkpoint=path)
     assert path.is_file()
     again: list[float] = []
-    model.fit(data, progress=lambda e, m, value: again.append(value), checkpoint=path)
-    assert again[0] == pytest.approx(min(seen), rel=1e-9)
+    note = lambda done, most, value: again.append(value)  # noqa: E731
+    resumed = model.fit(data, options=options, progress=note, checkpoint=path)
+    assert again[: len(seen)] == seen
     assert not path.exists()
+    whole = forcegp.StructuredGP(two_contacts()).fit(data, options=options)
+    assert resumed.history == whole.history
+    assert all(torch.equal(x, resumed.hyperparameters[key]) for key, x in whole.hyperparameters.items())
 
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fit.safetensors"
-    Checkpoint(path, "another").noting(None)(1, 0.0, {"joint.log_std": torch.zeros(7, dtype=torch.float64)})
+    start = {"joint.log_std": torch.zeros(7, dtype=torch.float64)}
+    Checkpoint(path, "another").recorded(lambda tensors: tensors["joint.log_std"].sum())(start)
     with pytest.raises(ModelError, match="belongs to another fit"):
         forcegp.StructuredGP(two_contacts()).fit(logged(two_contacts(), 5), checkpoint=path)
     path.write_bytes(b"not a checkpoint")

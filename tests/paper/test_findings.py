@@ -101,6 +101,15 @@ def test_the_papers_curves_are_compared_with_the_papers_kernel() -> None:
     assert "With our default kernels 0.090 at N = 200" in found.text
 
 
+def test_tables_put_the_papers_numbers_beside_the_papers_kernel() -> None:
+    own = [score("sgp-mean-se", 200, split) for split in ("selection", "stretches")]
+    both = results([*results().scores, *own])
+    rows = {row[0]: row[-1] for row in error_table(both, PAPER).rows}
+    assert rows["S-GP, analytical mean"] == "–" and rows["S-GP, analytical mean, paper's kernel"] == "0.094"
+    names = [row[0] for row in curve_table(both, PAPER, "noisy").rows]
+    assert names[-1] == "S-GP, analytical mean, paper" and "paper's kernel" in names[-2]
+
+
 def test_the_overview_has_a_row_per_main_model() -> None:
     table = overview_table(results())
     assert [row[0] for row in table.rows][-1] == "S-GP, mean and contact prior"

@@ -38,7 +38,6 @@ TEN_SECONDS = Profile(
     rollout_seconds=1.0,
     rollout_starts=2,
     rollout_samples=3,
-    calibration_starts=4,
 )
 
 pytestmark = pytest.mark.slow

@@ -31,14 +31,17 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
             found.append(
                 Finding(kind, f"time {word} in {describe(rows)}", rows, evidence={"steps": mask.sum()})
             )
-    repeated = np.concatenate([[False], log.steps == 0.0])
-    return found, log.mask(repeated) if repeated.any() else log
+    wrong = np.concatenate([[False], log.steps <= 0.0])
+    return found, log.mask(wrong) if found else log
 
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
     """Steps that are longer than the clock's jitter allows: samples are missing."""
     with np.errstate(invalid="ignore"):
         gaps = log.steps > log.longest_step
+    if log.masked is not None:
+        # The step after a wrong time stamp is long because of that stamp.
+        gaps &= ~log.masked[:-1]
     if not gaps.any() or not log.header.ordered:
         return [], log
     rows, longest = _after(gaps), float(np.nanmax(log.steps))

@@ -113,7 +113,7 @@ def _placement(
 
 
 def _fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
-    """Offset in the middle of the path [m], slope along the surface `(3,)`, and the distance they make `(n,)`.
+    """Offset in the middle of the path [m], slope along the surface `(3,)`, distance they make `(n,)`.
 
     Rows that stay off the fit, such as those labelled too early, are trimmed round by round.
     """
@@ -151,7 +151,7 @@ def _labels(
     touch: float,
     log: Log,
 ) -> list[Finding]:
-    """Rows labelled closed off the surface, by where in the interval they lie, and open ones that slide on it."""
+    """Rows labelled closed off the surface, by their place in the interval, and open ones that slide."""
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     off = closed & (np.abs(c) > touch)
     runs: dict[str, list[tuple[int, int]]] = {"contact-early": [], "contact-late": [], "contact-far": []}
@@ -171,7 +171,8 @@ def _labels(
         if spans:
             rows: Intervals = tuple(spans)
             most = max(float(np.abs(c[a:b]).max()) for a, b in rows)
-            text = f"contact {contact.name!r} is {texts[kind]}, by up to {1e3 * most:.3g} mm, in {describe(rows)}"
+            where = f"by up to {1e3 * most:.3g} mm, in {describe(rows)}"
+            text = f"contact {contact.name!r} is {texts[kind]}, {where}"
             found.append(Finding(kind, text, rows, contact=contact.name, evidence={"distance_m": most}))
     return [*found, *_missed(contact, path, usable & ~closed, c, touch, log)]
 

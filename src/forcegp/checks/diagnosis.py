@@ -8,6 +8,7 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import Fit
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.checks.log import Log
+from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
 
 CURRENT = 1.6
@@ -22,34 +23,47 @@ SIGNIFICANT = 3.0
 
 SMALL_ANGLE = np.radians(0.5)
 """Encoder offsets below this are within calibration, or an error of a centre of mass [rad]."""
-SMALL_GAIN = 0.05
-"""Gains closer to 1 than this are within the accuracy of torque sensors and masses."""
+SMALL_GAIN = 0.2
+"""Gains closer to 1 than this may as well be errors of the masses of a robot file."""
+EXPLAINED = 0.3
+"""Share of the torque that a gain may leave unexplained."""
+SMALL_TILT = 1.0
+"""Bases are levelled to better than this [degrees]."""
+SMALL_GRAVITY = 0.05
+"""Share of gravity below which a change of its size is an error of the masses."""
 
 
-def plausible(hypothesis: Hypothesis, fit: Fit) -> bool:
-    """Whether the parameters of a hypothesis are what it says: a tool has a mass, an offset is not a trifle."""
+def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: Fit) -> bool:
+    """Whether the parameters are what a hypothesis says: a tool has a mass, an offset is not a trifle."""
     if hypothesis.name == "encoder-offset":
         return bool(abs(fit.theta[0]) > max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0]))
     if hypothesis.name == "gains":
-        return bool((np.abs(fit.theta[: len(hypothesis.joints)]) > SMALL_GAIN).any())
+        joints = list(hypothesis.joints)
+        # A gain that only makes the torque larger than its error explains nothing.
+        explained = float(np.median(fit.relative[joints])) < EXPLAINED
+        return explained and bool((np.abs(fit.theta[: len(joints)]) > SMALL_GAIN).any())
+    if hypothesis.name == "gravity":
+        assumed = system.robot.gravity.numpy()
+        angle, size = _turn(assumed, assumed + fit.theta[:3])
+        return angle > SMALL_TILT or abs(size - 1.0) > SMALL_GRAVITY
     if hypothesis.name == "payload":
         return bool(fit.theta[0] > SIGNIFICANT * fit.spread[0])
     return True
 
 
-def corrected(hypothesis: Hypothesis, fit: Fit) -> Log | None:
-    """The log without the fault, or `None` where the robot is at fault."""
-    log, joints = hypothesis.log, list(hypothesis.joints)
+def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
+    """The log without the fault; unchanged where the robot is at fault."""
+    joints = list(hypothesis.joints)
     if hypothesis.name == "gains":
         tau = log.tau.copy()
         # r = u − τ = g τ: the right torque is (1 + g) τ.
-        tau[:, joints] *= 1.0 + fit.theta[: len(joints)]
+        tau[:, joints] *= 1.0 + theta[: len(joints)]
         return log.replace(tau=tau)
     if hypothesis.name == "encoder-offset":
         q = log.q.copy()
-        q[:, joints] += fit.theta[:1]
+        q[:, joints] += theta[:1]
         return log.replace(q=q)
-    return log if hypothesis.columns is None else None
+    return hypothesis.change(log)
 
 
 def finding_of(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> list[Finding]:
@@ -84,7 +98,7 @@ def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit
     evidence = {f"factor {name}": gain for name, gain in zip(names, gains, strict=True)}
     listed = ", ".join(f"{name} {gain:.3g}" for name, gain in zip(names, gains, strict=True))
     factor = np.exp(np.abs(np.log(np.abs(gains) + 1e-12)))
-    if len(names) > 1 and np.median(factor) > CURRENT:
+    if 2 * len(names) > log.nq > 1 and np.median(factor) > CURRENT:
         text = f"torques fit when multiplied by {listed}: currents, or torques on the motor side"
         return Finding("torque-current", text, log.all_rows, names, evidence=evidence)
     off = [k for k in range(len(names)) if factor[k] > 1.05]
@@ -106,16 +120,23 @@ def _encoder(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: F
 def _gravity(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
     assumed = system.robot.gravity.numpy()
     found = assumed + fit.theta[:3]
-    size, given = np.linalg.norm(found), np.linalg.norm(assumed)
-    angle = float(np.degrees(np.arccos(np.clip(found @ assumed / max(size * given, 1e-12), -1.0, 1.0))))
+    given = float(np.linalg.norm(assumed))
+    angle, size = _turn(assumed, found)
     evidence = {"angle_deg": angle, **{f"g{axis}": value for axis, value in zip("xyz", found, strict=True)}}
     vector = ", ".join(f"{value:.3g}" for value in found)
-    if given > 0.0 and size < WEIGHTLESS * given:
+    if given > 0.0 and size < WEIGHTLESS:
         text = "the torque holds no gravity: a torque with gravity compensation taken off"
         return Finding("torque-without-gravity", text, log.all_rows, log.joint_names, evidence=evidence)
     tilted = given > 0.0 and angle <= TILT
     text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"
     return Finding("base-tilted" if tilted else "gravity-direction", text, log.all_rows, evidence=evidence)
+
+
+def _turn(assumed: Array, found: Array) -> tuple[float, float]:
+    """Angle between two vectors in degrees, and the length of the second over that of the first."""
+    lengths = float(np.linalg.norm(assumed)), float(np.linalg.norm(found))
+    cosine = found @ assumed / max(lengths[0] * lengths[1], 1e-12)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), lengths[1] / max(lengths[0], 1e-12)
 
 
 def _payload(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:

@@ -14,7 +14,7 @@ from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
 from forcegp.identification import base_parameters, regressor
 
-STILL = 0.02
+STILL = 0.05
 """Range of motion below which a joint does not move [rad, m]."""
 REVERSALS = 4
 """Changes of direction that tell Coulomb friction from an offset of the torque."""
@@ -24,6 +24,8 @@ SHORT_SECONDS = 2.0
 """Length of a log below which little is learned [s]."""
 ROWS = 1000
 """Rows of which the regressor is made."""
+LOOK = 0.1
+"""Time after which the torque says something new [s]."""
 LEARNED = 0.5
 """Standard deviation after the log, as a share of that before it, below which a parameter is identified."""
 
@@ -37,7 +39,7 @@ def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
     return [Finding("log-short", text, log.all_rows, evidence={"seconds": seconds})], log
 
 
-def _still(log: Log) -> np.ndarray:
+def still_joints(log: Log) -> np.ndarray:
     """`(nq,)` bool, joints that stay within a hair of one position."""
     q = log.q[log.usable]
     return np.ptp(np.percentile(q, (0.5, 99.5), axis=0), axis=0) < STILL if len(q) else np.zeros(log.nq, bool)
@@ -45,7 +47,7 @@ def _still(log: Log) -> np.ndarray:
 
 def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     """Joints that do not move, or hardly ever change direction."""
-    still, found = _still(log), []
+    still, found = still_joints(log), []
     if still.any():
         joints = tuple(log.joint_names[j] for j in np.flatnonzero(still))
         text = f"{', '.join(joints)} moves by less than {STILL} rad: its friction and inertia are not seen"
@@ -53,15 +55,17 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     if not log.header.ordered:
         return found, log
     turns = np.zeros(log.nq, int)
+    fast = HYSTERESIS * np.percentile(np.abs(log.qd[log.usable]), 99, axis=0)
     for s in log.stretches:
         for j in range(log.nq):
             x = log.qd[s][:, j]
-            direction = np.sign(x[np.abs(x) > HYSTERESIS * np.abs(log.qd[log.usable, j]).max()])
+            direction = np.sign(x[np.abs(x) > fast[j]])
             turns[j] += int((np.diff(direction) != 0).sum())
     few = (turns < REVERSALS) & ~still
     if few.any():
         joints = tuple(log.joint_names[j] for j in np.flatnonzero(few))
-        text = f"{', '.join(joints)} changes direction fewer than {REVERSALS} times: friction looks like an offset"
+        why = "friction looks like an offset"
+        text = f"{', '.join(joints)} changes direction fewer than {REVERSALS} times: {why}"
         found.append(Finding("few-reversals", text, log.all_rows, joints))
     return found, log
 
@@ -69,7 +73,7 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
 def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
     """Base parameters that the torque would not sharpen, and the motion that is missing for them."""
     rows = log.rows(ROWS)
-    if len(rows) < 50 or _still(log).all():
+    if len(rows) < 50 or still_joints(log).all():
         return [], log
     sharpness, names, columns = _sharpness(system, log, rows)
     weak = sharpness > LEARNED
@@ -91,8 +95,8 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
     """Standard deviation of each base parameter after the log over that before it.
 
-    Before: the robot file, with masses known to 30 % and centres of mass to 0.1 m. After: that and the torques
-    of the rows, with noise of a hundredth of each joint's torque.
+    Before: the robot file, with masses known to 30 % and centres of mass to 0.1 m. After: that and the
+    torques of the rows, with noise of a hundredth of each joint's torque.
     """
     robot = system.robot
     base = base_parameters(robot)
@@ -105,9 +109,9 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     share = np.array([MASS_SHARE, *[MOMENT_ARM] * 3, *[MOMENT_ARM**2] * 6])
     prior = (mass[:, None] * share).ravel()[columns]
     A = (Y / noise[:, None]).reshape(-1, len(columns)) * prior
-    # Neighbouring rows tell the same: the log counts as independent looks of a tenth of a second.
-    looks = max(1.0, len(rows) * min(1.0, 10.0 * log.dt * len(log) / max(len(rows), 1) / max(len(rows), 1)))
-    gram = A.T @ A * (min(looks, len(rows)) / len(rows))
+    # Neighbouring rows tell the same: the log counts as one look per tenth of a second.
+    looks = int(log.usable.sum()) * log.dt / LOOK if log.header.ordered else len(rows)
+    gram = A.T @ A * (looks / len(rows))
     after = np.linalg.inv(gram + np.eye(len(columns)))
     return np.sqrt(np.diag(after)), base.names, columns
 

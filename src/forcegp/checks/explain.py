@@ -1,4 +1,4 @@
-"""Which one fault explains the torque best: greedy choice by cross-validation with the one-standard-error rule.
+"""Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
 
 Round by round the simplest hypothesis within one standard error of the best is taken (Breiman, Friedman,
 Olshen, Stone, *Classification and Regression Trees*, 1984, sec. 3.4.3), as long as it lowers the held-out
@@ -8,25 +8,41 @@ second fault, so that one fault does not show as several.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from forcegp.checks.diagnosis import corrected, finding_of, plausible
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import Fit, Problem, cross_validate, gain_of
-from forcegp.checks.hypotheses import LAGS, Hypothesis, continuous, discrete, problem_of, with_log
+from forcegp.checks.hypotheses import (
+    LAGS,
+    ROBOT,
+    Hypothesis,
+    continuous,
+    discrete,
+    encoder_hypothesis,
+    gain_hypothesis,
+    problem_of,
+    robot_hypotheses,
+    with_log,
+)
 from forcegp.checks.log import Log
 from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
 
 ROWS = 1600
 """Rows that hypotheses are tested on."""
+SCREENING = 4
+"""Share of these rows, as its inverse, on which hypotheses must do better first."""
 ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
 """Standard errors by which the held-out score must drop; there are about a hundred hypotheses."""
+SHARE = 0.03
+"""Share of the best drop that a simpler hypothesis may leave to a second round."""
 MATERIAL = 0.15
 """Drop of Σ_j log error that matters: 14 % less error in one joint."""
 MATERIAL_EACH = 0.05
@@ -40,6 +56,7 @@ class Explanation:
     Attributes:
         findings: faults found, the most telling first.
         log: the log without them.
+        repairs: what takes the faults out of a log, in order.
         problem: the torques that remain, over `rows`.
         robot: names of the accepted hypotheses about the robot, which stay in the model.
         columns, prior: their columns, and how large their parameters may be.
@@ -49,6 +66,7 @@ class Explanation:
 
     findings: list[Finding]
     log: Log
+    repairs: tuple[Callable[[Log], Log], ...]
     problem: Problem
     robot: tuple[str, ...]
     columns: Array
@@ -62,7 +80,7 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     rows = log.rows(ROWS, margin=max(LAGS))
     problem = _weighed(problem_of(system, log, rows))
     kept, prior = np.zeros((*problem.r.shape, 0)), np.zeros(0)
-    findings, taken, robot = [], set(), ()
+    findings, taken, robot, repairs = [], set(), (), []
     for _ in range(ROUNDS):
         chosen = _best(system, log, rows, problem, kept, prior, taken)
         if chosen is None:
@@ -71,16 +89,32 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
         found = finding_of(system, log, hypothesis, fit)
         findings += found
         taken.add((hypothesis.name, hypothesis.joints))
-        fixed = corrected(hypothesis, fit)
-        if fixed is not None:
-            log = fixed
+        if hypothesis.name not in ROBOT:
+            theta = fit.theta
+            if hypothesis.name == "encoder-offset":
+                theta = _refined(system, log, rows, problem, hypothesis, theta[:1])
+            repairs.append(partial(corrected, hypothesis=hypothesis, theta=theta))
+            log = repairs[-1](log)
             problem = _weighed(problem_of(system, log, rows), kept, prior)
         else:
             assert hypothesis.columns is not None and hypothesis.prior is not None
             kept = np.concatenate([hypothesis.columns, kept], axis=-1)
             prior = np.concatenate([hypothesis.prior, prior])
             problem, robot = _weighed(problem, kept, prior), (hypothesis.name, *robot)
-    return Explanation(findings, log, problem, robot, kept, prior, cross_validate(problem, kept, prior), rows)
+    return Explanation(
+        findings, log, tuple(repairs), problem, robot, kept, prior, cross_validate(problem, kept, prior), rows
+    )
+
+
+def _refined(
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem, found: Hypothesis, theta: Array
+) -> Array:
+    """An encoder offset after two more Gauss-Newton steps, as its effect on the torque is not linear."""
+    for _ in range(2):
+        moved = corrected(log, found, theta)
+        again = encoder_hypothesis(system, moved, rows, found.joints[0])
+        theta = theta + cross_validate(with_log(problem, system, moved, rows), again.columns).theta
+    return theta
 
 
 def _weighed(problem: Problem, columns: Array | None = None, prior: Array | None = None) -> Problem:
@@ -111,18 +145,16 @@ def _best(
     ]
     good = []
     for hypothesis, fit in tried:
-        gain, error = gain_of(fit.score, null.score)
-        concerned = len(hypothesis.joints) or log.nq
-        least = max(MATERIAL, MATERIAL_EACH * concerned)
-        if gain > least and gain > SIGNIFICANT * error and plausible(hypothesis, fit):
+        gain = gain_of(fit.score, null.score)
+        if _significant(gain, len(hypothesis.joints) or log.nq) and plausible(system, hypothesis, fit):
             good.append((hypothesis, fit))
     if not good:
         return None
     best = min(good, key=lambda pair: pair[1].score.mean())
-    near = []
+    most, near = gain_of(best[1].score, null.score)[0], []
     for hypothesis, fit in good:
         loss, error = gain_of(best[1].score, fit.score)
-        if loss <= error + 1e-9:
+        if loss <= max(error, SHARE * most) + 1e-9:
             near.append((hypothesis, fit))
     return min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
 
@@ -131,13 +163,41 @@ def _fits(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: Array
 ) -> Iterator[tuple[Hypothesis, Fit]]:
     # Once the robot is at fault and its parameters are free, they bend to any sign and order.
-    for hypothesis in discrete(log) if not len(prior) else ():
-        changed = with_log(problem, system, hypothesis.log, rows)
-        yield hypothesis, cross_validate(changed, kept, prior)
-    for hypothesis in continuous(system, log, rows):
-        if len(prior) and hypothesis.joints:
-            continue
-        assert hypothesis.columns is not None and hypothesis.prior is not None
-        columns = np.concatenate([hypothesis.columns, kept], axis=-1)
-        gains = hypothesis.joints if hypothesis.name == "gains" else ()
-        yield hypothesis, cross_validate(problem, columns, np.concatenate([hypothesis.prior, prior]), gains)
+    for hypothesis in _promising(system, log, rows, problem) if not len(prior) else ():
+        changed = with_log(problem, system, hypothesis.change(log), rows)
+        yield hypothesis, cross_validate(changed)
+    tried = continuous(system, log, rows) if not len(prior) else robot_hypotheses(system, log, rows)
+    null, off = cross_validate(problem, kept, prior).score, []
+    for hypothesis in tried:
+        fit = _fit(problem, hypothesis, kept, prior)
+        yield hypothesis, fit
+        if hypothesis.name == "gains" and _significant(gain_of(fit.score, null), 1):
+            off += hypothesis.joints
+    if len(off) > 1:
+        together = gain_hypothesis(log, rows, tuple(off))
+        yield together, _fit(problem, together, kept, prior)
+
+
+def _fit(problem: Problem, hypothesis: Hypothesis, kept: Array, prior: Array) -> Fit:
+    """A hypothesis with parameters, beside those that the model holds already."""
+    assert hypothesis.columns is not None and hypothesis.prior is not None
+    columns = np.concatenate([hypothesis.columns, kept], axis=-1)
+    gains = hypothesis.joints if hypothesis.name == "gains" else ()
+    return cross_validate(problem, columns, np.concatenate([hypothesis.prior, prior]), gains)
+
+
+def _significant(gain: tuple[float, float], concerned: int) -> bool:
+    """Whether a drop of the score matters for the number of joints concerned, and is no chance."""
+    least = max(MATERIAL, MATERIAL_EACH * concerned)
+    return gain[0] > least and gain[0] > SIGNIFICANT * gain[1]
+
+
+def _promising(
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem
+) -> Iterator[Hypothesis]:
+    """Hypotheses without parameters that lower the error on a part of the rows."""
+    few = rows[::SCREENING]
+    null = cross_validate(with_log(problem, system, log, few)).score.mean()
+    for hypothesis in discrete(log):
+        if cross_validate(with_log(problem, system, hypothesis.change(log), few)).score.mean() < null:
+            yield hypothesis

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, SupportsFloat
 
 from forcegp.checks.kinds import KINDS
 from forcegp.errors import UnknownNameError
@@ -38,7 +38,7 @@ class Finding:
     intervals: Intervals
     joints: tuple[str, ...] = ()
     contact: str | None = None
-    evidence: Mapping[str, float] = field(default_factory=dict)
+    evidence: Mapping[str, SupportsFloat] = field(default_factory=dict)
     weight: Severity | None = None
 
     def __post_init__(self) -> None:

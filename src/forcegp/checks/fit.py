@@ -1,4 +1,4 @@
-"""How well a hypothesis explains the torque: least squares on all blocks of a log but one, tested on that one."""
+"""How well a hypothesis explains the torque: least squares on all blocks of a log but one."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from forcegp.checks.statistics import Array
 
 BLOCKS = 8
 """Contiguous parts of the log, each held out once."""
-FLOOR = 0.01
-"""Errors below this share of a joint's torque do not matter."""
+FLOOR = 0.03
+"""Errors below this share of a joint's torque do not matter: robot files are no better."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Fit:
         theta: `(p,)` parameters of the hypothesis, from all blocks.
         spread: `(p,)` their standard deviation, by the jackknife over blocks.
         known: parameters of the nuisance columns.
+        relative: `(nq,)` held-out error of the typical block over the size of the torque.
         score: `(blocks,)` Σ_j log(error_j / size_j), with a floor where errors do not matter.
     """
 
@@ -50,6 +51,7 @@ class Fit:
     theta: Array
     spread: Array
     known: Array
+    relative: Array
     score: Array
 
 
@@ -102,8 +104,9 @@ def cross_validate(
     theta = (whole / unit)[:p]
     # An error counts in relation to the torque: a gain of zero explains a noisy torque, and nothing.
     size = problem.size * np.abs(1.0 + gains_of(theta, gains, len(problem.size))) + 1e-12
-    score = 0.5 * np.log((error * problem.scale / size) ** 2 + FLOOR**2).sum(axis=1)
-    return Fit(error, theta, (spread / unit)[:p], (whole / unit)[p:], score)
+    relative = error * problem.scale / size
+    score = 0.5 * np.log(relative**2 + FLOOR**2).sum(axis=1)
+    return Fit(error, theta, (spread / unit)[:p], (whole / unit)[p:], np.median(relative, axis=0), score)
 
 
 def gains_of(theta: Array, joints: tuple[int, ...], nq: int) -> Array:

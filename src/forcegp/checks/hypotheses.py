@@ -1,9 +1,10 @@
-"""What may be wrong with a log or a robot file, one hypothesis each, and the log or the torque that follows."""
+"""What may be wrong with a log or a robot file, one hypothesis each."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -36,7 +37,7 @@ class Hypothesis:
     Attributes:
         name: what is wrong: a kind of finding, or a family of kinds.
         size: number of parameters, discrete choices counted as none.
-        log: the log as it would be, were the hypothesis right.
+        change: makes the log as it would be, were the hypothesis right; parameters come on top.
         columns: `(n, nq, p)` torque that the parameters add to r, if there are any.
         prior: `(p,)` how large the parameters may be.
         joints: indices of the joints concerned.
@@ -45,7 +46,7 @@ class Hypothesis:
 
     name: str
     size: int
-    log: Log
+    change: Callable[[Log], Log]
     columns: Array | None = None
     prior: Array | None = None
     joints: tuple[int, ...] = ()
@@ -77,14 +78,19 @@ def _diagonal(x: Array) -> Array:
     return x[..., None] * np.eye(x.shape[-1])
 
 
-def flipped(log: Log, j: int | slice, *names: str) -> Log:
+def unchanged(log: Log) -> Log:
+    """The log itself."""
+    return log
+
+
+def flipped(log: Log, j: int | slice, names: tuple[str, ...]) -> Log:
     """The log with the sign of some columns changed."""
     sign = np.ones(log.nq)
     sign[j] = -1.0
     return log.replace(**{name: getattr(log, name) * sign for name in names})
 
 
-def swapped(log: Log, i: int, j: int, *names: str) -> Log:
+def swapped(log: Log, i: int, j: int, names: tuple[str, ...]) -> Log:
     """The log with two joints exchanged in some columns."""
     order = np.arange(log.nq)
     order[[i, j]] = j, i
@@ -102,37 +108,40 @@ def delayed(log: Log, shift: int) -> Log:
 
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
-    """Signs, orders, units and delays: explanations without a parameter to fit."""
-    motion = ("q", "qd", "qdd")
+    """Signs, orders and delays: explanations without a parameter to fit."""
+    every, motion, lags = tuple(range(log.nq)), ("q", "qd", "qdd"), LAGS if log.stretches else ()
     if log.nq > 1:
-        yield Hypothesis("torque-sign", 0, flipped(log, slice(None), "tau"), joints=tuple(range(log.nq)))
-    for j in range(log.nq):
-        yield Hypothesis("torque-sign", 0, flipped(log, j, "tau"), joints=(j,))
-        yield Hypothesis("joint-sign", 0, flipped(log, j, *motion, "tau"), joints=(j,))
-        yield Hypothesis("joint-sign", 0, flipped(log, j, *motion), joints=(j,))
-    for i, j in combinations(range(log.nq), 2):
-        yield Hypothesis("torque-order", 0, swapped(log, i, j, "tau"), joints=(i, j))
-        yield Hypothesis("joint-order", 0, swapped(log, i, j, *motion, "tau"), joints=(i, j))
-    if log.stretches:
-        for lag in LAGS:
-            for shift in (lag, -lag):
-                yield Hypothesis("torque-delay", 1, delayed(log, shift), shift=shift)
+        yield Hypothesis("torque-sign", 0, partial(flipped, j=slice(None), names=("tau",)), joints=every)
+    for j in every:
+        yield Hypothesis("torque-sign", 0, partial(flipped, j=j, names=("tau",)), joints=(j,))
+        yield Hypothesis("joint-sign", 0, partial(flipped, j=j, names=(*motion, "tau")), joints=(j,))
+        yield Hypothesis("joint-sign", 0, partial(flipped, j=j, names=motion), joints=(j,))
+    for i, j in combinations(every, 2):
+        yield Hypothesis("torque-order", 0, partial(swapped, i=i, j=j, names=("tau",)), joints=(i, j))
+        yield Hypothesis("joint-order", 0, partial(swapped, i=i, j=j, names=(*motion, "tau")), joints=(i, j))
+    for shift in (sign * lag for lag in lags for sign in (1, -1)):
+        yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Gains, offsets, gravity, tool and masses: explanations with parameters."""
-    q, qd, qdd, tau = tensors(log, rows, "q", "qd", "qdd", "tau")
-    gains = _diagonal(tau.numpy())
-    yield Hypothesis("gains", log.nq, log, gains, np.full(log.nq, 100.0), tuple(range(log.nq)))
+    """Gains, encoder offsets, gravity, tool and masses: explanations with parameters."""
     for j in range(log.nq):
-        yield Hypothesis("gains", 1, log, gains[..., [j]], np.full(1, 100.0), (j,))
-    for j in range(log.nq):
-        columns = _offset_column(system, j, q, qd, qdd)
-        # r = u(q) − τ, and u(q + δ) − τ vanishes: r = −∂u/∂q δ.
-        yield Hypothesis("encoder-offset", 1, log, -columns[..., None], np.full(1, 1.0), (j,))
+        yield gain_hypothesis(log, rows, (j,))
+        yield encoder_hypothesis(system, log, rows, j)
+    yield from robot_hypotheses(system, log, rows)
+
+
+def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypothesis:
+    """The torques of some joints have to be scaled: u − τ = g τ."""
+    columns = _diagonal(log.tau[rows])[..., list(joints)]
+    return Hypothesis("gains", len(joints), unchanged, columns, np.full(len(joints), 100.0), joints)
+
+
+def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
+    """Explanations by the robot file, which leave the log as it is."""
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
-        yield Hypothesis(name, columns.shape[-1], log, columns, prior)
+        yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
 
 
 ROBOT = ("gravity", "payload", "masses")
@@ -140,7 +149,7 @@ ROBOT = ("gravity", "payload", "masses")
 
 
 def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
-    """Torque `(n, nq, p)` per unit of each parameter of the robot that may be off, and how far it may be `(p,)`."""
+    """Torque `(n, nq, p)` per unit of each parameter that may be off, and how far it may be `(p,)`."""
     robot = system.robot
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     if name == "gravity":
@@ -154,6 +163,12 @@ def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: s
     mass = robot.mass.numpy()[:, None]
     share = np.array([MASS_SHARE, *[MOMENT_ARM] * 3, *[MOMENT_ARM**2] * 6])
     return -Y, (np.maximum(mass, 0.01 * mass.max()) * share).ravel()
+
+
+def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j: int) -> Hypothesis:
+    """The encoder of joint j is off by δ: u(q + δ) − τ vanishes, so that r = u(q) − τ = −∂u/∂q δ."""
+    columns = _offset_column(system, j, *tensors(log, rows, "q", "qd", "qdd"))
+    return Hypothesis("encoder-offset", 1, unchanged, -columns[..., None], np.full(1, 1.0), (j,))
 
 
 def _offset_column(system: ConstrainedSystem, j: int, *motion: torch.Tensor) -> Array:

@@ -13,8 +13,8 @@ from forcegp.constraints import ConstrainedSystem
 
 JUMP = 30.0
 """Robust standard deviations beyond which a step is a jump, not noise: fifteen at each of two rows."""
-VISIBLE = 5e-3
-"""A jump also moves the joint by this share of its range, or of its largest speed."""
+FASTEST = 2.0
+"""A jump also exceeds what the fastest joint changes within a step by this factor."""
 
 
 def _surplus(x: Array, rate: Array, log: Log) -> Array:
@@ -35,14 +35,14 @@ def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
     )
     change = np.zeros_like(x)
     change[1:] = np.abs(np.diff(x, axis=0))
-    reach = np.ptp(x[usable], axis=0)
-    big = (np.abs(surplus) > JUMP * scale) & (np.abs(surplus) > VISIBLE * reach)
+    fastest = float(np.percentile(np.abs(rate[usable]), 99.9)) * log.dt
+    big = (np.abs(surplus) > JUMP * scale) & (np.abs(surplus) > FASTEST * fastest)
     # Where the column itself does not change faster than usual, its rate is at fault, not the position.
     return big & (change > JUMP * np.median(change[usable], axis=0)) & usable[:, None]
 
 
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Positions that jump where the velocity does not account for it: rows are missing, or a joint wrapped."""
+    """Positions that jump beyond what the velocity accounts for: rows are missing, or a joint wrapped."""
     if not log.stretches or "qd" in log.derived:
         return [], log
     jumps = _jumps(log.q, log.qd, log)

@@ -228,9 +228,8 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
         f"correlation {level.correlation[j]:.3g}"
     )
     evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
+    found = Finding("acceleration-mismatch", text, log.all_rows, joints, evidence=evidence)
     qdd = log.qdd.copy()
     for s in log.stretches:
         qdd[s, wrong] = np.gradient(log.qd[s][:, wrong], log.t[s], axis=0)
-    return [Finding("acceleration-mismatch", text, log.all_rows, joints, evidence=evidence)], log.replace(
-        qdd=qdd
-    )
+    return [found], log.replace(qdd=qdd, derived=log.derived | {"qdd"})

@@ -16,6 +16,8 @@ SLACK = 1e-3
 """Share of a limit by which it may be exceeded: rounding, and encoders that read a little beyond a stop."""
 CLIPPED_RUN = 3
 """Rows in a row at the same extreme value that make a plateau."""
+OFTENER = 10.0
+"""Factor by which a clipped value occurs more often than its neighbours."""
 OFTEN = 0.05
 """Share of rows beyond the limits from which a wrong unit is considered."""
 
@@ -97,7 +99,7 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
             near = np.abs(usable - extreme) <= 0.01 * np.ptp(usable)
             runs = [(a, b) for a, b in intervals(at) if b - a >= CLIPPED_RUN]
             levels = len(np.unique(usable[near]))
-            if runs and at.sum() > max(0.5 * near.sum(), levels) and extreme != 0.0:
+            if runs and at.sum() > OFTENER * near.sum() / levels and extreme != 0.0:
                 for a, b in runs:
                     clipped[a:b, j] = True
     if not clipped.any():

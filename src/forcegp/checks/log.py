@@ -28,7 +28,7 @@ CLOCK_SPREAD = 10.0
 """A gap also lies this many robust standard deviations of the steps above the median: clocks jitter."""
 SHORTEST = 8
 """Rows of the shortest stretch that is looked at."""
-SMOOTHING = 0.03
+SMOOTHING = 0.1
 """Length of the filter that derives missing accelerations [s]."""
 
 

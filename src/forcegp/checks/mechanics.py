@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from forcegp.checks.clock import Outcome
+from forcegp.checks.excitation import still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of
 from forcegp.checks.hypotheses import friction_columns, robot_columns
 from forcegp.checks.log import Log
 from forcegp.checks.residual import projector, residual
+from forcegp.checks.smooth import smoothed
 from forcegp.checks.statistics import MAD_TO_STD, describe, intervals
 from forcegp.constraints import ConstrainedSystem
 
@@ -28,8 +30,12 @@ TRACE_ROWS = 20_000
 """Rows at which the residual is looked at over time."""
 DISTURBANCE_SECONDS = 0.1
 """Length over which the residual is averaged [s]."""
-DISTURBANCE = 8.0
+DISTURBANCE = 5.0
 """Robust standard deviations of the log residual from which a stretch of time stands out."""
+LOUD = 4.0
+"""Factor over the residual of the worst tenth of the motion from which it stands out as well."""
+MOVING = 0.05
+"""Share of the largest speed from which an arm moves."""
 VISIBLE = 0.1
 """A disturbance is also this share of the joint's torque."""
 
@@ -41,9 +47,16 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     found, log = _without_torque(log)
     if found:
         return found, log
-    told = explain(system, log)
+    smooth = smoothed(log)
+    told = explain(system, smooth)
+    disturbed, rows = _disturbances(system, told)
+    if disturbed:
+        # What happened in these rows must pass neither for friction nor for a mass.
+        told = explain(system, smooth.mask(rows))
     found = [*told.findings, *_friction(told), *_offsets(told), *_unexplained(told)]
-    return [*found, *_disturbances(system, told)], told.log
+    for repair in told.repairs:
+        log = repair(log)
+    return [*found, *disturbed], log
 
 
 def _without_torque(log: Log) -> Outcome:
@@ -89,7 +102,7 @@ def _friction(told: Explanation) -> list[Finding]:
     viscous, coulomb = -told.fit.known[:nq], -told.fit.known[nq : 2 * nq]
     rows = log.qd[told.rows]
     power = (viscous * rows**2 + coulomb * np.abs(rows)).mean(axis=0)
-    there = np.array([_part(told, j, [j, nq + j]).there for j in range(nq)])
+    there = np.array([_part(told, j, [j, nq + j]).there for j in range(nq)]) & ~still_joints(log)
     found = []
     for hit, word in ((there & (power > 0.0), "more"), (there & (power <= 0.0), "less")):
         if not hit.any():
@@ -128,8 +141,8 @@ def _unexplained(told: Explanation) -> list[Finding]:
     return [Finding("torque-unexplained", text, told.log.all_rows, evidence={"share": share})]
 
 
-def _disturbances(system: ConstrainedSystem, told: Explanation) -> list[Finding]:
-    """Times at which far more torque is unexplained than usual."""
+def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Finding], np.ndarray]:
+    """Times at which far more torque is unexplained than usual, and the rows around them."""
     log, rows = told.log, told.log.rows(TRACE_ROWS)
     trace = residual_trace(system, told, rows)
     scale = np.maximum(told.problem.scale, FLOOR * told.problem.size)
@@ -137,22 +150,29 @@ def _disturbances(system: ConstrainedSystem, told: Explanation) -> list[Finding]
     width = max(1, round(DISTURBANCE_SECONDS / stride))
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
-    middle = np.median(level)
-    spread = max(MAD_TO_STD * np.median(np.abs(level - middle)), 0.2)
+    # An arm at rest leaves little unexplained; it is no measure for one that moves.
+    speed = np.abs(log.qd[rows]).max(axis=1)
+    moving = level[speed > MOVING * np.percentile(speed, 99)]
+    middle = np.median(moving)
+    spread = max(MAD_TO_STD * np.median(np.abs(moving - middle)), 0.2)
     visible = (np.abs(trace) > VISIBLE * told.problem.size).any(axis=1)
-    bad = level > middle + DISTURBANCE * spread
+    bad = level > min(middle + DISTURBANCE * spread, np.percentile(moving, 90) + 2.0 * np.log(LOUD))
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)
+    mask = np.zeros(len(log), bool)
     if not spans:
-        return []
+        return [], mask
+    for a, b in spans:
+        mask[rows[max(a - width, 0)] : rows[min(b + width, len(rows)) - 1] + 1] = True
     whole = tuple((int(rows[a]), int(rows[b - 1]) + 1) for a, b in spans)
     worst = int(np.argmax((np.abs(trace) / scale)[bad].max(axis=0)))
     peak = float(np.abs(trace[bad][:, worst]).max())
     text = (
-        f"torque of up to {peak:.3g} N m at {log.joint_names[worst]} that neither robot nor labelled contacts "
-        f"explain, in {describe(whole)}"
+        f"torque of up to {peak:.3g} N m at {log.joint_names[worst]} that neither robot nor labelled "
+        f"contacts explain, in {describe(whole)}"
     )
-    return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence={"peak_Nm": peak})]
+    evidence = {"peak_Nm": peak}
+    return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence=evidence)], mask
 
 
 def residual_trace(system: ConstrainedSystem, told: Explanation, rows: np.ndarray) -> Array:

@@ -68,7 +68,7 @@ def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: 
 
 
 def projector(J: Array, scale: Array) -> Array:
-    """Orthonormal projector on torques r/scale that no force at the touching points can make, `(n, nq, nq)`."""
+    """Projector `(n, nq, nq)` on torques r/scale that no force at the touching points can make."""
     J = J * (1.0 / scale)
     eye = np.broadcast_to(np.eye(J.shape[-1]), (len(J), *2 * (J.shape[-1],))).copy()
     touching = (J != 0.0).any(axis=(1, 2))

@@ -63,23 +63,26 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("length", excitation.check_length),
     ("motion", excitation.check_motion),
     ("noise", noise.check_noise),
-    ("contact", contact.check_contacts),
     ("dynamics", mechanics.check_dynamics),
+    ("contact", contact.check_contacts),
     ("contact force", force.check_forces),
     ("excitation", excitation.check_excitation),
 )
 """Every check in the order in which they run; each sees the log as those before it have corrected it."""
 
-VOIDS = frozenset({"velocity-mismatch"})
-"""Findings after which the dynamics cannot be judged."""
-DYNAMIC = frozenset({"dynamics", "contact force", "excitation"})
+_MOTION = frozenset({"velocity-mismatch"})
+_ROBOT = frozenset(
+    {"gravity-direction", "base-tilted", "payload-missing", "masses-mismatch", "torque-unexplained"}
+)
+VOIDS = {"dynamics": _MOTION, "contact force": _MOTION | _ROBOT, "excitation": _MOTION}
+"""Findings after which a check cannot judge."""
 
 
 def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress | None = None) -> Report:
     """Check a log against a scene before a model is fitted to it.
 
-    Each check is silent on a log that is in order. A fault that is found is undone for the checks after it, so
-    that one fault is reported once; the log itself is not changed.
+    Each check is silent on a log that is in order. A fault that is found is undone for the checks after it,
+    so that one fault is reported once; the log itself is not changed.
 
     Args:
         system: robot and contacts.
@@ -105,14 +108,19 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
     for done, (name, run) in enumerate(CHECKS):
         if progress is not None:
             progress(done, len(CHECKS))
-        void = next((finding.kind for finding in findings if finding.kind in VOIDS), None)
-        if name in DYNAMIC and void:
+        void = next((finding.kind for finding in findings if finding.kind in VOIDS.get(name, ())), None)
+        if void:
             skipped[name] = f"not judged after {void}"
             continue
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
             found, log = run(system, log)
         findings += found
+        if not log.usable.any():
+            text = "no row of the log is usable"
+            findings.append(Finding("log-short", text, log.all_rows, weight="error"))
+            skipped |= {other: "no row is usable" for other, _ in CHECKS[done + 1 :]}
+            break
     order = list(KINDS)
     findings.sort(key=lambda finding: (SEVERITIES.index(finding.severity), order.index(finding.kind)))
     return Report(tuple(findings), samples, system.robot.joint_names, skipped)

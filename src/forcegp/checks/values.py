@@ -15,10 +15,14 @@ HELD_RUN = 2
 """A logger that fails to update repeats a row at least this often before it is reported as held."""
 STUCK_SECONDS = 0.05
 """A channel stands still when it repeats one value for this long while the joint moves [s]."""
+STUCK_VISIBLE = 0.02
+"""Share of its range that a channel should have moved by in that time."""
 SPIKE = 12.0
 """Robust standard deviations beyond which a single value is a spike: never reached by normal noise."""
 SPIKE_ALONE = 4.0
 """Factor by which a spike stands out from the misfit of its neighbours."""
+SPIKE_VISIBLE = (0.01, 0.002)
+"""A spike is also this share of its own column's range, and of the largest range of the joints."""
 COARSE = 0.05
 """Share of the velocity that the steps of an encoder may make up when positions are differentiated."""
 
@@ -70,13 +74,16 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
         for j, joint in enumerate(log.joint_names):
             x = value[:, j]
             steps = np.abs(np.diff(x))
-            usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
             if (steps > 0.0).mean() < 0.1:
                 continue
+            visible = STUCK_VISIBLE * np.ptp(np.percentile(x[log.usable], (0.5, 99.5)))
             runs = [
                 (a, b + 1)
                 for a, b in intervals((steps == 0.0) & log.usable[1:] & log.usable[:-1])
-                if b - a >= least and _expected_change(log, name, j, a, b) > 5.0 * max(usual, 1e-300)
+                if b - a >= least
+                # A torque that stays at its extreme is clipped, which is another finding.
+                and not (name == "tau" and x[a] in (x[log.usable].min(), x[log.usable].max()))
+                and _expected_change(log, name, j, a, b) > visible
             ]
             if runs:
                 spans = tuple(runs)
@@ -90,9 +97,9 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
 def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
     """How far a channel should have moved over rows a to b, judged by the channels of the same joint."""
     if name == "q":
-        return float(np.abs(log.qd[a:b, j]).sum() * log.dt)
+        return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
     if name == "qd":
-        return float(np.abs(log.qdd[a:b, j]).sum() * log.dt)
+        return float(np.ptp(np.cumsum(log.qdd[a:b, j])) * log.dt)
     # Torque and acceleration: as far as they change over as many rows elsewhere, if the arm moves.
     x = getattr(log, name)[:, j]
     lag = b - a
@@ -111,7 +118,14 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
         if len(inner) < 50:
             continue
         scale = robust_std(inner) + resolution(value[log.usable]) + 1e-12 * np.abs(value[log.usable]).max()
-        outlier = (np.abs(own) > SPIKE * scale) & (np.abs(own) > SPIKE_ALONE * around)
+        reach = np.ptp(np.percentile(value[log.usable], (0.5, 99.5), axis=0), axis=0)
+        least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
+        # Next to a contact switch values jump by nature.
+        outlier = (
+            ~_switches(log)[:, None]
+            & (np.abs(own) > np.maximum(SPIKE * scale, least))
+            & (np.abs(own) > SPIKE_ALONE * around)
+        )
         # The neighbours of a spike are off as well, by less.
         for j in np.flatnonzero(outlier.any(axis=0)):
             peak = outlier[:, j] & (np.abs(own[:, j]) >= _neighbour_peak(np.abs(own[:, j])))
@@ -122,6 +136,15 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     rows = intervals(bad)
     text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}: {describe(rows)}"
     return [Finding("spike", text, rows, evidence={"rows": bad.sum()})], log.mask(bad)
+
+
+def _switches(log: Log) -> np.ndarray:
+    """`(n,)` bool, rows within two of a contact switch."""
+    near = np.zeros(len(log), bool)
+    for label in log.contact.values():
+        for k in np.flatnonzero(label[1:] != label[:-1]) + 1:
+            near[max(k - 2, 0) : k + 3] = True
+    return near
 
 
 def _neighbour_peak(x: Array) -> Array:

@@ -7,6 +7,7 @@ import warnings
 
 import typer
 
+from forcegp.cli.check import check
 from forcegp.cli.evaluate import evaluate
 from forcegp.cli.fit import fit
 from forcegp.cli.import_ import import_
@@ -28,7 +29,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (reproduce, simulate, select, fit, predict, evaluate, rollout):
+for command in (reproduce, simulate, check, select, fit, predict, evaluate, rollout):
     app.command()(command)
 app.command("import")(import_)
 

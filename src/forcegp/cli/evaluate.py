@@ -10,41 +10,53 @@ import typer
 from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, progress_bar, read_data, show
 
 WINDOW_SECONDS = 3.0
-"""How much of the data the figures show, as in the paper."""
+"""Length of the plots over time [s], as in the paper."""
 
 
 def evaluate(
     model: ModelFolder,
     data: DataFile,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for figures and a page.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its data.")] = None,
+    train: Annotated[
+        Path | None,
+        typer.Option(
+            help="Data that the trivial predictors are fitted to; default: the other half of the data."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a model's predictions with a data set: errors, coverage, density, constraint residual.
+    """Compare a model's predictions with a data set and with trivial predictors.
 
-    Errors are in rad/s² (m/s² for sliding joints); coverage is the share of samples within two standard
-    deviations. The folder gets a page with the predictions over the first seconds, its figures and their
-    data, and evaluation.json with the scores by joint and the calibration.
+    The trivial predictors are the mean, the robot file alone, and least squares of inertial parameters,
+    viscous and Coulomb friction and offsets. The verdict says whether the model is better than each, in
+    torque and in acceleration. Errors are in rad/s² (m/s² for sliding joints); coverage is the share of
+    samples within two standard deviations.
+
+    With --out, prints the path of a page with the verdict, the errors by joint, the calibration and the
+    predictions over the first seconds, and writes all scores to evaluation.json.
 
     [bold]Examples[/bold]
 
-    forcegp evaluate --model model/ --data test.parquet --out evaluation/
+    forcegp evaluate --model model/ --data test.parquet --train train.parquet --out evaluation/
     """
     from forcegp.evaluation import evaluate as run
     from forcegp.files import write_json
     from forcegp.models.load import load_model
 
     regression = load_model(model)
-    test = data_of_robot(read_data(data), regression.system.robot)
+    robot = regression.system.robot
+    test = data_of_robot(read_data(data), robot)
+    known = None if train is None else data_of_robot(read_data(train), robot)
     with progress_bar("evaluating", len(test)) as progress:
-        result = run(regression, test, progress=progress)
-    figures: dict[str, object] = dict(result.summary())
+        found = run(regression, test, train=known, progress=progress)
+    result: dict[str, object] = {"verdict": found.verdict or "too few samples", **found.summary()}
     if out is not None:
         from forcegp.report.evaluation import write_evaluation
         from forcegp.report.window import opening, predicted_window
 
-        write_json(out / "evaluation.json", result.to_dict())
+        write_json(out / "evaluation.json", found.to_dict())
         window = predicted_window(regression, opening(test, WINDOW_SECONDS), regression.kind)
-        figures["file"] = str(out / "evaluation.json")
-        title = f"Model {model} on {data}"
-        figures["page"] = str(write_evaluation(out, title, result.summary(), window))
-    show(figures, as_json)
+        fitted_to = None if train is None else str(train)
+        page = write_evaluation(out, str(model), str(data), found, window, fitted_to)
+        result |= {"file": str(out / "evaluation.json"), "page": str(page)}
+    show(result, as_json)

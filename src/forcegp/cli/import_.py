@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -30,6 +30,10 @@ def import_(
     ] = None,
     guess: Annotated[
         Path | None, typer.Option(help="Write a mapping to this file for you to check, and import nothing.")
+    ] = None,
+    fit_surface: Annotated[
+        Literal["plane", "sphere"] | None,
+        typer.Option(help="Fit a surface to the path of each contact, and propose it for the scene."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -59,7 +63,10 @@ def import_(
     with progress_bar(f"reading {log.name}", 1) as advance:
         imported = import_log(log, system, mapping, progress=lambda done, total: advance(done, total))
     imported.data.write(out)
-    show(_summary(imported) | {"file": str(out)} if not as_json else _json(imported, out), as_json)
+    result = _json(imported) if as_json else _summary(imported)
+    if fit_surface is not None:
+        result |= _surfaces(imported, system, fit_surface)
+    show(result | {"file": str(out)}, as_json)
 
 
 def _system(scene: str | None, robot: str | None) -> ConstrainedSystem:
@@ -93,18 +100,28 @@ def _summary(imported: Imported) -> dict[str, object]:
     return result | {f"step_{i + 1}": step for i, step in enumerate(report.steps)}
 
 
-def _json(imported: Imported, out: Path) -> dict[str, object]:
+def _surfaces(
+    imported: Imported, system: ConstrainedSystem, kind: Literal["plane", "sphere"]
+) -> dict[str, object]:
+    """The surface of each contact that was closed, as a line for the scene."""
+    from forcegp.logs.surface_fit import fit_surface
+
+    touched = [name for name, closed in imported.data.contact.items() if bool(closed.any())]
+    return {name: fit_surface(imported.data, system, name, kind).toml().strip() for name in touched}
+
+
+def _json(imported: Imported) -> dict[str, object]:
     from dataclasses import asdict
 
     data, report = imported.data, imported.report
     return {
-        "file": str(out),
         "format": report.format,
         "rows_read": report.rows_read,
         "rows": len(data),
         "segments": len(data.segment.unique()),
         "period_s": data.header.dt,
         "noise_std": data.header.noise_std,
+        "contacts": [asdict(evidence) for evidence in imported.contacts],
         "findings": [asdict(finding) for finding in report.findings],
         "steps": report.steps,
     }

@@ -18,6 +18,11 @@ def simulate(
         float | None, typer.Option(help="Simulated time in seconds; default: the scene's.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of motion and noise; default: the scene's.")] = None,
+    engine: Annotated[str | None, typer.Option(help="pybullet, mujoco or auto; default: scene's.")] = None,
+    contact: Annotated[
+        str | None,
+        typer.Option(help="rigid, or solver for MuJoCo's own contact and friction; default: the scene's."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate the robot of a scene as it slides over its surface, and log the motion.
@@ -27,12 +32,14 @@ def simulate(
     forcegp simulate --scene kuka_plane --out run.parquet
 
     forcegp simulate --scene my_scene.toml --duration 10 --seed 3 --out run.parquet
+
+    forcegp simulate --scene ur5_wiping --engine mujoco --contact solver --out run.parquet
     """
     from forcegp.scene import load_scene
     from forcegp.simulate import simulate as run
 
     read = load_scene(scene)
-    changes = {"duration": duration, "seed": seed}
+    changes = {"duration": duration, "seed": seed, "engine": engine, "contact": contact}
     config = replace(read.simulation, **{name: v for name, v in changes.items() if v is not None})
     system = read.system()
     with progress_bar("simulating", config.steps) as progress:

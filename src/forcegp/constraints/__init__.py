@@ -1,10 +1,10 @@
 """Implicit constraints: surfaces, contacts, stabilization, and the constrained equations of motion."""
 
-from forcegp.constraints.baumgarte import Baumgarte
 from forcegp.constraints.contact import Constraint, PointConnection, SurfaceContact
 from forcegp.constraints.gauss import Equations
+from forcegp.constraints.linearization import Linearization
 from forcegp.constraints.surface import Cylinder, ImplicitSurface, Plane, Sphere, Surface, SurfaceSchema
-from forcegp.constraints.system import ConstrainedSystem
+from forcegp.constraints.system import Baumgarte, ConstrainedSystem
 
 __all__ = [
     "Baumgarte",
@@ -13,6 +13,7 @@ __all__ = [
     "Cylinder",
     "Equations",
     "ImplicitSurface",
+    "Linearization",
     "Plane",
     "PointConnection",
     "Sphere",

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from forcegp import kinematics
@@ -17,6 +18,34 @@ from forcegp.constraints.surface import Surface, check_point
 from forcegp.errors import ParameterError
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
+
+Anchor = tuple[str, Sequence[float]]
+"""A frame, and a point in its coordinates [m]."""
+
+
+class MovingPoint(NamedTuple):
+    """The motion of a point fixed in a frame of the robot.
+
+    Attributes:
+        position, velocity: `(*batch, 3)` in the world [m], [m/s].
+        bias: `(*batch, 3)` acceleration at q̈ = 0 [m/s²].
+        jacobian: J `(*batch, 3, nq)`, world axes.
+        turning: ω `(*batch, 3)` of the frame [rad/s].
+        angular: J_ω `(*batch, 3, nq)`.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    bias: Tensor
+    jacobian: Tensor
+    turning: Tensor
+    angular: Tensor
+
+    @classmethod
+    def of(cls, position: Tensor, jacobian: Tensor, bias: Tensor, qd: Tensor) -> MovingPoint:
+        """From the position, the Jacobian `(*batch, 6, nq)` (angular rows first), the bias and q̇."""
+        rate = (jacobian @ qd[..., None])[..., 0]
+        return cls(position, rate[..., 3:], bias, jacobian[..., 3:, :], rate[..., :3], jacobian[..., :3, :])
 
 
 class ContactPoint(NamedTuple):
@@ -56,31 +85,38 @@ class Constraint(ABC):
     name: str
     rows: int
 
+    @property
     @abstractmethod
+    def anchors(self) -> tuple[Anchor, ...]:
+        """The points of the robot that the constraint reads, each with its frame."""
+
+    @abstractmethod
+    def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
+        """c, A and b from the motion of the anchors."""
+
     def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
         """c, A and b at a state whose link motion is known."""
+        return self.terms_of([_moving_point(robot, poses, motion, qd, *anchor) for anchor in self.anchors])
 
     @abstractmethod
     def check(self, robot: RobotModel) -> None:
         """Check that the constraint fits a robot.
 
         Raises:
-            UnknownNameError: a frame is not the robot's.
-            ForceGPError: a point has not three finite coordinates.
+            UnknownNameError: the robot has no such frame.
+            ParameterError: a point does not have three finite coordinates.
         """
 
 
 def _moving_point(
-    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, frame: str, point: Sequence[float]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Position, bias acceleration `(*batch, 6)` and Jacobian `(*batch, 6, nq)` of a point fixed in a frame.
-
-    Angular rows come before linear ones.
-    """
+    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor, frame: str, point: Sequence[float]
+) -> MovingPoint:
+    """The motion of a point fixed in a frame, from the motion of the links."""
     index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
     J = kinematics.jacobian_of_poses(robot, poses, index, x)
-    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)
-    return kinematics.point_of_poses(robot, poses, index, x) + robot.base_position, bias, J
+    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)[..., 3:]
+    position = kinematics.point_of_poses(robot, poses, index, x) + robot.base_position
+    return MovingPoint.of(position, J, bias, qd)
 
 
 @dataclass(frozen=True)
@@ -132,24 +168,30 @@ class SurfaceContact(Constraint):
         robot.frame_index(self.frame)
         check_point(self.point, f"the touching point of {self.name!r}")
 
-    def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
+    @property
+    def anchors(self) -> tuple[Anchor, ...]:
+        return ((self.frame, self.point),)
+
+    def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
+        (tip,) = points
         surface = self.center_surface
-        p, bias, J = _moving_point(robot, poses, motion, self.frame, self.point)
-        v = (J[..., 3:, :] @ qd[..., None])[..., 0]
-        normal = surface.gradient(p)
-        A = normal[..., None, :] @ J[..., 3:, :]
-        b = -((normal * bias[..., 3:]).sum(-1) + surface.curvature(p, v))
-        at = ContactPoint(p, v, J[..., 3:, :], normal)
-        if self.radius:
-            at = _rounded(at, J[..., :3, :], qd, self.radius)
-        return ConstraintTerms(surface.value(p)[..., None], A, b[..., None], at)
+        normal = surface.gradient(tip.position)
+        A = normal[..., None, :] @ tip.jacobian
+        b = -((normal * tip.bias).sum(-1) + surface.curvature(tip.position, tip.velocity))
+        at = self._touching(tip, normal)
+        return ConstraintTerms(surface.value(tip.position)[..., None], A, b[..., None], at)
 
-
-def _rounded(center: ContactPoint, angular: Tensor, qd: Tensor, radius: float) -> ContactPoint:
-    """The material point of a ball that touches, from the ball's centre and angular Jacobian."""
-    arm = -radius * center.normal
-    J = center.jacobian - kinematics.skew(arm) @ angular
-    return ContactPoint(center.position + arm, (J @ qd[..., None])[..., 0], J, center.normal)
+    def _touching(self, tip: MovingPoint, normal: Tensor) -> ContactPoint:
+        """The material point that touches."""
+        if not self.radius:
+            return ContactPoint(tip.position, tip.velocity, tip.jacobian, normal)
+        arm = -self.radius * normal
+        return ContactPoint(
+            tip.position + arm,
+            tip.velocity + kinematics.cross(tip.turning, arm),
+            tip.jacobian - kinematics.skew(arm) @ tip.angular,
+            normal,
+        )
 
 
 @dataclass(frozen=True)
@@ -176,10 +218,15 @@ class PointConnection(Constraint):
         for point in (self.point, self.other_point):
             check_point(point, f"an end of {self.name!r}")
 
-    def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
-        p, bias, J = _moving_point(robot, poses, motion, self.frame, self.point)
-        bias, J = bias[..., 3:], J[..., 3:, :]
+    @property
+    def anchors(self) -> tuple[Anchor, ...]:
+        first = (self.frame, self.point)
+        return (first,) if self.other_frame is None else (first, (self.other_frame, self.other_point))
+
+    def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
+        p, bias, J = points[0].position, points[0].bias, points[0].jacobian
         if self.other_frame is None:
-            return ConstraintTerms(p - kinematics.as_point(robot, self.other_point), J, -bias)
-        p2, bias2, J2 = _moving_point(robot, poses, motion, self.other_frame, self.other_point)
-        return ConstraintTerms(p - p2, J - J2[..., 3:, :], bias2[..., 3:] - bias)
+            place = torch.as_tensor(self.other_point, dtype=p.dtype, device=p.device)
+            return ConstraintTerms(p - place, J, -bias)
+        other = points[1]
+        return ConstraintTerms(p - other.position, J - other.jacobian, other.bias - bias)

@@ -1,21 +1,58 @@
-"""A robot with its constraints, and the equations of motion that follow from them at a state."""
+"""A robot with its constraints and their stabilization, and the equations of motion at a state."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from forcegp import dynamics, kinematics
-from forcegp.constraints.baumgarte import Baumgarte
-from forcegp.constraints.contact import Constraint
+from forcegp.constraints.contact import Constraint, ConstraintTerms
 from forcegp.constraints.gauss import Equations
-from forcegp.errors import ForceGPError, ShapeError, UnknownNameError
+from forcegp.constraints.linearization import Linearization, linearize
+from forcegp.errors import ParameterError, ShapeError, UnknownNameError
+from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
-from forcegp.types import JointVector
+from forcegp.types import ConstraintVector, JointVector
+
+
+@dataclass(frozen=True)
+class Baumgarte:
+    """Makes the constraint error a damped oscillator, c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
+
+    Since c̈ = A q̈ − b, the stabilized right-hand side is b̃ = b − 2ωξ A q̇ − ω² c: the signs that the
+    paper prints in eq. (30) are the opposite ones, with which the error grows.
+
+    Args:
+        natural_frequency: ω > 0 [rad/s].
+        damping_ratio: ξ > 0; 1 is critical damping.
+
+    Raises:
+        ParameterError: a parameter is not positive.
+    """
+
+    natural_frequency: float = 10.0
+    damping_ratio: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("natural_frequency", "damping_ratio"):
+            value = getattr(self, name)
+            if not 0.0 < value < float("inf"):
+                raise ParameterError(
+                    f"Baumgarte's {name} must be positive",
+                    expected="a positive finite number",
+                    got=value,
+                    hint="pass baumgarte=None for no stabilization",
+                )
+
+    def stabilized(self, b: ConstraintVector, c: ConstraintVector, cd: ConstraintVector) -> ConstraintVector:
+        """b̃ = b − 2ωξ ċ − ω² c, `(*batch, m)`."""
+        omega = self.natural_frequency
+        return b - 2.0 * omega * self.damping_ratio * cd - omega**2 * c
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +65,8 @@ class ConstrainedSystem:
         baumgarte: stabilization of the constraint error, or `None`.
 
     Raises:
-        UnknownNameError: a contact names a frame that the robot has not.
-        ForceGPError: two contacts share a name.
+        UnknownNameError: a contact is attached to an unknown frame.
+        ParameterError: two contacts have the same name, or a point is not valid.
     """
 
     robot: RobotModel
@@ -40,7 +77,9 @@ class ConstrainedSystem:
         names = [contact.name for contact in self.contacts]
         for name in names:
             if names.count(name) > 1:
-                raise ForceGPError(f"two contacts are named {name!r}", hint="give each contact its own name")
+                raise ParameterError(
+                    f"two contacts are named {name!r}", hint="give each contact its own name"
+                )
         for contact in self.contacts:
             contact.check(self.robot)
 
@@ -78,6 +117,8 @@ class ConstrainedSystem:
         n, device = len(self.contacts), self.robot.device
         if active is None:
             return torch.ones(*batch, self.m, dtype=torch.bool, device=device)
+        if not isinstance(active, Tensor):
+            raise ShapeError("active is no tensor", expected="a bool tensor", got=type(active).__name__)
         sizes = zip(reversed(active.shape), reversed((*batch, n)), strict=False)
         fits = (
             0 < active.ndim <= len(batch) + 1 and active.shape[-1] == n and all(a in (1, b) for a, b in sizes)
@@ -108,27 +149,93 @@ class ConstrainedSystem:
         poses = kinematics.link_poses(robot, q)
         motion = kinematics.link_motion(robot, poses, qd)
         links = dynamics.link_inertia(robot, poses)
-        terms = {contact.name: contact.terms(robot, poses, motion, qd) for contact in self.contacts}
+        return self._assembled(
+            q,
+            qd,
+            active,
+            self._terms(poses, motion, qd),
+            M=dynamics.mass_matrix_of_poses(robot, poses, links),
+            Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
+            Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
+            poses=poses,
+            motion=motion,
+        )
+
+    def _assembled(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        active: Tensor | None,
+        terms: dict[str, ConstraintTerms],
+        **mechanics: Any,
+    ) -> Equations:
+        """The equations of motion from the constraints' terms and the mechanics of the robot."""
+        c, cd, A, b = self._rows(q, qd, terms, active)
+        return Equations(
+            A=A,
+            b=b,
+            c=c,
+            cd=cd,
+            Q_D=dynamics.damping_force(self.robot, qd),
+            contact_points={name: term.point for name, term in terms.items() if term.point is not None},
+            **mechanics,
+        )
+
+    def linearize(
+        self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
+    ) -> Linearization:
+        """The constrained acceleration and the multiplier with their Jacobians by q, q̇ and force.
+
+        q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) with its exact derivatives. If Q depends on the state, as
+        learned forces do, add `dforce` times the derivative of Q.
+
+        Args:
+            q, qd: `(*batch, nq)` joint positions and velocities.
+            force: `(*batch, nq)` Q, the motor torques and all other forces that the robot file does not know.
+            active: `(*batch, n_contacts)` bool, which contacts are closed in each sample; default all.
+
+        Returns:
+            q̈, λ and their Jacobians, detached from the autograd graph.
+
+        Raises:
+            ShapeError: an argument does not fit.
+
+        Example:
+            >>> import torch, forcegp
+            >>> system = forcegp.load_scene("kuka_plane").system()
+            >>> at = system.linearize(*torch.zeros(3, 7, dtype=torch.float64))
+            >>> at.dq.shape, at.multiplier_dforce.shape
+            (torch.Size([7, 7]), torch.Size([1, 7]))
+        """
+        self.robot.check_state(force=force)
+        if force.shape != q.shape:
+            raise ShapeError("q and force are not one batch", expected=tuple(q.shape), got=tuple(force.shape))
+        with torch.no_grad():
+            eom = self.equations(q, qd, active)
+
+        def rows(q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+            poses = kinematics.link_poses(self.robot, q)
+            terms = self._terms(poses, kinematics.link_motion(self.robot, poses, qd), qd)
+            _, _, A, b = self._rows(q, qd, terms, active)
+            return A, b
+
+        return linearize(self.robot, eom, rows, q, qd, force)
+
+    def _terms(self, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> dict[str, ConstraintTerms]:
+        return {contact.name: contact.terms(self.robot, poses, motion, qd) for contact in self.contacts}
+
+    def _rows(
+        self, q: Tensor, qd: Tensor, terms: dict[str, ConstraintTerms], active: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """c and ċ of all contacts, and the stabilized A and b of the active ones."""
         c, A, b = self._stack(q, list(terms.values()))
         cd = (A @ qd[..., None])[..., 0]
         if self.baumgarte is not None:
             b = self.baumgarte.stabilized(b, c, cd)
         rows = self.active_rows(active, q.shape[:-1])
-        return Equations(
-            M=dynamics.mass_matrix_of_poses(robot, poses, links),
-            A=torch.where(rows[..., None], A, 0.0),
-            b=torch.where(rows, b, 0.0),
-            c=c,
-            cd=cd,
-            Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
-            Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
-            Q_D=dynamics.damping_force(robot, qd),
-            contact_points={name: term.point for name, term in terms.items() if term.point is not None},
-            poses=poses,
-            motion=motion,
-        )
+        return c, cd, torch.where(rows[..., None], A, 0.0), torch.where(rows, b, 0.0)
 
-    def _stack(self, q: Tensor, terms: list) -> tuple[Tensor, Tensor, Tensor]:
+    def _stack(self, q: Tensor, terms: list[ConstraintTerms]) -> tuple[Tensor, Tensor, Tensor]:
         """c, A, b of all contacts, concatenated over rows."""
         if not terms:
             empty = q.new_zeros(*q.shape[:-1], 0)

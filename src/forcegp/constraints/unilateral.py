@@ -3,25 +3,45 @@
 The simulator and rollouts share this file. A closed contact opens where its multiplier would turn negative.
 An open contact closes where c ≤ 0 and ċ < 0, with an inelastic impact. Constraints without a surface, such as
 a connection of two points, hold in both directions and never change.
+
+The formulas take tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.constraints.contact import SurfaceContact
-from forcegp.constraints.gauss import Equations
-from forcegp.constraints.projection import project_velocity
-from forcegp.constraints.system import ConstrainedSystem
-from forcegp.types import ConstraintVector, JointVector
+from forcegp.constraints.contact import Constraint, SurfaceContact
+from forcegp.types import Array
 
 PULL = 1e-9
 """A contact pulls if λ is below minus this [N]; rounding must not open a contact that carries no load."""
 APPROACH = 1e-9
 """A contact is approached if ċ is below minus this [m/s]; after an impact ċ is zero up to rounding."""
+
+
+@runtime_checkable
+class ContactSystem(Protocol):
+    """What contact mechanics ask of a robot with its constraints."""
+
+    @property
+    def contacts(self) -> Sequence[Constraint]:
+        """The constraints."""
+        ...
+
+    @property
+    def m(self) -> int:
+        """Number of constraint rows."""
+        ...
+
+    def equations(self, q: Any, qd: Any, active: Any = None) -> Any:
+        """The equations of motion with the active constraints: `Equations`, or the same of one state."""
+        ...
 
 
 class Landing(NamedTuple):
@@ -34,9 +54,9 @@ class Landing(NamedTuple):
         impact: whether a contact has just closed.
     """
 
-    closed: Tensor
-    qd: JointVector
-    eom: Equations
+    closed: Array
+    qd: Array
+    eom: Any
     impact: bool
 
 
@@ -51,38 +71,39 @@ class ContactForces(NamedTuple):
         Q_D, Q_I, Q_z: `(nq,)` joint friction, and normal and friction force of the contacts [N m].
     """
 
-    closed: Tensor
-    c: ConstraintVector
-    multiplier: ConstraintVector
-    Q: JointVector
-    Q_D: JointVector
-    Q_I: JointVector
-    Q_z: JointVector
+    closed: Array
+    c: Array
+    multiplier: Array
+    Q: Array
+    Q_D: Array
+    Q_I: Array
+    Q_z: Array
 
 
-def can_open(system: ConstrainedSystem) -> Tensor:
-    """Which constraints are contacts with a surface, `(n_contacts,)` bool."""
+def can_open(system: ContactSystem, like: Array) -> Array:
+    """Which constraints are contacts with a surface, `(n_contacts,)` bool, an array like another one."""
     flags = [isinstance(contact, SurfaceContact) for contact in system.contacts]
-    return torch.tensor(flags, dtype=torch.bool, device=system.robot.device)
+    if isinstance(like, Tensor):
+        return torch.tensor(flags, dtype=torch.bool, device=like.device)
+    return np.array(flags, dtype=bool)
 
 
-def rows_of(system: ConstrainedSystem, active: Tensor) -> Tensor:
+def rows_of(system: ContactSystem, active: Tensor) -> Tensor:
     """The rows of the active contacts, `(*batch, m)` bool."""
-    if system.m == len(system.contacts):
-        return active
     repeats = torch.tensor([contact.rows for contact in system.contacts], device=active.device)
     return active.repeat_interleave(repeats, dim=-1)
 
 
-def any_row(system: ConstrainedSystem, rows: Tensor) -> Tensor:
+def any_row(system: ContactSystem, rows: Array) -> Array:
     """Whether any row of each contact is set: `(*batch, n_contacts)` bool from `(*batch, m)` bool."""
     if system.m == len(system.contacts):
         return rows
-    parts = rows.split([contact.rows for contact in system.contacts], dim=-1)
-    return torch.stack([part.any(-1) for part in parts], dim=-1)
+    ends = np.cumsum([contact.rows for contact in system.contacts])
+    parts = [rows[..., end - c.rows : end].any(-1) for c, end in zip(system.contacts, ends, strict=True)]
+    return torch.stack(parts, -1) if isinstance(rows, Tensor) else np.stack(parts, -1)
 
 
-def pulling(system: ConstrainedSystem, active: Tensor, multiplier: ConstraintVector) -> Tensor:
+def pulling(system: ContactSystem, active: Array, multiplier: Array) -> Array:
     """Closed contacts that would have to pull, λ < 0, and therefore open.
 
     Args:
@@ -93,10 +114,10 @@ def pulling(system: ConstrainedSystem, active: Tensor, multiplier: ConstraintVec
     Returns:
         `(*batch, n_contacts)` bool.
     """
-    return any_row(system, multiplier < -PULL) & can_open(system) & active
+    return any_row(system, multiplier < -PULL) & can_open(system, active) & active
 
 
-def reached(system: ConstrainedSystem, active: Tensor, c: ConstraintVector, cd: ConstraintVector) -> Tensor:
+def reached(system: ContactSystem, active: Array, c: Array, cd: Array) -> Array:
     """Open contacts that the robot has reached, c ≤ 0 while ċ < 0, and that therefore close.
 
     Args:
@@ -107,22 +128,19 @@ def reached(system: ConstrainedSystem, active: Tensor, c: ConstraintVector, cd: 
     Returns:
         `(*batch, n_contacts)` bool.
     """
-    return any_row(system, (c <= 0.0) & (cd < -APPROACH)) & can_open(system) & ~active
+    return any_row(system, (c <= 0.0) & (cd < -APPROACH)) & can_open(system, active) & ~active
 
 
-def impact_velocity(
-    system: ConstrainedSystem, q: JointVector, qd: JointVector, active: Tensor
-) -> JointVector:
+def impact_velocity(system: ContactSystem, q: Array, qd: Array, active: Array) -> Array:
     """Velocity `(*batch, nq)` after an inelastic impact without friction on the active contacts.
 
     M (q̇⁺ − q̇⁻) = Aᵀ Λ with A q̇⁺ = 0, so q̇⁺ = T q̇⁻ = q̇⁻ − L A q̇⁻.
     """
-    return project_velocity(system.equations(q, qd, active=active), qd)
+    eom = system.equations(q, qd, active=active)
+    return qd - (eom.L @ (eom.A @ qd[..., None]))[..., 0]
 
 
-def sliding_friction(
-    system: ConstrainedSystem, eom: Equations, active: Tensor, viscous_friction: float
-) -> JointVector:
+def sliding_friction(system: ContactSystem, eom: Any, active: Array, viscous_friction: float) -> Array:
     """Friction of the active contacts: Q_z = Σ J_Eᵀ F_z with F_z = −θ_v (I − n nᵀ) ṗ_E.
 
     Args:
@@ -134,18 +152,18 @@ def sliding_friction(
     Returns:
         `(*batch, nq)` [N m, N].
     """
-    Q_z = torch.zeros_like(eom.Q_C)
+    Q_z = 0.0 * eom.Q_C
     for i, contact in enumerate(system.contacts):
         if contact.name in eom.contact_points:
             at = eom.contact_points[contact.name]
-            n = torch.nn.functional.normalize(at.normal, dim=-1)
-            sliding = at.velocity - (at.velocity * n).sum(-1, keepdim=True) * n
-            force = torch.where(active[..., i, None], -viscous_friction * sliding, 0.0)
-            Q_z = Q_z + (at.jacobian.mT @ force[..., None])[..., 0]
+            n, v = at.normal, at.velocity
+            sliding = v - ((v * n).sum(-1) / (n * n).sum(-1))[..., None] * n
+            force = (-viscous_friction * active[..., i, None]) * sliding
+            Q_z = Q_z + (at.jacobian.swapaxes(-1, -2) @ force[..., None])[..., 0]
     return Q_z
 
 
-def land(system: ConstrainedSystem, q: JointVector, qd: JointVector, closed: Tensor) -> Landing:
+def land(system: ContactSystem, q: Array, qd: Array, closed: Array) -> Landing:
     """Close the contacts that one state `(nq,)` has reached, with their impact."""
     eom = system.equations(q, qd, active=closed)
     new = reached(system, closed, eom.c, eom.cd)
@@ -157,11 +175,11 @@ def land(system: ConstrainedSystem, q: JointVector, qd: JointVector, closed: Ten
 
 
 def contact_forces(
-    system: ConstrainedSystem,
-    q: JointVector,
-    qd: JointVector,
+    system: ContactSystem,
+    q: Array,
+    qd: Array,
     landing: Landing,
-    Q_u: JointVector,
+    Q_u: Array,
     viscous_friction: float,
 ) -> ContactForces:
     """Normal and friction force under the torque Q_u, after every contact that would have to pull has opened.
@@ -180,7 +198,7 @@ def contact_forces(
         multiplier = eom.multiplier(Q + Q_z)
         pulls = pulling(system, closed, multiplier)
         if not bool(pulls.any()):
-            Q_I = (eom.A.mT @ multiplier[:, None])[:, 0]
+            Q_I = (eom.A.T @ multiplier[:, None])[:, 0]
             return ContactForces(closed, eom.c, multiplier, Q, eom.Q_D, Q_I, Q_z)
         closed = closed & ~pulls
         eom = system.equations(q, qd, active=closed)

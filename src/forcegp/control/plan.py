@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +13,6 @@ from torch import Tensor
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.constraints.gauss import Equations
 from forcegp.control.motion import MotionConfig
 from forcegp.control.placement import inverse_kinematics, tool_rotation
 from forcegp.control.task_space import Target
@@ -45,15 +45,20 @@ class Plan:
     targets: Target
     start: Tensor
 
-    def target(self, k: int) -> Target:
-        """The target of sample k."""
-        return Target(*(values[k] for values in self.targets))
+    def arrays(self) -> Target:
+        """The targets as NumPy arrays `(n, …)`."""
+        return Target(*(values.numpy() for values in self.targets))
 
-    def normal(self, eom: Equations) -> Tensor:
-        """Unit normal of the surface under the tool `(*batch, 3)`; zero in free space."""
+    def normal(self, eom: Any) -> Any:
+        """Unit normal of the surface under the tool `(*batch, 3)`; zero in free space.
+
+        Args:
+            eom: the equations of motion of a batch of states, or of one state in NumPy.
+        """
         if self.contact is None:
-            return eom.Q_C.new_zeros(*eom.Q_C.shape[:-1], 3)
-        return torch.nn.functional.normalize(eom.contact_points[self.contact].normal, dim=-1)
+            return 0.0 * eom.Q_C[..., :3]
+        n = eom.contact_points[self.contact].normal
+        return n / ((n * n).sum(-1) ** 0.5)[..., None]
 
 
 def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.Generator) -> Plan:

@@ -3,26 +3,45 @@
 The task is the pose of the tool: 3D position and 3D orientation. A redundant arm moves its elbow in the
 null space of the task's Jacobian, which leaves the error dynamics of the task untouched
 (Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1).
+
+The control law takes tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator,
+where the overhead of tensors would take most of the time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 import torch
+from scipy.linalg import lapack
 from torch import Tensor
 
 from forcegp import kinematics
-from forcegp.constraints.gauss import Equations
 from forcegp.errors import NumericalError
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
-from forcegp.types import JointVector, Rotation, Scalars, Vector3
+from forcegp.types import Array, JointVector
 
 SINGULAR = 1e-3
 """Below this smallest pivot of √(J Jᵀ) the task asks for joint speeds a thousand times its own."""
+
+
+@runtime_checkable
+class RobotForces(Protocol):
+    """What the controller reads from the equations of motion: M and Q_K = Q_C + Q_G + Q_D."""
+
+    @property
+    def M(self) -> Array:
+        """`(*batch, nq, nq)` mass matrix."""
+        ...
+
+    @property
+    def Q_K(self) -> Array:
+        """`(*batch, nq)` the force that the robot file knows, without actuation."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -56,11 +75,11 @@ class ToolMotion(NamedTuple):
         bias: J̇ q̇ `(*batch, 6)`.
     """
 
-    rotation: Tensor
-    position: Tensor
-    twist: Tensor
-    jacobian: Tensor
-    bias: Tensor
+    rotation: Array
+    position: Array
+    twist: Array
+    jacobian: Array
+    bias: Array
 
 
 class Target(NamedTuple):
@@ -73,12 +92,12 @@ class Target(NamedTuple):
         push: `(*batch,)` force that the tool is to exert on the surface it touches, along its normal [N].
     """
 
-    position: Vector3
-    velocity: Vector3
-    acceleration: Vector3
-    rotation: Rotation
-    posture: JointVector
-    push: Scalars
+    position: Array
+    velocity: Array
+    acceleration: Array
+    rotation: Array
+    posture: Array
+    push: Array
 
 
 def tool_motion(
@@ -105,17 +124,27 @@ def tool_motion(
     )
 
 
-def orientation_error(rotation: Rotation, target: Rotation) -> Vector3:
-    """e_O = ½ Σᵢ rᵢ × rᵢᵈ over the axes, sin(angle) times the axis that turns the one onto the other.
+def orientation_error(rotation: Array, target: Array) -> Array:
+    """e_O = ½ Σᵢ rᵢ × rᵢᵈ over the axes, sin(angle) times the axis that turns the first onto the second.
+
+    The sum is the vector of the skew part of R_d Rᵀ.
+
+    Args:
+        rotation, target: `(*batch, 3, 3)` axes of a frame.
+
+    Returns:
+        `(*batch, 3)`, world axes.
 
     Source: Siciliano et al., eq. 3.98.
     """
-    return 0.5 * torch.linalg.cross(rotation, target, dim=-2).sum(-1)
+    E = target @ rotation.swapaxes(-1, -2)
+    skew = E - E.swapaxes(-1, -2)
+    return 0.5 * _package(E).stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
 
-def task_acceleration(tool: ToolMotion, target: Target, gains: Gains) -> Tensor:
+def task_acceleration(tool: ToolMotion, target: Target, gains: Gains) -> Array:
     """[ω̇; p̈] `(*batch, 6)` that makes both errors damped oscillators, ë + k_D ė + k_P e = 0."""
-    omega, velocity = tool.twist.split(3, dim=-1)
+    omega, velocity = tool.twist[..., :3], tool.twist[..., 3:]
     turning = (
         gains.orientation_stiffness * orientation_error(tool.rotation, target.rotation)
         - gains.orientation_damping * omega
@@ -125,10 +154,10 @@ def task_acceleration(tool: ToolMotion, target: Target, gains: Gains) -> Tensor:
         + gains.position_damping * (target.velocity - velocity)
         + gains.position_stiffness * (target.position - tool.position)
     )
-    return torch.cat([turning, moving], dim=-1)
+    return _package(omega).concatenate([turning, moving], -1)
 
 
-def joint_acceleration(tool: ToolMotion, task: Tensor, posture: JointVector) -> JointVector:
+def joint_acceleration(tool: ToolMotion, task: Array, posture: Array) -> Array:
     """y = J⁺(a − J̇q̇) + (I − J⁺J) y₀: the task's acceleration, and the posture's in its null space.
 
     Args:
@@ -136,29 +165,49 @@ def joint_acceleration(tool: ToolMotion, task: Tensor, posture: JointVector) -> 
         task: a `(*batch, 6)` wanted acceleration of the tool.
         posture: y₀ `(*batch, nq)` wanted acceleration of the joints, as far as the task leaves it free.
 
+    Returns:
+        `(*batch, nq)` [rad/s², m/s²].
+
     Raises:
         NumericalError: the arm is singular, so that the task cannot be reached.
     """
     J = tool.jacobian
-    factor, failed = torch.linalg.cholesky_ex(J @ J.mT)
-    if bool(failed.any()) or float(factor.diagonal(dim1=-2, dim2=-1).min()) < SINGULAR:
+    Jt = J.swapaxes(-1, -2)
+    missing = task - tool.bias - (J @ posture[..., None])[..., 0]
+    solved, pivot = _solve(J @ Jt, missing[..., None])
+    if not pivot >= SINGULAR:
         raise NumericalError(
             "the arm is singular: its joints cannot give the tool every velocity",
-            hint="a smaller rectangle, or one nearer to the middle of the workspace",
+            hint="a smaller rectangle, or one nearer to the centre of the workspace",
         )
-    missing = task - tool.bias - (J @ posture[..., None])[..., 0]
-    return posture + (J.mT @ torch.cholesky_solve(missing[..., None], factor))[..., 0]
+    return posture + (Jt @ solved)[..., 0]
+
+
+def _solve(G: Array, x: Array) -> tuple[Array, float]:
+    """G⁻¹ x of symmetric positive definite matrices, and the smallest pivot; 0 if one is not definite."""
+    if isinstance(G, Tensor):
+        factor, failed = torch.linalg.cholesky_ex(G)
+        pivot = 0.0 if bool(failed.any()) else float(factor.diagonal(dim1=-2, dim2=-1).min())
+        return torch.cholesky_solve(x, factor), pivot
+    factor, failed = lapack.dpotrf(G, lower=1)
+    solved, _ = lapack.dpotrs(factor, x, lower=1)
+    return solved, 0.0 if failed else float(factor.diagonal().min())
+
+
+def _package(like: Array) -> Any:
+    """The package of an array's functions."""
+    return torch if isinstance(like, Tensor) else np
 
 
 def control_torque(
     tool: ToolMotion,
-    eom: Equations,
-    q: JointVector,
-    qd: JointVector,
+    eom: RobotForces,
+    q: Array,
+    qd: Array,
     target: Target,
-    normal: Vector3,
+    normal: Array,
     gains: Gains,
-) -> JointVector:
+) -> Array:
     """Motor torque Q_u = M y − Q_K − J_Eᵀ n F of task-space inverse dynamics control, before any limit.
 
     Args:
@@ -179,5 +228,5 @@ def control_torque(
     posture = gains.posture_stiffness * (target.posture - q) - gains.posture_damping * qd
     y = joint_acceleration(tool, task_acceleration(tool, target, gains), posture)
     force = -target.push[..., None] * normal
-    push = (tool.jacobian[..., 3:, :].mT @ force[..., None])[..., 0]
+    push = (tool.jacobian[..., 3:, :].swapaxes(-1, -2) @ force[..., None])[..., 0]
     return (eom.M @ y[..., None])[..., 0] - eom.Q_K + push

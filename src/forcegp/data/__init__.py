@@ -1,6 +1,7 @@
 """Logged motion: the data set and its files, derivatives, noise, selection and splits."""
 
-from forcegp.data.dataset import Dataset, NotLoggedError, RobotMismatchWarning
+from forcegp.data.compatible import RobotMismatchWarning
+from forcegp.data.dataset import Dataset, NotLoggedError
 from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.header import DataHeader
 from forcegp.data.noise import with_noise

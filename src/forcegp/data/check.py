@@ -1,24 +1,18 @@
-"""What makes a data set valid, and the messages for what does not."""
+"""Whether a data set is valid, and what to say if it is not."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
-from forcegp.data.columns import JOINT_VECTORS, component_names
-from forcegp.data.header import DataHeader
-from forcegp.errors import DataError, near_names
+from forcegp.data.fields import JOINT_VECTORS, Fields, component_names
+from forcegp.errors import DataError
 from forcegp.limits import LOGGED_VALUE
 
-if TYPE_CHECKING:
-    from forcegp.data.dataset import Dataset
 
-
-def _named_columns(data: Dataset) -> list[tuple[str, Tensor]]:
+def _named_columns(data: Fields) -> list[tuple[str, Tensor]]:
     """Every floating-point column of the data set but time, by its name on disk, vectors whole."""
     pairs = [(name, getattr(data, name)) for name in JOINT_VECTORS] + list(data.extras.items())
     for name, group in data.contact_extras.items():
@@ -26,7 +20,7 @@ def _named_columns(data: Dataset) -> list[tuple[str, Tensor]]:
     return pairs
 
 
-def check_tensors(data: Dataset) -> None:
+def check_tensors(data: Fields) -> None:
     """Check that every column is a tensor, and every group of columns a mapping, before they are used."""
     for name in ("contact", "extras", "contact_extras"):
         _check_kind(name, getattr(data, name), Mapping, "a mapping of names to tensors")
@@ -44,14 +38,14 @@ def check_tensors(data: Dataset) -> None:
 def _check_kind(name: str, value: object, kind: type, expected: str, hint: str | None = None) -> None:
     if not isinstance(value, kind):
         raise DataError(
-            f"column {name!r} is no tensor" if kind is Tensor else f"{name!r} is no mapping",
+            f"column {name!r} is not a tensor" if kind is Tensor else f"{name!r} is not a mapping",
             expected=expected,
             got=type(value).__name__,
             hint=hint,
         )
 
 
-def check_layout(data: Dataset) -> None:
+def check_layout(data: Fields) -> None:
     """Check shapes, types and device of the columns, and the names of joints and contacts."""
     n, nq = len(data.t) if data.t.ndim == 1 else -1, len(data.joint_names)
     if n < 0:
@@ -86,9 +80,9 @@ def check_layout(data: Dataset) -> None:
         raise DataError("column 'segment' has the wrong type", expected="int64", got=data.segment.dtype)
 
 
-def _check_names(data: Dataset) -> None:
+def _check_names(data: Fields) -> None:
     """Extras must not hide a field, nor each other, and a dot in their name would cut it on disk."""
-    taken = {field.name for field in fields(data)}
+    taken = set(vars(data))
     for name in (*data.extras, *data.contact_extras):
         if name in taken or "." in name or not name:
             raise DataError(
@@ -117,7 +111,7 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
         )
 
 
-def check_values(data: Dataset) -> None:
+def check_values(data: Fields) -> None:
     """Check that every number is finite, and that time increases within each segment."""
     for name, value in (("t", data.t), *_named_columns(data)):
         if not bool((value.abs() <= LOGGED_VALUE).all()):
@@ -126,7 +120,7 @@ def check_values(data: Dataset) -> None:
         check_time(data)
 
 
-def _report_not_finite(data: Dataset, name: str, value: Tensor) -> None:
+def _report_not_finite(data: Fields, name: str, value: Tensor) -> None:
     wrong = ~(value.abs() <= LOGGED_VALUE)
     place, count = torch.nonzero(wrong)[0].tolist(), int(wrong.sum())
     column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]
@@ -138,7 +132,7 @@ def _report_not_finite(data: Dataset, name: str, value: Tensor) -> None:
     )
 
 
-def check_time(data: Dataset) -> None:
+def check_time(data: Fields) -> None:
     """Check that rows of a segment are together, and that time increases strictly within each.
 
     Raises:
@@ -153,7 +147,8 @@ def check_time(data: Dataset) -> None:
             f"column 't' does not increase in row {row}",
             expected=f"more than {t[row - 1].item():.9g} s",
             got=f"{t[row].item():.9g} s",
-            hint="sort the log by time, or number its trajectories in a column 'segment'",
+            hint="sort the log by time, or number its trajectories in a column 'segment'; select points with "
+            "data[rows], or pass header=DataHeader(ordered=False) if the rows are points in any order",
         )
     runs = segment[torch.cat([same.new_ones(min(len(segment), 1)), ~same])]
     if len(runs.unique()) < len(runs):
@@ -171,11 +166,16 @@ def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
         DataError: a mask of another length, or an index that does not exist.
     """
     if isinstance(rows, slice):
-        return torch.arange(n, device=device)[rows]
-    index = torch.as_tensor(rows, device=device)
+        return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
+    try:
+        index = torch.as_tensor(rows, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DataError(
+            "rows are selected by a slice, a mask or a list of row numbers", got=repr(rows)[:80]
+        ) from error
     if index.ndim != 1 or (index.is_floating_point() and len(index)):
         raise DataError(
-            "rows are chosen by a slice, a mask or a list of row numbers",
+            "rows are selected by a slice, a mask or a list of row numbers",
             got=f"a tensor of shape {tuple(index.shape)} and type {index.dtype}",
         )
     if index.dtype == torch.bool:
@@ -186,59 +186,3 @@ def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
     if bool(outside.any()):
         raise DataError("there is no such row", expected=f"0 to {n - 1}", got=int(index[outside][0]))
     return torch.where(index < 0, index + n, index).to(torch.int64)
-
-
-def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
-    """Check that the joints of a log are those of a robot, in its order."""
-    if tuple(have) == tuple(want):
-        return
-    missing = [joint for joint in want if joint not in have]
-    if not missing:
-        raise DataError(
-            f"the joints of the data are not those of robot {robot!r} in its order",
-            expected=", ".join(want),
-            got=", ".join(have),
-            hint="call data.select(robot.joint_names)",
-        )
-    near = near_names(missing[0], (joint for joint in have if joint not in want))
-    raise DataError(
-        f"joint {missing[0]!r} of robot {robot!r} is not in the data",
-        expected=", ".join(want),
-        got=", ".join(have),
-        hint=f"is {near[0]!r} in the data the same joint? Rename its columns" if near else None,
-    )
-
-
-def check_alike(parts: Sequence[Dataset]) -> None:
-    """Check that data sets hold the same columns, so that they can be put one after another."""
-    if not parts:
-        raise DataError("there is nothing to concatenate", expected="one or more data sets")
-
-    def layout(data: Dataset) -> dict[str, object]:
-        return {
-            "joints": data.joint_names,
-            "contacts": tuple(data.contact),
-            "extras": sorted(data.extras),
-            "contact extras": sorted((name, *sorted(group)) for name, group in data.contact_extras.items()),
-            "types": (data.dtype, data.device),
-        }
-
-    first = layout(parts[0])
-    for number, part in enumerate(parts[1:], start=1):
-        for what, value in layout(part).items():
-            if value != first[what]:
-                raise DataError(
-                    f"the {what} of data set {number} differ from those of data set 0",
-                    expected=first[what],
-                    got=value,
-                )
-
-
-def common_header(headers: Sequence[DataHeader]) -> DataHeader:
-    """What headers agree on; a field on which they differ says nothing."""
-    first = headers[0].model_dump()
-    agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
-    steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))
-    agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
-    agreed["ordered"] = all(header.ordered for header in headers)
-    return DataHeader(**agreed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,30 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forcegp.data.derivative import SavitzkyGolay, differentiate
+from forcegp.data.fields import AXES, JOINT_VECTORS, Fields, component_names
 from forcegp.data.header import DataHeader
 from forcegp.data.table import Columns, IgnoredColumnsWarning
 from forcegp.errors import DataError, near_names
 from forcegp.limits import JOINTS, SEGMENT_NUMBER
 
-if TYPE_CHECKING:
-    from forcegp.data.dataset import Dataset
-
-JOINT_VECTORS = ("q", "qd", "tau", "qdd")
-"""The joint vectors that every data set holds."""
-AXES = ("x", "y", "z")
-"""Components of a Cartesian vector logged of a contact."""
-
-Fields = dict[str, Any]
+Arrays = dict[str, Any]
 
 
-def component_names(name: str, value: Tensor, joint_names: Sequence[str]) -> list[str]:
-    """Names on disk of the columns of a joint vector, a contact's scalar or its Cartesian vector."""
-    if value.ndim == 1:
-        return [name]
-    return [f"{name}.{part}" for part in (AXES if "." in name else joint_names)]
-
-
-def unparse(data: Dataset) -> tuple[Columns, DataHeader]:
+def unparse(data: Fields) -> tuple[Columns, DataHeader]:
     """Columns and header of a data set, as they are written."""
     named: dict[str, Tensor] = {name: getattr(data, name) for name in JOINT_VECTORS} | dict(data.extras)
     for name, group in data.contact_extras.items():
@@ -51,7 +37,7 @@ def unparse(data: Dataset) -> tuple[Columns, DataHeader]:
     return {name: value.detach().cpu().numpy() for name, value in columns.items()}, header
 
 
-def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Fields:
+def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Arrays:
     """Arrays of a data set from the columns of a file.
 
     Raises:
@@ -64,7 +50,7 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
         raise DataError(f"{source}: too many joints", expected=f"at most {JOINTS}", got=len(joints))
     contacts = header.contact_names or tuple(name[8:] for name in raw if name.startswith("contact."))
     left = dict(raw)
-    fields: Fields = {"t": _take(source, left, "t").astype(float), "joint_names": joints}
+    fields: Arrays = {"t": _take(source, left, "t").astype(float), "joint_names": joints}
     absent = {name for name in ("qd", "qdd") if not any(f"{name}.{joint}" in left for joint in joints)}
     for name in JOINT_VECTORS:
         if not (method and name in absent):
@@ -85,7 +71,7 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
     return fields
 
 
-def as_tensors(fields: Fields, dtype: torch.dtype, device: torch.device) -> Fields:
+def as_tensors(fields: Arrays, dtype: torch.dtype, device: torch.device) -> Arrays:
     """The arrays of `parse` as tensors, real numbers in the precision asked for."""
 
     def convert(value: Any) -> Any:
@@ -171,7 +157,7 @@ def _extras(
 
 
 def _fill_in(
-    source: str, fields: Fields, absent: set[str], method: SavitzkyGolay, header: DataHeader
+    source: str, fields: Arrays, absent: set[str], method: SavitzkyGolay, header: DataHeader
 ) -> DataHeader:
     """Compute the absent `qd` and `qdd`, and log how uncertain the computed q̈ is."""
     of, order = ("q", 2) if "qd" in absent else ("qd", 1)

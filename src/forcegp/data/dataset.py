@@ -1,9 +1,8 @@
-"""The logged motion of a robot: states, torques, accelerations and contacts, one row a sample."""
+"""The logged motion of a robot: states, torques, accelerations and contacts, one row per sample."""
 
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,15 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from forcegp.data import check, columns, table
+from forcegp.data import check, columns, compatible, table
 from forcegp.data.derivative import SavitzkyGolay
+from forcegp.data.fields import JOINT_VECTORS, contact_table
 from forcegp.data.header import DataHeader
+from forcegp.data.summary import summary
 from forcegp.errors import DataError, UnknownNameError
 from forcegp.robot.model import RobotModel
-
-
-class RobotMismatchWarning(UserWarning):
-    """The data were logged on a robot with other figures than the one they are used with."""
 
 
 class NotLoggedError(DataError, AttributeError):
@@ -73,6 +70,10 @@ class Dataset:
         """Number of samples."""
         return self.t.shape[0]
 
+    def __repr__(self) -> str:
+        """One line that says what is logged, without the numbers."""
+        return summary(self)
+
     def __getattr__(self, name: str) -> Any:
         extras, contact_extras = self.__dict__.get("extras", {}), self.__dict__.get("contact_extras", {})
         if name in extras:
@@ -83,11 +84,14 @@ class Dataset:
             raise AttributeError(name)
         raise NotLoggedError(
             f"{name!r} is not logged in this data set",
-            expected="one of " + ", ".join([*columns.JOINT_VECTORS, *extras, *contact_extras]),
+            expected="one of " + ", ".join([*JOINT_VECTORS, *extras, *contact_extras]),
         )
 
     def __getitem__(self, rows: object) -> Dataset:
         """The data set of some rows, given as a slice, a mask `(n,)` or indices in any order.
+
+        Rows that no longer follow time make a data set of points: its `header.ordered` is false, so that
+        models can be fitted to it, but it cannot be split into stretches or differentiated.
 
         Raises:
             DataError: a mask of another length, or an index that does not exist.
@@ -121,17 +125,9 @@ class Dataset:
         """`(n, len(contacts))` bool: which of the named contacts are closed.
 
         Raises:
-            DataError: whether a contact is closed is not logged.
+            DataError: the data do not say whether a contact is closed.
         """
-        for name in contacts:
-            if name not in self.contact:
-                raise DataError(
-                    f"column 'contact.{name}' is missing",
-                    expected=f"contact.{name}, 1 where the contact is closed and 0 elsewhere",
-                    got=", ".join(f"contact.{c}" for c in self.contact) or "no contact column",
-                )
-        columns_ = [self.contact[name] for name in contacts]
-        return torch.stack(columns_, dim=-1) if columns_ else self.segment.new_zeros(len(self), 0).bool()
+        return contact_table(self, contacts)
 
     def replace(self, **fields: object) -> Dataset:
         """A data set with some fields changed."""
@@ -160,7 +156,7 @@ class Dataset:
             if joint not in self.joint_names:
                 raise UnknownNameError("joint of the data set", joint, self.joint_names)
         order = [self.joint_names.index(joint) for joint in joints]
-        fields = {name: getattr(self, name)[:, order] for name in columns.JOINT_VECTORS}
+        fields = {name: getattr(self, name)[:, order] for name in JOINT_VECTORS}
         extras = {name: value[:, order] for name, value in self.extras.items()}
         header = self.header.model_copy(update={"joint_names": tuple(joints)})
         return self.replace(**fields, extras=extras, joint_names=tuple(joints), header=header)
@@ -169,24 +165,16 @@ class Dataset:
         """Check that the columns are the robot's joints, in its order.
 
         Warns:
-            RobotMismatchWarning: the robot has other figures than the one that was logged.
+            RobotMismatchWarning: the parameters of the robot differ from those of the logged one.
 
         Raises:
             DataError: joints are missing, unknown or in another order; the hint says what to call.
         """
-        check.check_joints(self.joint_names, robot.joint_names, robot.name)
-        logged = self.header.robot_fingerprint
-        if logged is not None and logged != robot.fingerprint:
-            warnings.warn(
-                f"the data were logged on robot {self.header.robot!r} (fingerprint {logged}) and are used on "
-                f"{robot.name!r} ({robot.fingerprint}): inertia, kinematics, base or gravity differ",
-                RobotMismatchWarning,
-                stacklevel=2,
-            )
+        compatible.check_robot(self, robot)
 
     def _map(self, change: Callable[[Tensor], Tensor], **fields: object) -> Dataset:
         """The data set with every column changed alike."""
-        vectors = {name: change(getattr(self, name)) for name in ("t", "segment", *columns.JOINT_VECTORS)}
+        vectors = {name: change(getattr(self, name)) for name in ("t", "segment", *JOINT_VECTORS)}
         return self.replace(
             **vectors,
             contact={name: change(value) for name, value in self.contact.items()},
@@ -200,21 +188,21 @@ class Dataset:
 
     @staticmethod
     def concatenate(parts: Sequence[Dataset]) -> Dataset:
-        """Data sets one after another, each with segments of its own; what not all of them log is an error.
+        """Data sets one after another, each with segments of its own.
 
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
         """
-        check.check_alike(parts)
+        compatible.check_alike(parts)
         first = parts[0]
         segments, start = [], 0
         for part in parts:
             _, own = torch.unique_consecutive(part.segment, return_inverse=True)
             segments.append(own + start)
             start += int(own.max()) + 1 if len(part) else 0
-        header = check.common_header([part.header for part in parts])
+        header = compatible.common_header([part.header for part in parts])
         return Dataset(
-            **{name: torch.cat([getattr(p, name) for p in parts]) for name in ("t", *columns.JOINT_VECTORS)},
+            **{name: torch.cat([getattr(p, name) for p in parts]) for name in ("t", *JOINT_VECTORS)},
             joint_names=first.joint_names,
             contact={name: torch.cat([p.contact[name] for p in parts]) for name in first.contact},
             extras={name: torch.cat([p.extras[name] for p in parts]) for name in first.extras},

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -23,10 +23,15 @@ from forcegp.forces.start import (
     random_starts,
     warm_start_sizes,
 )
+from forcegp.gp.bound import negative_bound
+from forcegp.gp.features import Features
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
+from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
+from forcegp.gp.structured_covariance import Block
 
 Tensors = dict[str, Tensor]
+TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
+"""Name of the learned noise of the motor torque."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -55,6 +60,12 @@ class Problem:
         mean: prior mean of Q.
         training: measurements, noise and input scales.
         parameters: module whose `forward()` gives the robot at θ_A, or `None`.
+        torque_std: standard deviation of the white noise of the motor torque, `(nq,)`, unless it is learned.
+        power: κ, which the likelihood is raised to; below 1 where samples are correlated.
+        offsets: prior means of latent forces, by prior.
+        pinned: priors whose force has mean zero from here on, since the robot contains it; the others are
+            conditioned on that, and only the uncertainty of the pinned ones remains.
+        inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
     """
 
     system: ConstrainedSystem
@@ -62,6 +73,11 @@ class Problem:
     mean: ForceMean
     training: Training
     parameters: nn.Module | None = None
+    torque_std: Tensor | None = None
+    power: float = 1.0
+    offsets: Mapping[str, Tensor] = field(default_factory=dict)
+    inducing: tuple[Features, ...] | None = None
+    pinned: tuple[str, ...] = ()
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """The system with the robot at the analytical parameters among the tensors."""
@@ -80,7 +96,9 @@ class Problem:
 
     def force_noise(self, tensors: Mapping[str, Tensor]) -> ForceNoise | None:
         """Variance of the white noise on the joint force, or `None` for none."""
-        return None
+        learned = tensors.get(TORQUE_NOISE)
+        std = self.torque_std if learned is None else learned.exp()
+        return None if std is None else lambda at: (std**2).expand_as(at.q)
 
     def rows(self, tensors: Mapping[str, Tensor]) -> WhitenedRows:
         """Whitened rows at the noise and analytical parameters among the tensors."""
@@ -95,19 +113,38 @@ class Problem:
                     m,
                     self.noise_at(tensors, i),
                     force_noise,
+                    self.offsets,
                 )
                 for i, m in enumerate(self.training.measurements)
             ]
-        )
+        ).tempered(self.power)
+
+    def of_means(self) -> Problem:
+        """The problem that posterior means are read from, in which pinned forces are known to be zero."""
+        return dataclasses.replace(self, offsets={}, pinned=())
+
+    def silenced(self, blocks: Sequence[Block]) -> list[Block]:
+        """Rows that pinned forces do not act on."""
+        keep = [prior.name not in self.pinned for prior in self.priors]
+        return [
+            Block(
+                b.features,
+                tuple(W if k else torch.zeros_like(W) for W, k in zip(b.operators, keep, strict=True)),
+                b.target,
+            )
+            for b in blocks
+        ]
 
     @cached_property
     def fixed_rows(self) -> WhitenedRows:
         """The rows at the noise and robot as given."""
         return self.rows({})
 
-    def initial(self, learn_noise: bool) -> Tensors:
+    def initial(self, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
         """Default start of everything that can be learned."""
         start = initial_hyperparameters(self.priors, self.fixed_rows.blocks)
+        if learn_torque_noise:
+            start[TORQUE_NOISE] = (0.5 * self.torque_residual()).clamp(min=1e-4).log().double()
         if learn_noise:
             noise = self.training.noise_std
             start |= {noise_key(i): _typical(std).double().log() for i, std in enumerate(noise)}
@@ -116,13 +153,31 @@ class Problem:
             start |= {f"{ANALYTICAL}.{name}": value.detach().clone() for name, value in named}
         return start
 
+    @torch.no_grad()
+    def torque_residual(self) -> Tensor:
+        """Root mean square of M times the residual of accelerations, `(nq,)` [N m, N]."""
+        total, count = torch.zeros_like(self.system.robot.mass), 0
+        for m in self.training.measurements:
+            if m.quantity == "qdd":
+                at = m.at(self.system)
+                residual = m.values - at.eom.acceleration(self.mean(self.system, at))
+                force = (at.eom.M @ residual[..., None])[..., 0]
+                total, count = total + (force**2).sum(0), count + len(force)
+        return (total / max(count, 1)).sqrt()
+
+    def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
+        """Of the rows, exact or as the collapsed bound, with their constant."""
+        if self.inducing is not None:
+            return negative_bound(self.priors, params, rows.blocks, self.inducing) + rows.constant
+        return negative_log_likelihood(self.priors, params, rows.blocks)[0] + rows.constant
+
     def objective(self, tensors: Tensors, held: Tensors, center: Tensors) -> Tensor:
         """Negative log posterior: the likelihood of the rows, and weak priors around `center`."""
         moving = any(key.startswith(OWN) for key in tensors)
         rows = self.rows({**held, **tensors}) if moving else self._held_rows(held)
-        value, _ = negative_log_likelihood(self.priors, kernel_parameters({**held, **tensors}), rows.blocks)
+        value = self.negative_log_likelihood(kernel_parameters({**held, **tensors}), rows)
         hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL + ".")}
-        return value + rows.constant + negative_log_prior(hyper, center)
+        return value + negative_log_prior(hyper, center)
 
     def _held_rows(self, held: Tensors) -> WhitenedRows:
         """The rows where neither noise nor robot is learned; computed once for those as given."""
@@ -142,11 +197,13 @@ class Search:
         start: default initial values of what is learned, and centre of the weak priors.
         held: values that are not learned.
         options: optimiser and its limits.
+        recorded: wraps the objective, such as `Checkpoint.recorded`.
     """
 
     start: Tensors
     held: Tensors
     options: LearningOptions
+    recorded: Callable[[Objective], Objective] = lambda objective: objective
 
     def solve(
         self,
@@ -201,6 +258,6 @@ class Search:
             if progress is not None:
                 progress(evaluations, value + constant, best)
 
-        learned = minimise(objective, begin, self.options, analytical, bounds, whole)
+        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, whole)
         history = [value + constant for value in learned.history]
         return dataclasses.replace(learned, value=learned.value + constant, history=history)

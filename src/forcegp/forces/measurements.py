@@ -14,7 +14,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, farthest_points, standardized
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.quantities import QUANTITIES, states
+from forcegp.forces.quantities import QUANTITIES, States, states
 from forcegp.gp.features import Standardization
 
 NoiseStd = float | Sequence[float] | Tensor
@@ -48,6 +48,7 @@ class Measurement:
         q, qd, tau: `(n, nq)` states.
         active: `(n, n_contacts)` bool.
         values: `(n, d)`.
+        segment: `(n,)` trajectory of each sample; one trajectory by default.
     """
 
     quantity: str
@@ -56,6 +57,12 @@ class Measurement:
     tau: Tensor
     active: Tensor
     values: Tensor
+    segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
+
+    def __post_init__(self) -> None:
+        if self.segment is None:
+            zero = torch.zeros(len(self.q), dtype=torch.int64, device=self.q.device)
+            object.__setattr__(self, "segment", zero)
 
     @property
     def states(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -67,9 +74,13 @@ class Measurement:
         """q, q̇, τ, which contacts are closed, and the values."""
         return (*self.states, self.values)
 
+    def at(self, system: ConstrainedSystem) -> States:
+        """The equations of motion at the states, with the acceleration where it was measured."""
+        return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None)
+
     def __getitem__(self, rows: Tensor) -> Measurement:
         """The values at some of the states."""
-        return Measurement(self.quantity, *(part[rows] for part in self.tensors))
+        return Measurement(self.quantity, *(part[rows] for part in (*self.tensors, self.segment)))
 
 
 def _by_contact(name: str) -> Callable[[Dataset, ConstrainedSystem], Tensor]:
@@ -115,7 +126,7 @@ def measurement_of(
     values = COLUMNS[quantity](data, system)
     std = _checked_noise(_noise_of(observation, default_noise), quantity, values)
     active = data.active(system.contact_names)
-    return Measurement(quantity, data.q, data.qd, data.tau, active, values), std
+    return Measurement(quantity, data.q, data.qd, data.tau, active, values, data.segment), std
 
 
 def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
@@ -134,7 +145,10 @@ def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
 
 def _checked_noise(noise: NoiseStd, quantity: str, values: Tensor) -> Tensor:
     """A noise as a tensor `(d,)` or `(n, d)`."""
-    std = torch.as_tensor(noise, dtype=values.dtype, device=values.device)
+    try:
+        std = torch.as_tensor(noise, dtype=values.dtype, device=values.device)
+    except (TypeError, ValueError, RuntimeError) as cause:
+        raise ModelError("a noise standard deviation is a number, or one per component", got=noise) from cause
     if std.shape not in ((), (1,), values.shape[-1:], values.shape):
         raise ModelError(
             f"the noise of {quantity!r} does not match its components",
@@ -173,7 +187,21 @@ class Training:
     def thinned(self, samples: int) -> Training:
         """About this many samples: the farthest points among the distinct states of each measurement."""
         share = samples / self.samples
-        rows = [_spread(m, math.ceil(share * len(m.q))) for m in self.measurements]
+        return self.of_rows([_spread(m, math.ceil(share * len(m.q))) for m in self.measurements])
+
+    def evenly(self, samples: int) -> Training:
+        """At most this many samples, evenly spaced in each measurement."""
+        step = max(1, math.ceil(self.samples / samples))
+        return self.of_rows([torch.arange(0, len(m.q), step, device=m.q.device) for m in self.measurements])
+
+    def without(self, measurement: int, rows: Tensor) -> Training:
+        """All samples but some rows of one measurement."""
+        kept = [torch.ones(len(m.q), dtype=torch.bool, device=m.q.device) for m in self.measurements]
+        kept[measurement][rows] = False
+        return self.of_rows([own.nonzero()[:, 0] for own in kept])
+
+    def of_rows(self, rows: Sequence[Tensor]) -> Training:
+        """Some rows of each measurement."""
         return dataclasses.replace(
             self,
             measurements=tuple(m[own] for m, own in zip(self.measurements, rows, strict=True)),
@@ -181,6 +209,11 @@ class Training:
                 std[own] if std.ndim == 2 else std for std, own in zip(self.noise_std, rows, strict=True)
             ),
         )
+
+    def moving(self, speed: float) -> Training:
+        """The samples in which a joint moves faster than a speed [rad/s, m/s]."""
+        fast = [(m.qd.abs().amax(-1) > speed).nonzero()[:, 0] for m in self.measurements]
+        return self.of_rows(fast)
 
 
 def _spread(m: Measurement, count: int) -> Tensor:
@@ -208,13 +241,19 @@ def training_of(
     Raises:
         ModelError, DataError: there are no data, or they do not fit the system.
     """
-    observations = [Observation(data)] if isinstance(data, Dataset) else list(data)
+    observations = [Observation(data)] if isinstance(data, Dataset) else data
+    if not isinstance(observations, Sequence) or not all(isinstance(o, Observation) for o in observations):
+        raise ModelError(
+            "these are no data to learn from",
+            expected="a Dataset, or a list of Observation",
+            got=type(data).__name__,
+        )
     if not observations:
         raise ModelError(
             "there are no samples to learn from", expected="at least one observation", got="none"
         )
     pairs = [measurement_of(o, system, noise_std) for o in observations]
-    at = [states(system, *m.states) for m, _ in pairs]
+    at = [m.at(system) for m, _ in pairs]
     scales = []
     for prior in priors:
         if prior.name in kept:

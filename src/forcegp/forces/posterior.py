@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -50,12 +50,40 @@ class ForcePosterior:
         priors, scales: the force priors and the standardization of their inputs.
         mean: prior mean of Q.
         latent: the conditioned processes.
+        offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
+        central: processes that means are read from, where some forces are pinned to zero; `latent` by default.
     """
 
     priors: tuple[ForcePrior, ...]
     scales: tuple[Standardization, ...]
     mean: ForceMean
     latent: LatentPosterior
+    offsets: Mapping[str, Tensor] = field(default_factory=dict)
+    central: LatentPosterior | None = None
+
+    def latent_mean(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | None:
+        """Posterior mean of the force of prior p, `(n, components)`; `None` where it is zero."""
+        if self.central is not None:
+            if not self.central.is_measured(p):
+                return None
+            return self.central.latent_mean(p, self.features_of(p, system, at))
+        return self._own_mean(p, system, at)
+
+    def _own_mean(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | None:
+        """Posterior mean where no force is pinned."""
+        offset = self.offsets.get(self.priors[p].name)
+        if not self.latent.is_measured(p):
+            return None if offset is None else offset.expand(len(at.q), -1)
+        mean = self.latent.latent_mean(p, self.features_of(p, system, at))
+        return mean if offset is None else mean + offset
+
+    def shift(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | float:
+        """What samples of the latent force of prior p must be moved by to have the mean that is predicted."""
+        if self.central is None:
+            return self.offsets.get(self.priors[p].name, 0.0)
+        mean, own = self.latent_mean(p, system, at), self._own_mean(p, system, at)
+        offset = self.offsets.get(self.priors[p].name, 0.0)
+        return (0.0 if mean is None else mean) - (0.0 if own is None else own) + offset
 
     def features_of(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         """Standardized kernel inputs of prior p at states."""
@@ -65,8 +93,8 @@ class ForcePosterior:
         """Posterior mean of Q̄ = m + Σ E f, `(n, nq)`: the force field of a rollout."""
         force = self.mean(system, at)
         for p, prior in enumerate(self.priors):
-            if self.latent.is_measured(p):
-                latent = self.latent.latent_mean(p, self.features_of(p, system, at))
+            latent = self.latent_mean(p, system, at)
+            if latent is not None:
                 force = force + (prior.operator(system, at) @ latent[..., None])[..., 0]
         return force
 
@@ -74,9 +102,9 @@ class ForcePosterior:
         """Posterior mean of a quantity, o + B(m + Σ E f), `(n, d)`."""
         mean = prior_mean(system, at, z, self.mean)
         for p, prior in enumerate(self.priors):
-            if self.latent.is_measured(p):
+            latent = self.latent_mean(p, system, at)
+            if latent is not None:
                 (W,) = prior_operators([prior], system, at, z)
-                latent = self.latent.latent_mean(p, self.features_of(p, system, at))
                 mean = mean + (W @ latent[..., None])[..., 0]
         return mean
 

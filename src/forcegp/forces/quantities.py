@@ -25,6 +25,7 @@ class States:
         q, qd, tau: `(n, nq)`.
         active: `(n, n_contacts)` bool.
         eom: the equations of motion at these states.
+        qdd: `(n, nq)` measured acceleration, where one is known.
     """
 
     q: Tensor
@@ -32,11 +33,19 @@ class States:
     tau: Tensor
     active: Tensor
     eom: Equations
+    qdd: Tensor | None = None
 
 
-def states(system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> States:
+def states(
+    system: ConstrainedSystem,
+    q: Tensor,
+    qd: Tensor,
+    tau: Tensor,
+    active: Tensor,
+    qdd: Tensor | None = None,
+) -> States:
     """Evaluate the equations of motion at a batch of states."""
-    return States(q, qd, tau, active, system.equations(q, qd, active))
+    return States(q, qd, tau, active, system.equations(q, qd, active), qdd)
 
 
 class FlatStates(NamedTuple):
@@ -201,11 +210,11 @@ def affine_maps(system: ConstrainedSystem, at: States, quantity: str | Sequence[
         UnknownNameError: no such quantity.
         ModelError: none is named.
     """
-    names = [quantity] if isinstance(quantity, str) else list(quantity)
+    names = list(quantity) if isinstance(quantity, Sequence) and not isinstance(quantity, str) else [quantity]
     if not names:
         raise ModelError("no quantity is named", expected="one of " + ", ".join(QUANTITIES))
     for name in names:
-        if name not in QUANTITIES:
+        if not isinstance(name, str) or name not in QUANTITIES:
             raise UnknownNameError("quantity", name, QUANTITIES)
     return {name: QUANTITIES[name](system, at) for name in names}
 

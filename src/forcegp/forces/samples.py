@@ -52,6 +52,7 @@ class ForceSamples:
         Q_z = torch.zeros_like(Q)
         for p, prior in enumerate(self.posterior.priors):
             latent = self.functions.latent(p, self.posterior.features_of(p, system, at), sample)
+            latent = latent + self.posterior.shift(p, system, at)
             force = (prior.operator(system, at) @ latent[..., None])[..., 0]
             Q, Q_z = (Q, Q_z + force) if prior.target == CONTACT else (Q + force, Q_z)
         return Q, Q_z
@@ -83,6 +84,7 @@ class ForceSamples:
                     for own in chunks
                 ]
             )
+            force = force + self.posterior.shift(p, system, at)
             Q_bar = Q_bar + (prior.operator(system, at) @ force[..., None])[..., 0]
         return Q_bar
 

@@ -23,7 +23,7 @@ from forcegp.gp.structured_covariance import Block
 LOG_LENGTHSCALE_BOUNDS = (math.log(0.03), math.log(3e4))
 LOG_STD_BOUNDS = (math.log(1e-6), math.log(1e6))
 LOG_NOISE_BOUNDS = (math.log(1e-6), math.log(1e4))
-WIDTH = {"log_lengthscale": (1.0, 4.0), "log_noise_std": (5.0, 5.0)}
+WIDTH = {"log_lengthscale": (1.0, 4.0), "log_noise_std": (5.0, 5.0), "log_scale": (1.0, 1.0)}
 """Standard deviations of the log-normal priors below and above the start, in e-folds; 3 where not named."""
 OWN = tuple(name + "." for name in RESERVED)
 """Prefixes of what is learned besides the hyperparameters of the priors."""

@@ -7,7 +7,7 @@ over twice, once for the sums and once for the gradient, in memory that does not
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -17,12 +17,10 @@ from forcegp.gp.basis import ProcessBasis, latent_basis
 from forcegp.gp.blocks import components_of, rows_of
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters
+from forcegp.gp.places import Gradient, Place, from_tensors, tensors_of
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block, Process
 from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
-
-Gradient = dict[tuple[Any, ...], Tensor]
-"""Derivatives by place: ("param", name), ("feature", block, process, name), ("target", block) and so on."""
 
 
 def bound_of(sums: Sums, posterior: SparsePosterior) -> Tensor:
@@ -52,38 +50,9 @@ def negative_bound(
     Raises:
         NumericalError: the sums are not finite.
     """
-    named = dict(_named(params, blocks))
+    named = dict(tensors_of(params, blocks))
     value = _NegativeBound.apply(processes, inducing, list(named), *named.values())
     return value  # pyright: ignore[reportReturnType]
-
-
-def _named(params: Parameters, blocks: Sequence[Block]) -> Iterator[tuple[tuple[Any, ...], Tensor]]:
-    """Every tensor that the bound depends on, by its place."""
-    for key, value in params.items():
-        yield ("param", key), value
-    for g, block in enumerate(blocks):
-        for p, (features, W) in enumerate(zip(block.features, block.operators, strict=True)):
-            for name, x in features.items():
-                yield ("feature", g, p, name), x
-            yield ("operator", g, p), W
-        yield ("target", g), block.target
-
-
-def _unnamed(named: dict[tuple[Any, ...], Tensor]) -> tuple[dict[str, Tensor], list[Block]]:
-    """Hyperparameters and blocks of the tensors of `_named`."""
-    params = {place[1]: x for place, x in named.items() if place[0] == "param"}
-    features: dict[int, dict[int, dict[str, Tensor]]] = {}
-    operators: dict[int, list[Tensor]] = {}
-    for place, x in named.items():
-        if place[0] == "feature":
-            features.setdefault(place[1], {}).setdefault(place[2], {})[place[3]] = x
-        elif place[0] == "operator":
-            operators.setdefault(place[1], []).append(x)
-    blocks = [
-        Block(tuple(features[g][p] for p in range(len(own))), tuple(own), named["target", g])
-        for g, own in operators.items()
-    ]
-    return params, blocks
 
 
 class _NegativeBound(torch.autograd.Function):
@@ -94,11 +63,11 @@ class _NegativeBound(torch.autograd.Function):
         ctx: Any,
         processes: Sequence[Process],
         inducing: Sequence[Features],
-        places: list[tuple[Any, ...]],
+        places: list[Place],
         *tensors: Tensor,
     ) -> Tensor:
         named = dict(zip(places, (t.detach() for t in tensors), strict=True))
-        params, blocks = _unnamed(named)
+        params, blocks = from_tensors(named)
         basis = latent_basis(processes, params, inducing, components_of(blocks[0]))
         sums = accumulate(basis, blocks)
         posterior = SparsePosterior.of(basis, sums)

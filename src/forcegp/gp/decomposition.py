@@ -13,9 +13,9 @@ from functools import reduce
 import torch
 
 from forcegp.gp.draws import FunctionDraw
-from forcegp.gp.kernels import Kernel, Linear, Parameters, Product, Sum, sub
+from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Product, Sum, sub
 
-EXACT: tuple[type[Kernel], ...] = (Linear,)
+EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
 """Kernels without factors whose `draw` holds all their features, whatever number it is asked for."""
 
 

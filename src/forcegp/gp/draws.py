@@ -49,6 +49,17 @@ class LinearDraw(FunctionDraw):
 
 
 @dataclass(frozen=True)
+class ConstantDraw(FunctionDraw):
+    """A constant per output."""
+
+    std: Tensor
+
+    def basis(self, x: Features) -> Tensor:
+        n = stacked(x, None).shape[-2]
+        return self.std[:, None, None].expand(-1, n, 1)
+
+
+@dataclass(frozen=True)
 class SumDraw(FunctionDraw):
     """Features of both terms."""
 

@@ -6,7 +6,7 @@ block, to check a sparse posterior against the exact one where no factorisation 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -130,22 +130,40 @@ def solve(
     y = target_of(blocks)[:, None] if right is None else right
     if len(y) != offsets(blocks)[-1]:
         raise ModelError("the right-hand side does not fit", expected=offsets(blocks)[-1], got=len(y))
-    precondition = SparsePreconditioner(basis, blocks)
-    scale = y.norm(dim=0).clamp(min=torch.finfo(y.dtype).tiny)
+    x, history = _conjugate_gradients(
+        lambda direction: product(processes, params, blocks, direction),
+        SparsePreconditioner(basis, blocks),
+        y,
+        tolerance,
+        limit,
+    )
+    return Solution(x, y - product(processes, params, blocks, x), len(history) + 1, history)
+
+
+def _conjugate_gradients(
+    multiply: Callable[[Tensor], Tensor],
+    precondition: Callable[[Tensor], Tensor],
+    y: Tensor,
+    tolerance: float,
+    limit: int,
+) -> tuple[Tensor, list[float]]:
+    """The solution, and the largest relative residual after each iteration."""
+    tiny = torch.finfo(y.dtype).tiny
+    scale = y.norm(dim=0).clamp(min=tiny)
     x, residual = torch.zeros_like(y), y.clone()
-    z = precondition(residual)
-    direction, rho = z, (residual * z).sum(0)
+    direction = precondition(residual)
+    rho = (residual * direction).sum(0)
     history: list[float] = []
     while len(history) < limit:
-        Kd = product(processes, params, blocks, direction)
-        step = rho / (direction * Kd).sum(0).clamp(min=torch.finfo(y.dtype).tiny)
+        Kd = multiply(direction)
+        step = rho / (direction * Kd).sum(0).clamp(min=tiny)
         x, residual = x + step * direction, residual - step * Kd
         history.append(float((residual.norm(dim=0) / scale).max()))
         if history[-1] <= tolerance:
-            return Solution(x, y - product(processes, params, blocks, x), len(history) + 1, history)
+            return x, history
         z = precondition(residual)
         rho, before = (residual * z).sum(0), rho
-        direction = z + (rho / before.clamp(min=torch.finfo(y.dtype).tiny)) * direction
+        direction = z + (rho / before.clamp(min=tiny)) * direction
     raise NumericalError(
         "conjugate gradients did not converge",
         expected=f"a relative residual of {tolerance:g} within {limit} iterations",

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.draws import FunctionDraw, LinearDraw, OuterDraw, ProductDraw, SumDraw
+from forcegp.gp.draws import ConstantDraw, FunctionDraw, LinearDraw, OuterDraw, ProductDraw, SumDraw
 from forcegp.gp.features import Features, stacked
 
 Parameters = Mapping[str, Tensor]
@@ -128,6 +128,29 @@ class Linear(Kernel):
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         return LinearDraw(self.inputs, self._slope_std(params), params["log_bias_std"].exp())
+
+
+@dataclass(frozen=True)
+class Constant(Kernel):
+    """k = s²: constants, with one standard deviation s for each `group` of outputs, 1 at the start."""
+
+    group: int = 1
+
+    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
+        return {"log_scale": torch.zeros(outputs // self.group, dtype=torch.float64)}
+
+    def _std(self, params: Parameters) -> Tensor:
+        return params["log_scale"].exp().repeat_interleave(self.group)
+
+    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        n1, n2 = (stacked(x, None).shape[-2] for x in (x1, x2))
+        return (self._std(params) ** 2)[:, None, None].expand(-1, n1, n2)
+
+    def diagonal(self, params: Parameters, x: Features) -> Tensor:
+        return (self._std(params) ** 2)[:, None].expand(-1, stacked(x, None).shape[-2])
+
+    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+        return ConstantDraw(self._std(params))
 
 
 @dataclass(frozen=True)

@@ -11,21 +11,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-import scipy.linalg.lapack
 import torch
 from torch import Tensor
 
-from forcegp.errors import ModelError, NumericalError
+from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.blocks import chunked, components_of
 from forcegp.gp.diagnostics import Diagnostics
+from forcegp.gp.factor import extended
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.pathwise import FEATURES, FunctionSamples
 from forcegp.gp.sparse_draws import draw_functions
 from forcegp.gp.structured_covariance import Block, Process
-from forcegp.gp.sums import Sums, accumulate, add_rows
+from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 from forcegp.linalg import cholesky
 
 CHUNK_PREDICTIONS = 256
@@ -34,9 +33,6 @@ CHUNK_PREDICTIONS = 256
 UPDATE_FRACTION = 0.25
 """New rows, as a fraction of the basis functions, above which a factor is computed afresh."""
 
-PANEL = 16
-"""Columns that LAPACK's triangular-pentagonal QR takes at a time."""
-
 
 @dataclass(frozen=True, eq=False)
 class SparsePosterior:
@@ -44,13 +40,13 @@ class SparsePosterior:
 
     Attributes:
         basis: basis functions.
-        sums: sums over the samples.
+        moments: sums over the samples but for G, which the factor holds.
         L: lower Cholesky factor of A = I + G.
         jitter: what was added to the diagonal, 0.0 as a rule.
     """
 
     basis: LatentBasis
-    sums: Sums
+    moments: Moments
     L: Tensor
     jitter: float = 0.0
 
@@ -63,19 +59,28 @@ class SparsePosterior:
         """
         A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
         L, jitter = cholesky(A)
-        return cls(basis, sums, L, jitter)
+        result = cls(basis, Moments(*sums.moments), L, jitter)
+        result.__dict__["sums"] = sums
+        return result
+
+    @cached_property
+    def sums(self) -> Sums:
+        """All sums over the samples, G from the factor where samples were added to it."""
+        eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
+        return Sums(*self.moments.moments, self.L @ self.L.mT - (1.0 + self.jitter) * eye)
 
     @cached_property
     def weights(self) -> Tensor:
         """A⁻¹v, the posterior mean of the basis functions' weights `(size,)`."""
-        return torch.cholesky_solve(self.sums.v[:, None], self.L)[:, 0]
+        return torch.cholesky_solve(self.moments.v[:, None], self.L)[:, 0]
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
         """Of each process, whether any row shows it; the samples change nothing about the others."""
-        diagonal = self.sums.G.diagonal()
+        # The factor of A = I + G is that of the identity where G is zero.
+        diagonal = self.L.diagonal().abs()
         own = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
-        return tuple(bool((diagonal[columns] > 0.0).any()) for columns in own)
+        return tuple(bool((diagonal[columns] > 1.0).any()) for columns in own)
 
     def is_measured(self, p: int) -> bool:
         """Whether any row depends on process p; where none does, its posterior is its prior."""
@@ -177,8 +182,8 @@ class SparsePosterior:
         rows = sum(block.rows for block in blocks)
         if rows > UPDATE_FRACTION * self.basis.size or self.L.device.type != "cpu":
             return SparsePosterior.of(self.basis, self.sums + accumulate(self.basis, blocks))
-        sums, Phi = add_rows(self.basis, self.sums, blocks)
-        return SparsePosterior(self.basis, sums, _extended(self.L, Phi), self.jitter)
+        moments, Phi = add_rows(self.basis, self.moments, blocks)
+        return SparsePosterior(self.basis, moments, extended(self.L, Phi), self.jitter)
 
     def forgetting(self, factor: float) -> SparsePosterior:
         """With every sample so far counting `factor` times; with 0 the prior is left.
@@ -196,19 +201,6 @@ class SparsePosterior:
             NumericalError: the samples were not among them.
         """
         return SparsePosterior.of(self.basis, self.sums - accumulate(self.basis, blocks))
-
-
-def _extended(L: Tensor, rows: Tensor) -> Tensor:
-    """Lower factor of L Lᵀ + rowsᵀ rows, from the QR factorisation of Lᵀ above the rows.
-
-    Its diagonal may be negative, which solves do not mind.
-    """
-    upper, below = np.asfortranarray(L.numpy().T), np.asfortranarray(rows.numpy())
-    (tpqrt,) = scipy.linalg.lapack.get_lapack_funcs(("tpqrt",), (upper,))
-    R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below)
-    if info != 0:
-        raise NumericalError("a Cholesky factor could not be updated", got=f"LAPACK tpqrt info {info}")
-    return torch.from_numpy(R).mT
 
 
 def condition_sparse(

@@ -22,11 +22,10 @@ CHUNK_SAMPLES = 1024
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
-    """Sums over samples for one basis.
+class Moments:
+    """Sums over samples that are cheap to hold.
 
     Attributes:
-        G: Σ V S Vᵀ `(size, size)`.
         v: Σ V Wᵀy `(size,)`.
         yy: Σ y² `()`.
         rows: number of rows, less what is forgotten `()`.
@@ -34,23 +33,38 @@ class Sums:
         missed: what of it the basis misses, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
     """
 
-    G: Tensor
     v: Tensor
     yy: Tensor
     rows: Tensor
     prior: Tensor
     missed: Tensor
 
+    @property
+    def moments(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The sums."""
+        return self.v, self.yy, self.rows, self.prior, self.missed
+
+
+@dataclass(frozen=True, eq=False)
+class Sums(Moments):
+    """All sums over samples for one basis.
+
+    Attributes:
+        G: Σ V S Vᵀ `(size, size)`.
+    """
+
+    G: Tensor
+
     @classmethod
     def zero(cls, basis: LatentBasis, like: Tensor) -> Sums:
         """Sums over no samples."""
         n, p = basis.size, len(basis.parts)
-        return cls(*(like.new_zeros(shape) for shape in ((n, n), (n,), (), (), (p,), (p,))))
+        return cls(*(like.new_zeros(shape) for shape in ((n,), (), (), (p,), (p,), (n, n))))
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
         """All sums."""
-        return self.G, self.v, self.yy, self.rows, self.prior, self.missed
+        return *self.moments, self.G
 
     def __add__(self, other: Sums) -> Sums:
         """Sums over the samples of both.
@@ -70,7 +84,9 @@ class Sums:
         self._check(other)
         if float(other.rows) > float(self.rows):
             raise ModelError(
-                "cannot remove more rows than there are", expected=f"≤ {float(self.rows):g}", got=other.rows
+                "cannot remove more rows than there are",
+                expected=f"at most {float(self.rows):g}",
+                got=float(other.rows),
             )
         return Sums(*(a - b for a, b in zip(self.tensors, other.tensors, strict=True)))
 
@@ -144,13 +160,13 @@ def _by_process(basis: LatentBasis, S: Tensor, variance: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def add_rows(basis: LatentBasis, sums: Sums, blocks: Sequence[Block]) -> tuple[Sums, Tensor]:
-    """Sums with a few more samples, and the rows of these in terms of the basis functions.
+def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> tuple[Moments, Tensor]:
+    """Moments with a few more samples, and the rows of these in terms of the basis functions.
 
     The rows are formed as they stand, which is faster than `accumulate` for a few samples.
 
     Returns:
-        The new sums, and Φ with rows W_i V_iᵀ `(rows, size)`.
+        The new moments, and Φ with rows W_i V_iᵀ `(rows, size)`.
     """
     rows = []
     for block in blocks:
@@ -159,15 +175,14 @@ def add_rows(basis: LatentBasis, sums: Sums, blocks: Sequence[Block]) -> tuple[S
         S = (W.mT @ W).permute(1, 2, 0)
         rows.append((W[:, :, basis.owner] * V[:, None, :]).flatten(0, 1))
         y = block.target.reshape(-1)
-        sums = Sums(
-            torch.addmm(sums.G, rows[-1].mT, rows[-1]),
-            torch.addmv(sums.v, rows[-1].mT, y),
-            sums.yy + y @ y,
-            sums.rows + block.rows,
-            sums.prior + _by_process(basis, S, prior),
-            sums.missed + _by_process(basis, S, missed),
+        moments = Moments(
+            torch.addmv(moments.v, rows[-1].mT, y),
+            moments.yy + y @ y,
+            moments.rows + block.rows,
+            moments.prior + _by_process(basis, S, prior),
+            moments.missed + _by_process(basis, S, missed),
         )
-    return sums, torch.cat(rows)
+    return moments, torch.cat(rows)
 
 
 def _runs(columns: list[slice]) -> list[slice]:

@@ -17,6 +17,7 @@ class Family:
         unit: of the columns, or `None` where it is not known.
         declared: whether the log declares the unit.
         sign: +1, −1, or one of them for each joint of the robot.
+        by_joint: joint of the robot → column, where `columns` does not name the joints as the positions do.
     """
 
     pattern: str
@@ -25,6 +26,7 @@ class Family:
     unit: str | None = None
     declared: bool = False
     sign: float | dict[str, float] = 1.0
+    by_joint: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -87,7 +89,8 @@ class Draft:
         return "\n".join(lines) + "\n"
 
     def _family(self, name: str, family: Family) -> list[str]:
-        pairs: list[list[object]] = [["column", family.pattern], ["stream", family.stream or None]]
+        named = ["columns", family.by_joint] if family.by_joint else ["column", family.pattern]
+        pairs: list[list[object]] = [named, ["stream", family.stream or None]]
         pairs += [["unit", family.unit], ["sign", None if family.sign == 1.0 else family.sign]]
         if name == "torque" and family.unit in ("A", "mA"):
             pairs += [["side", "motor"], ["gear_ratio", 1.0], ["torque_constant", 1.0]]

@@ -6,6 +6,7 @@ torque with the inverse dynamics of the scene's robot, gravity included. What is
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,16 +14,18 @@ import numpy as np
 import torch
 
 from forcegp import dynamics
-from forcegp.constraints import ConstrainedSystem
-from forcegp.logs import headings, smoothing, units
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.errors import DataError
+from forcegp.logs import evidence, headings, smoothing, units
+from forcegp.logs.contact import force_levels
 from forcegp.logs.draft import Draft
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, parse_mapping
 from forcegp.logs.readers import read
 from forcegp.logs.report import Report
+from forcegp.logs.sections import ContactSection
 from forcegp.logs.signals import Array, Signals
 from forcegp.logs.table import LogTable, Progress, Stream
-from forcegp.robot import RobotModel
 
 ROWS = 100_000
 """Rows that are looked at."""
@@ -30,10 +33,12 @@ TRIED_ROWS = 3000
 """Rows on which the inverse dynamics are evaluated."""
 DEFAULT = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s2", "torque": "Nm"}
 """Units that are assumed before any is tried."""
-MOST_RADIANS, LEAST_DEGREES = 60.0, 0.02
-"""Beyond the first, positions are in degrees; below the second, a log in degrees would not move at all."""
+MOST_RADIANS, LEAST_DEGREES = 60.0, 3.2
+"""Positions beyond the first are in degrees; below the second, an arm in degrees would hardly move."""
 CLEARER = 1.5
 """A unit is certain if the torque fits so much better than in the other one."""
+LEAST_FORCE = 1.0
+"""A contact that is always closed presses with more than this [N]."""
 NEAR = 1.3
 """A ratio is that of a unit if it is within this factor."""
 
@@ -73,7 +78,7 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
     headings.find_families(stream, system.robot, draft)
     headings.find_wrench(table, system.robot, draft)
     _try(path, draft, system, _possible_units(draft, stream))
-    _contacts(table, draft, system)
+    _contacts(path, table, draft, system)
     return Guess(draft.toml(), tuple(draft.doubts))
 
 
@@ -94,9 +99,11 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
     fits = {}
     for unit in possible:
         draft.families["position"].unit = unit
-        _, correlation = torque_slopes(_signals(path, draft, system, without="velocity"), system.robot)
+        _, correlation = torque_slopes(_signals(path, draft, system, without="velocity"), system)
         fits[unit] = float((correlation**2).mean())
     best = max(fits, key=fits.__getitem__)
+    if fits[best] < CLEARER * fits[possible[0]]:
+        best = possible[0]
     draft.families["position"].unit = best
     if len(fits) > 1:
         listing = ", ".join(f"{fit:.2f} in {unit}" for unit, fit in fits.items())
@@ -104,7 +111,7 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
         draft.say("position", f"mean squared correlation of the torque with the model: {listing}", doubt)
     if "velocity" in draft.families:
         _velocity_unit(draft, _signals(path, draft, system))
-    _torque(draft, _signals(path, draft, system), system.robot)
+    _torque(draft, _signals(path, draft, system), system)
 
 
 def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
@@ -160,10 +167,10 @@ def _signs(slopes: Array, clear: np.ndarray, joints: tuple[str, ...]) -> float |
     return {j: -1.0 if c and s < 0.0 else 1.0 for j, s, c in zip(joints, slopes, clear, strict=True)}
 
 
-def _torque(draft: Draft, trial: Signals, robot: RobotModel) -> None:
+def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
     """Compare the logged torque with that of the rigid body, beside friction and a constant per joint."""
     family = draft.families["torque"]
-    slopes, correlation = torque_slopes(trial, robot)
+    slopes, correlation = torque_slopes(trial, system)
     clear = np.abs(correlation) > 0.5
     listing = ", ".join(f"{j} {c:+.2f}" for j, c in zip(trial.joint_names, correlation, strict=True))
     draft.say("torque", f"correlation with the robot's inverse dynamics: {listing}")
@@ -189,22 +196,25 @@ def _torque(draft: Draft, trial: Signals, robot: RobotModel) -> None:
         draft.say("torque", f"{size:.3g} times the inverse dynamics: a current, or motor side?", doubt=True)
 
 
-def torque_slopes(trial: Signals, robot: RobotModel) -> tuple[Array, Array]:
+def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Array]:
     """Slope and partial correlation of the logged torque over the inverse dynamics, `(nq,)` each.
 
-    τ_log = k τ_rigid + v q̇ + f sign(q̇) + const by least squares, joint by joint; the correlation is that of
-    what friction and the constant leave of both sides.
+    τ_log = k τ_rigid + v q̇ + f sign(q̇) + Aᵀλ + const by least squares, joint by joint, with a constant λ of
+    each contact; the correlation is that of what the other terms leave of both sides.
 
     Args:
         trial: the log, with `qd`, `qdd` and `tau`.
-        robot: the robot.
+        system: the robot with its contacts.
     """
+    nq = system.robot.nq
     rows = np.linspace(0, len(trial) - 1, min(TRIED_ROWS, len(trial))).astype(int)
     q, qd, qdd, tau = (np.ascontiguousarray(trial.vectors[name][rows]) for name in ("q", "qd", "qdd", "tau"))
-    rigid = dynamics.inverse_dynamics(robot, *(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
-    slopes, correlation = np.zeros(robot.nq), np.zeros(robot.nq)
-    for i in range(robot.nq):
-        others = np.column_stack([np.ones(len(rows)), qd[:, i], np.sign(qd[:, i])])
+    state = [torch.from_numpy(x) for x in (q, qd, qdd)]
+    rigid = dynamics.inverse_dynamics(system.robot, *state).numpy()
+    A = system.equations(state[0], state[1]).A.numpy()
+    slopes, correlation = np.zeros(nq), np.zeros(nq)
+    for i in range(nq):
+        others = np.column_stack([np.ones(len(rows)), qd[:, i], np.sign(qd[:, i]), A[:, :, i]])
         both = np.column_stack([rigid[:, i], tau[:, i]])
         left = both - others @ np.linalg.lstsq(others, both, rcond=None)[0]
         power = (left**2).sum(axis=0)
@@ -214,18 +224,33 @@ def torque_slopes(trial: Signals, robot: RobotModel) -> tuple[Array, Array]:
     return slopes, correlation
 
 
-def _contacts(table: LogTable, draft: Draft, system: ConstrainedSystem) -> None:
+def _contacts(path: str | Path, table: LogTable, draft: Draft, system: ConstrainedSystem) -> None:
     """How the state of each contact of the scene may be known."""
-    for name in system.contact_names:
+    trial: Signals | None = None
+    for contact in system.contacts:
+        name = contact.name
         column = next(
             (c for c in table.names if "contact" in c.lower() and (name in c or system.m == 1)), None
         )
         if column is not None and np.isin(table.stream_of(column).columns[column], (0.0, 1.0)).all():
-            draft.contacts[name] = ['source = "column"', f'column = "{column}"']
-        elif draft.wrench:
-            draft.contacts[name] = ['source = "wrench"']
+            draft.contacts[name] = ['source = "column"', f"column = {json.dumps(column)}"]
+        elif draft.wrench or not isinstance(contact, SurfaceContact):
+            draft.contacts[name] = ['source = "wrench"' if draft.wrench else 'source = "always"']
         else:
-            draft.contacts[name] = ['source = "multiplier"   # or "distance", "always", "never"']
-            draft.say(
-                f"contact {name}", "the log has no contact column: λ of the rigid body shows it", doubt=True
-            )
+            trial = _signals(path, draft, system) if trial is None else trial
+            values = evidence.multiplier(trial, system, contact)
+            source, reason = _state(values, name)
+            draft.contacts[name] = [f'source = "{source}"   # or "multiplier", "distance", "always", "never"']
+            draft.say(f"contact {name}", f"no contact column; {reason}", doubt=True)
+
+
+def _state(values: Array, name: str) -> tuple[str, str]:
+    """Whether λ of the rigid body shows two states, or which one it shows."""
+    middle = float(np.median(values))
+    spread = 1.4826 * float(np.median(np.abs(values - middle)))
+    try:
+        high, low = force_levels(values, name, ContactSection(source="multiplier"))
+    except DataError:
+        source = "always" if middle > max(2.0 * spread, LEAST_FORCE) else "never"
+        return source, f"λ of the rigid body shows one state, {middle:.3g} ± {spread:.2g} N"
+    return "multiplier", f"λ of the rigid body shows two states, parted at {low:.3g} to {high:.3g} N"

@@ -43,7 +43,7 @@ COMMANDED = (
 _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )
-_DECLARED = re.compile(r"[\[(]([^\])]*)[\])]|_(deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps)$")
+_DECLARED = re.compile(r"[\[(]([^\])]*)[\])]|_(deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps)$", re.I)
 _AXES = (("force", "f"), ("torque", "m", "t", "moment"))
 _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
 
@@ -186,6 +186,7 @@ def _match_joints(robot: RobotModel, draft: Draft) -> None:
     """What the log calls each joint, from the names of the positions."""
     names = list(draft.families["position"].columns)
     if set(names) == set(robot.joint_names):
+        _match_others(robot, draft, set(names))
         return
     if all(name.isdigit() for name in names):
         ordered = sorted(names, key=int)
@@ -198,12 +199,22 @@ def _match_joints(robot: RobotModel, draft: Draft) -> None:
         rows, columns = linear_sum_assignment(-likeness)
         draft.joints = {robot.joint_names[i]: names[k] for i, k in zip(rows, columns, strict=True)}
         draft.say("joints", "the names were matched by their likeness", doubt=True)
+    _match_others(robot, draft, set(names))
+
+
+def _match_others(robot: RobotModel, draft: Draft, names: set[str]) -> None:
+    """Families that call the joints otherwise than the positions do: numbered ones get a column per joint."""
     for quantity, family in list(draft.families.items()):
-        if set(family.columns) != set(names):
+        if set(family.columns) == names:
+            continue
+        if all(name.isdigit() for name in family.columns):
+            ordered = sorted(family.columns, key=int)
+            columns = [family.columns[name] for name in ordered]
+            family.by_joint = dict(zip(robot.joint_names, columns, strict=True))
+            draft.say(quantity, "numbered joints were taken from base to tip", doubt=True)
+        else:
             del draft.families[quantity]
-            draft.say(
-                "joints", f"{family.pattern!r} numbers its joints otherwise and was left out", doubt=True
-            )
+            draft.say("joints", f"{family.pattern!r} names its joints otherwise and was left out", doubt=True)
 
 
 def _likeness(joint: str, name: str) -> float:

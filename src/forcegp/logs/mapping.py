@@ -12,11 +12,10 @@ from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 
-from forcegp.errors import MappingError, SceneError
+from forcegp.errors import MappingError
 from forcegp.logs import units
 from forcegp.logs.sections import MappingSections, PerJoint, QuantitySection
-from forcegp.logs.validation import validated
-from forcegp.scene.toml import Document, Key
+from forcegp.scene.document import Document, Key
 
 BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "ur3_mat")
 """Mappings that come with the library: those of published logs, and of ROS topics with the robot's names."""
@@ -137,11 +136,8 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
     Raises:
         MappingError: it is not valid; the message names file, line and key.
     """
-    try:
-        document = Document(content, source)
-    except SceneError as error:
-        raise MappingError(error.message, expected=error.expected, got=error.got, hint=error.hint) from error
-    mapping = Mapping(validated(MappingSections, document), document)
+    document = Document(content, source, MappingError)
+    mapping = Mapping(document.validated(MappingSections), document)
     _check(mapping)
     return mapping
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import OptimizeResult, least_squares
+from scipy.optimize import least_squares
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, Plane, Sphere, SurfaceContact
@@ -23,6 +23,10 @@ LEAST_POINTS = 20
 """Points that a fit needs."""
 ROUNDING = 1e-9
 """Smallest scale of the residuals [m], so that an exact path has one."""
+OUTLIER_STD = 4.0
+"""Rows further from the surface than so many deviations are not on it."""
+LEAST_WIDTH = 10.0
+"""Least width of a path that determines a plane, in deviations of its residuals."""
 LARGEST_TILT = 0.2
 """Standard deviation of the tilt [rad] beyond which the path does not determine a plane."""
 
@@ -37,7 +41,8 @@ class SurfaceFit:
         std: standard deviations: `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane;
             `center` [m] (the largest of its three) and `radius` [m] of a sphere.
         residual: deviation of the path from the surface [m].
-        points, effective_points: how many were fitted, and how many independent ones they are worth.
+        points, outliers: rows that were fitted, and rows too far off to be on the surface.
+        effective_points: how many independent rows the fitted ones are worth.
     """
 
     contact: str
@@ -45,6 +50,7 @@ class SurfaceFit:
     std: dict[str, float]
     residual: float
     points: int
+    outliers: int
     effective_points: float
 
     def toml(self) -> str:
@@ -67,9 +73,9 @@ def fit_surface(
 ) -> SurfaceFit:
     """Fit a surface to the path of the touching point while a contact is closed.
 
-    Least squares of the signed distances, with a loss that grows linearly beyond three deviations, so that
-    rows of bouncing and labelling do not pull. The error bars count residuals that are correlated in time as
-    fewer independent ones.
+    Least squares of the signed distances; rows that a robust fit finds off the surface, such as those of
+    bouncing, are left out and counted. The error bars count residuals that are correlated in time as fewer
+    independent ones.
 
     Args:
         data: a log with the contact's state.
@@ -112,19 +118,20 @@ def _plane(contact: str, points: Array, towards: Array) -> SurfaceFit:
         n = n0 + x[0] * u + x[1] * v
         return n / np.linalg.norm(n)
 
-    x, cov, residuals, effective = _least_squares(lambda x: centered @ normal(x) - x[2], np.zeros(3))
+    found = _least_squares(lambda x: centered @ normal(x) - x[2], np.zeros(3))
+    x, cov, across = found.x, found.covariance, float((centered @ v).std())
     tilt = float(np.sqrt(max(cov[0, 0], cov[1, 1])))
-    if not tilt < LARGEST_TILT:
+    if not (tilt < LARGEST_TILT and across > LEAST_WIDTH * found.residuals.std()):
         raise DataError(
             "the path does not determine a plane: it is nearly straight or a point",
-            expected=f"a tilt known to {np.degrees(LARGEST_TILT):.2g}°",
-            got=f"± {np.degrees(tilt):.3g}°",
+            expected=f"a tilt known to {np.degrees(LARGEST_TILT):.2g}°, on a path wider than its noise",
+            got=f"± {np.degrees(tilt):.3g}° on a path {1e3 * across:.3g} mm wide",
             hint="slide in two directions",
         )
     n = normal(x)
     plane = Plane(tuple(float(c) for c in n), float(n @ middle + x[2]))
     std = {"offset": float(np.sqrt(cov[2, 2])), "tilt": tilt}
-    return SurfaceFit(contact, plane, std, _spread(residuals), len(points), effective)
+    return _result(contact, plane, std, found, len(points))
 
 
 def _sphere(contact: str, points: Array, towards: Array) -> SurfaceFit:
@@ -142,7 +149,8 @@ def _sphere(contact: str, points: Array, towards: Array) -> SurfaceFit:
     def residual(x: Array) -> Array:
         return np.linalg.norm(centered - x[:3], axis=1) - x[3]
 
-    x, cov, residuals, effective = _least_squares(residual, np.array([*start[:3], np.sqrt(squared)]))
+    found = _least_squares(residual, np.array([*start[:3], np.sqrt(squared)]))
+    x, cov = found.x, found.covariance
     center, radius = x[:3] + middle, float(x[3])
     std = {"center": float(np.sqrt(np.diag(cov)[:3].max())), "radius": float(np.sqrt(cov[3, 3]))}
     if not (std["radius"] < 0.5 * radius and (middle - center) @ towards > 0.0):
@@ -152,23 +160,43 @@ def _sphere(contact: str, points: Array, towards: Array) -> SurfaceFit:
             hint="fit a plane, or slide over a larger part of the sphere",
         )
     sphere = Sphere(tuple(float(c) for c in center), radius)
-    return SurfaceFit(contact, sphere, std, _spread(residuals), len(points), effective)
+    return _result(contact, sphere, std, found, len(points))
 
 
-def _least_squares(residual: Callable[[Array], Array], start: Array) -> tuple[Array, Array, Array, float]:
-    """Solution, covariance, residuals and number of independent ones."""
+def _result(
+    contact: str, surface: Plane | Sphere, std: dict[str, float], found: _Solution, points: int
+) -> SurfaceFit:
+    used = len(found.residuals)
+    return SurfaceFit(
+        contact, surface, std, float(found.residuals.std()), used, points - used, found.effective
+    )
 
-    def solve(x: Array) -> OptimizeResult:
-        scale = max(_spread(residual(x)), ROUNDING)
-        return least_squares(residual, x, loss="soft_l1", f_scale=3.0 * scale, x_scale="jac")
 
-    # The scale of the residuals is known only once the first fit has told the outliers from the rest.
-    found = solve(solve(start).x)
-    residuals = residual(found.x)
+@dataclass(frozen=True)
+class _Solution:
+    """Parameters, their covariance, residuals of the rows used, and how many of these are independent."""
+
+    x: Array
+    covariance: Array
+    residuals: Array
+    effective: float
+
+
+def _least_squares(residual: Callable[[Array], Array], start: Array) -> _Solution:
+    """A robust fit tells the outliers from the rest; least squares of the rest gives the error bars."""
+    robust = start
+    for _ in range(2):
+        scale = max(_spread(residual(robust)), ROUNDING)
+        found = least_squares(residual, robust, loss="soft_l1", f_scale=scale, x_scale="jac")
+        robust = found.x
+    first = residual(robust)
+    inside = np.abs(first - np.median(first)) <= OUTLIER_STD * max(_spread(first), ROUNDING)
+    final = least_squares(lambda x: residual(x)[inside], robust, x_scale="jac")
+    residuals = residual(final.x)[inside]
     effective = len(residuals) / correlation_time(residuals)
-    information = found.jac.T @ found.jac * (effective / len(residuals))
-    scale = max(_spread(residuals), ROUNDING)
-    return found.x, scale**2 * np.linalg.pinv(information, hermitian=True), residuals, effective
+    information = final.jac.T @ final.jac * (effective / len(residuals))
+    scale = max(float(residuals.std()), ROUNDING)
+    return _Solution(final.x, scale**2 * np.linalg.pinv(information, hermitian=True), residuals, effective)
 
 
 def correlation_time(values: Array) -> float:

@@ -10,8 +10,9 @@ from difflib import get_close_matches
 import numpy as np
 from numpy.typing import NDArray
 
+from forcegp import limits
 from forcegp.errors import DataError, ForceGPError
-from forcegp.logs import limits
+from forcegp.logs import bounds
 
 Column = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -89,7 +90,7 @@ class Growing:
     """
 
     def __init__(self, expected: int) -> None:
-        self._values = np.empty(max(1024, min(expected, limits.MAX_VALUES)))
+        self._values = np.empty(max(1024, min(expected, limits.LOG_VALUES)))
         self._count = 0
 
     def __len__(self) -> int:
@@ -159,7 +160,7 @@ def arrays_to_streams(
         if squeezed.dtype.kind not in "fiub" or squeezed.ndim not in (1, 2) or squeezed.size < 2:
             remarks.append(f"{name!r} of shape {array.shape} and type {array.dtype} was left out")
         else:
-            usable[name[: limits.MAX_NAME]] = squeezed
+            usable[name[: limits.LOG_NAME]] = squeezed
     lengths = [length for array in usable.values() for length in set(array.shape)]
     common = max(set(lengths), key=lambda length: (lengths.count(length), length), default=0)
     groups: dict[int, dict[str, Column]] = {}
@@ -168,11 +169,11 @@ def arrays_to_streams(
         if array.ndim == 2 and array.shape[0] != rows:
             array = array.T
             remarks.append(f"{name!r} was transposed: its rows are samples")
-        limits.check_values(source, rows, 1 if array.ndim == 1 else array.shape[1])
+        bounds.check_values(source, rows, 1 if array.ndim == 1 else array.shape[1])
         groups.setdefault(rows, {}).update(_columns(name, array))
-    limits.check_count(source, "arrays of different length", len(groups), limits.MAX_STREAMS)
+    bounds.check_count(source, "arrays of different length", len(groups), limits.LOG_STREAMS)
     for rows, columns in groups.items():
-        limits.check_values(source, rows, len(columns))
+        bounds.check_values(source, rows, len(columns))
     return tuple(
         Stream("" if rows == common else f"{rows} rows", columns)
         for rows, columns in sorted(groups.items(), key=lambda item: item[0] != common)

@@ -1,0 +1,5 @@
+"""Models of the forward dynamics: what they are made of, fitting, predicting, and reading them back."""
+
+from forcegp.models import transport
+
+transport.register()

@@ -281,7 +281,7 @@ def load_independent(
     settings = settings_of(header, IndependentSettings, source)
     nq, dtype = system.robot.nq, system.robot.dtype
     model = IndependentGP(system, settings.noise_std)
-    n = len(take(tensors, "training.q", None, dtype, source))
+    n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
     features = {
         name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
     }

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.identifiability import force_correlation
-from forcegp.forces.learn import Problem, analytical_parameters, kernel_parameters
+from forcegp.forces.inference import force_posterior, jitter_of, log_likelihood
+from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import CONTACT, JOINT, ForcePrior
-from forcegp.forces.quantities import affine_maps, flat_states, stack, states
+from forcegp.forces.quantities import AffineMap, affine_maps, flat_states, stack
 from forcegp.forces.samples import draw_samples
-from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
@@ -69,6 +69,7 @@ class StructuredFit(FittedModel):
         active: Tensor | None = None,
         covariance: bool = True,
         system: ConstrainedSystem | None = None,
+        noise: bool = False,
     ) -> Prediction:
         """Posterior mean and covariance of a quantity (eqs. 22 to 25).
 
@@ -78,9 +79,10 @@ class StructuredFit(FittedModel):
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
             covariance: whether to compute the covariance, which costs more than the mean.
             system: read the forces on another system, such as another surface or none at all.
+            noise: whether the covariance is that of a measurement, noise of torque and sensor included.
 
         Returns:
-            Mean `(*batch, d)` and covariance `(*batch, d, d)`, without measurement noise.
+            Mean `(*batch, d)` and covariance `(*batch, d, d)`, without measurement noise by default.
 
         Raises:
             UnknownNameError: no such quantity.
@@ -92,6 +94,8 @@ class StructuredFit(FittedModel):
         z, parts = stack(affine_maps(system, at, quantity))
         mean = self.posterior.read_mean(system, at, z)
         spread = self.posterior.read_covariance(system, at, z) if covariance else None
+        if spread is not None and noise:
+            spread = spread + self._noise_covariance(z, parts)
         return Prediction(
             mean.reshape(*flat.batch, z.o.shape[-1]),
             None if spread is None else spread.reshape(*flat.batch, *spread.shape[-2:]),
@@ -107,9 +111,29 @@ class StructuredFit(FittedModel):
         return draw_samples(self.posterior, samples, generator, FEATURES).total_force
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
-        latent = self.posterior.latent
-        assert isinstance(latent, ExactPosterior)
-        return pack(self.specification, self.training, self.hyperparameters, latent.alpha, self.result)
+        return pack(self.specification, self.problem, self.hyperparameters, self.posterior, self.result)
+
+    @property
+    def torque_std(self) -> Tensor | None:
+        """Standard deviation of the motor torque's noise as it is predicted, `(nq,)`, or `None` for none."""
+        learned = self.hyperparameters.get(TORQUE_NOISE)
+        if self.problem.torque_std is not None:
+            return self.problem.torque_std
+        return None if learned is None else learned.exp()
+
+    def _noise_covariance(self, z: AffineMap, parts: Mapping[str, slice]) -> Tensor:
+        """B Σ_τ Bᵀ + Σ_q̈ of a measurement of the quantities, `(n, d, d)`."""
+        noise = z.o.new_zeros(*z.o.shape, z.o.shape[-1])
+        if self.torque_std is not None:
+            noise = noise + (z.B_Q * self.torque_std**2) @ z.B_Q.mT
+        for i, quantity in enumerate(self.training.quantities):
+            if quantity in parts:
+                std = self.problem.noise_at(self.hyperparameters, i)
+                std = std if std.ndim == 1 else std.square().mean(0).sqrt()
+                own = torch.zeros_like(z.o[0])
+                own[parts[quantity]] = std**2
+                noise = noise + torch.diag(own)
+        return noise
 
 
 def learned_system(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> ConstrainedSystem:
@@ -123,35 +147,35 @@ def learned_system(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> C
 @torch.no_grad()
 def conditioned(
     specification: Specification,
-    training: Training,
+    problem: Problem,
     hyperparameters: Mapping[str, Tensor],
     learned: Learned | None = None,
+    warnings: Sequence[str] = (),
 ) -> StructuredFit:
-    """Condition forces on training data at given hyperparameters.
+    """Condition forces on the data of a problem at given hyperparameters.
 
     Args:
         specification: what is conditioned.
-        training: the data.
+        problem: data, robot and inference.
         hyperparameters: of priors, noise and robot.
         learned: how they were learned.
+        warnings: doubts that have come up.
 
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
-    problem = specification.problem(training)
-    rows = problem.rows(hyperparameters)
-    latent = ExactPosterior.of(problem.priors, kernel_parameters(hyperparameters), rows.blocks)
+    posterior = force_posterior(problem, hyperparameters)
     system = learned_system(problem, hyperparameters)
-    posterior = ForcePosterior(problem.priors, training.scales, problem.mean, latent)
-    log_likelihood = float(latent.log_likelihood() - rows.constant)
-    learned = learned or Learned({}, -log_likelihood, True, 0, 0.0, "conditioned, nothing learned")
+    likelihood = log_likelihood(posterior) - float(problem.rows(hyperparameters).constant)
+    learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
+    jitter = jitter_of(posterior)
     result = FitResult.of(
         learned,
-        log_marginal_likelihood=log_likelihood,
-        jitter=latent.conditioned.jitter,
-        constant_inputs=_constant_inputs(problem.priors, training),
-        force_correlation=_mean_correlation(posterior, system, training),
-        warnings=_warnings(latent.conditioned.jitter),
+        log_marginal_likelihood=likelihood,
+        jitter=jitter,
+        constant_inputs=_constant_inputs(problem.priors, problem.training),
+        force_correlation=_mean_correlation(posterior, system, problem.training),
+        warnings=(*warnings, *_warnings(jitter)),
     )
     return StructuredFit(specification, problem, hyperparameters, posterior, result, system)
 
@@ -178,7 +202,7 @@ def _mean_correlation(
     if not {JOINT, CONTACT} <= targets:
         return None
     few = training.thinned(min(CORRELATION_STATES, training.samples)).measurements
-    parts = [force_correlation(posterior, system, states(system, *m.states)) for m in _in_contact(few)]
+    parts = [force_correlation(posterior, system, m.at(system)) for m in _in_contact(few)]
     return float(torch.cat(parts).mean()) if parts else None
 
 

@@ -5,6 +5,7 @@ q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and likewise for every other quantit
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -13,16 +14,18 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
+from forcegp.forces.inference import check_method
 from forcegp.forces.learn import Problem, Search
 from forcegp.forces.mean import AnalyticalMean, mean_of
 from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
-from forcegp.gp.optimise import LearningOptions, Progress
+from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_spec import Specification
+from forcegp.models.structured_learning import in_motion, prepared, solve
+from forcegp.models.structured_spec import Specification, torque_noise_of
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
@@ -60,14 +63,30 @@ class StructuredGP(Model[StructuredFit]):
         noise_std: NoiseStd | None = None,
         learn_noise: bool = False,
         analytical_parameters: nn.Module | None = None,
+        torque_noise: NoiseStd | str | None = "auto",
+        inference: str = "auto",
     ) -> None:
         form = mean_of(mean)
         priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
         check_priors(priors, system)
         self.specified = system
         self.specification = Specification(
-            system, form, priors, noise_std, learn_noise, analytical_parameters
+            system,
+            form,
+            priors,
+            noise_std,
+            learn_noise,
+            analytical_parameters,
+            torque_noise_of(torque_noise, priors),
+            check_method(inference),
         )
+
+    @classmethod
+    def of(cls, specification: Specification) -> StructuredGP:
+        """A model with a given specification."""
+        model = cls.__new__(cls)
+        model.specified, model.specification = specification.system, specification
+        return model
 
     @property
     def mean(self) -> AnalyticalMean:
@@ -95,6 +114,7 @@ class StructuredGP(Model[StructuredFit]):
         begin: Mapping[str, Tensor] | None = None,
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
+        keep_checkpoint: bool = False,
     ) -> StructuredFit:
         """Learn hyperparameters (and analytical parameters) by maximum a posteriori, then condition.
 
@@ -107,8 +127,9 @@ class StructuredGP(Model[StructuredFit]):
             begin: `hyperparameters` of a fit of the same kind of model, such as one to less data, where
                 learning begins; by default it begins on fewer samples (`options.warm_start`).
             progress: called after each evaluation.
-            checkpoint: file that keeps the best values of a long fit; a fit that finds it resumes from
-                there, and removes it at its end.
+            checkpoint: file that records the evaluations of a long fit; a fit that finds it resumes
+                there, to the same bits as one without a break, and removes it at its end.
+            keep_checkpoint: leave the file, to be removed once the model is saved.
 
         Returns:
             The fitted model, which is also kept as `fitted`.
@@ -120,28 +141,31 @@ class StructuredGP(Model[StructuredFit]):
         spec = self.specification
         options = options or (LearningOptions() if spec.parameters is None else WITH_PARAMETERS)
         chosen = self._chosen(learn)
-        problem = spec.problem(self._training(data, chosen))
-        start = problem.initial(spec.learn_noise)
+        training, doubts = in_motion(spec, self._training(data, chosen))
+        problem = spec.problem(training)
+        start = problem.initial(spec.learn_noise, spec.learns_torque_noise)
         before = {} if self._fitted is None else self._fitted.hyperparameters
         current = {key: before.get(key, value) for key, value in start.items()}
         held = {key: value for key, value in current.items() if key.split(".")[0] not in chosen}
         free = {key: value for key, value in start.items() if key not in held}
         if not free:
-            return self.adopt(conditioned(spec, problem.training, held))
+            return self.adopt(conditioned(spec, prepared(spec, problem, held), held, warnings=doubts))
 
         def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
             if progress is not None:
                 progress(evaluations, options.max_evaluations, value)
 
-        note: Progress = report
-        saved = None
+        search, saved = Search(free, held, options), None
         if checkpoint is not None:
-            saved = Checkpoint(Path(checkpoint), _key(problem, options, free))
-            found = saved.read(free)
-            begin, note = begin if found is None else found, saved.noting(report)
-        learned = Search(free, held, options).solve(problem, note, begin)
-        fitted = self.adopt(conditioned(spec, problem.training, {**held, **learned.tensors}, learned))
+            saved = Checkpoint(Path(checkpoint), _key(spec, problem, search, begin))
+            saved.read(free)
+            search = dataclasses.replace(search, recorded=saved.recorded)
+        lesson = solve(spec, problem, search, report, begin)
         if saved is not None:
+            saved.write()
+        doubts = (*doubts, *lesson.warnings)
+        fitted = self.adopt(conditioned(spec, lesson.problem, lesson.hyperparameters, lesson.learned, doubts))
+        if saved is not None and not keep_checkpoint:
             saved.remove()
         return fitted
 
@@ -169,7 +193,9 @@ class StructuredGP(Model[StructuredFit]):
                 hint='call fit(data, learn=["noise"]), which learns the noise alone',
             )
         values = fitted.hyperparameters if hyperparameters is None else hyperparameters
-        return self.adopt(conditioned(self.specification, training, values))
+        spec, (moving, doubts) = self.specification, in_motion(self.specification, training)
+        problem = prepared(spec, dataclasses.replace(fitted.problem, training=moving), values)
+        return self.adopt(conditioned(spec, problem, values, warnings=doubts))
 
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""
@@ -225,13 +251,14 @@ class StructuredGP(Model[StructuredFit]):
         return self.fitted.training
 
 
-def _key(problem: Problem, options: LearningOptions, free: Mapping[str, Tensor]) -> str:
+def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:
     """Identifies the learning of some tensors, on these data and this system, with these options."""
     training = problem.training
     data = [value for m in training.measurements for value in m.tensors]
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
     record, robot = pack_system(problem.system)
+    named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
     return Checkpoint.key_of(
-        problem.mean, priors, options, list(free), training.quantities, *data, *training.noise_std,
-        record, *robot.values(),
+        problem.mean, priors, spec.inference, search.options, training.quantities, *data, *training.noise_std,
+        record, *robot.values(), *(part for pair in named for part in pair),
     )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import torch
@@ -15,6 +16,7 @@ from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
+from forcegp.gp.sparse_tensors import posterior_of_tensors
 from forcegp.models.base import FitResult
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
@@ -39,18 +41,13 @@ def load_structured(
     """
     settings = settings_of(header, StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)
-    model = StructuredGP(
-        spec.system, spec.mean, spec.priors, spec.noise_std, spec.learn_noise, spec.parameters
-    )
+    model = StructuredGP.of(spec)
     try:
-        for name, value in tensors.items():
-            finite = name.removeprefix("start.") in ("lower", "upper", "velocity_limit", "effort_limit")
-            if value.is_complex() or not (finite or bool(torch.isfinite(value).all())):
-                raise ValueError(f"tensor {name!r} holds values that are not finite real numbers")
+        _check_types(tensors)
         training = _training(settings, spec, tensors)
         hyper = _below(tensors, "hyper.")
         _check_hyperparameters(spec, training, hyper)
-        model.adopt(_restored(spec, training, hyper, tensors["alpha"], settings, system))
+        model.adopt(_restored(spec, training, hyper, tensors, settings, system))
     except (KeyError, RuntimeError, ValueError, IndexError) as cause:
         raise ModelError(f"{source}: the model's tensors do not fit its settings", got=str(cause)) from cause
     return model
@@ -63,23 +60,43 @@ def _specification(
         decode(dict(prior), CLASSES, f"{source}: settings.priors.{i}")
         for i, prior in enumerate(settings.priors)
     )
-    parameters = None
+    original, parameters = take_robot(tensors, "start.", system.robot, source), None
+    system = system.with_robot(original)
     if settings.analytical is not None:
-        original = take_robot(tensors, "start.", system.robot, source)
         try:
-            system = system.with_robot(original)
             parameters = AnalyticalParameters(original, settings.analytical)
         except ForceGPError as cause:
             raise ModelError.at(f"{source}: field 'settings.analytical'", cause) from cause
     return Specification(
-        system, AnalyticalMean(settings.mean), priors, settings.noise_std, settings.learn_noise, parameters
+        system,
+        AnalyticalMean(settings.mean),
+        priors,
+        settings.noise_std,
+        settings.learn_noise,
+        parameters,
+        settings.torque_noise,
+        settings.inference,
     )
+
+
+def _check_types(tensors: Mapping[str, Tensor]) -> None:
+    """Raise `ValueError` where a tensor is not of real numbers, or contacts are not flags."""
+    for name, value in tensors.items():
+        is_flag = name.startswith("data.") and name.endswith(".active")
+        fits = value.dtype == torch.bool if is_flag else value.is_floating_point()
+        if not fits:
+            raise ValueError(f"tensor {name!r} has type {value.dtype}")
 
 
 def _training(settings: StructuredSettings, spec: Specification, tensors: Mapping[str, Tensor]) -> Training:
     measurements, noise = [], []
     for i, quantity in enumerate(settings.measured):
         m = Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in COLUMNS})
+        n, nq = len(m.values) if m.values.ndim == 2 else -1, spec.system.robot.nq
+        shapes = {"q": (n, nq), "qd": (n, nq), "tau": (n, nq), "active": (n, len(spec.system.contacts))}
+        for name, shape in shapes.items():
+            if getattr(m, name).shape != shape:
+                raise ValueError(f"tensor 'data.{i}.{name}' has shape {tuple(getattr(m, name).shape)}")
         std = tensors[f"data.{i}.noise_std"]
         if std.shape not in (m.values.shape, m.values.shape[-1:]) or not bool((std > 0.0).all()):
             raise ValueError(f"noise of measurement {i} has shape {tuple(std.shape)}, or is not positive")
@@ -111,18 +128,28 @@ def _restored(
     spec: Specification,
     training: Training,
     hyper: dict[str, Tensor],
-    alpha: Tensor,
+    tensors: Mapping[str, Tensor],
     settings: StructuredSettings,
     system: ConstrainedSystem,
 ) -> StructuredFit:
     """The fit with its weights as they were; the factorisation waits until a covariance is asked for."""
-    problem = spec.problem(training)
-    blocks = problem.rows(hyper).blocks
-    rows = sum(block.rows for block in blocks)
-    if alpha.shape != (rows,):
-        raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
-    latent = ExactPosterior(problem.priors, kernel_parameters(hyper), blocks, alpha)
-    posterior = ForcePosterior(problem.priors, training.scales, problem.mean, latent)
+    problem = dataclasses.replace(
+        spec.problem(training),
+        system=spec.system if spec.parameters is not None else system,
+        power=settings.power,
+        offsets=_below(tensors, "offset."),
+        torque_std=tensors.get("torque_std"),
+    )
+    params = kernel_parameters(hyper)
+    if "alpha" in tensors:
+        blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
+        rows = sum(block.rows for block in blocks)
+        if alpha.shape != (rows,):
+            raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
+        latent = ExactPosterior(problem.priors, params, blocks, alpha)
+    else:
+        latent = posterior_of_tensors(problem.priors, params, _below(tensors, "sparse."))
+    posterior = ForcePosterior(problem.priors, training.scales, problem.mean, latent, problem.offsets)
     constant = tuple(
         f"{p.name}.{name}"
         for p, scale in zip(spec.priors, training.scales, strict=True)

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ModelError
 from forcegp.forces.learn import Problem, analytical_parameters
 from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import NoiseStd, Training
+from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.gp import kernels, stationary
+from forcegp.gp.exact import ExactPosterior
+from forcegp.gp.sparse import SparsePosterior
+from forcegp.gp.sparse_tensors import tensors_of_posterior
 from forcegp.models.base import FitResult
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import encode
@@ -33,7 +40,10 @@ CLASSES: dict[str, type] = {
     "linear": kernels.Linear,
     "sum": kernels.Sum,
     "product": kernels.Product,
+    "constant": kernels.Constant,
     "joint": JointForcePrior,
+    "joint_friction": JointFrictionPrior,
+    "inertial": InertialPrior,
     "normal": NormalForcePrior,
     "contact": ContactForcePrior,
     "sliding_friction": SlidingFrictionPrior,
@@ -54,6 +64,8 @@ class Specification:
         noise_std: of measured accelerations, or `None` for what the log states.
         learn_noise: whether the noise is learned.
         parameters: module whose `forward()` gives the robot at θ_A, or `None`.
+        torque_noise: standard deviation of the motor torque's white noise, `"learn"`, or `None` for none.
+        inference: `"auto"`, `"exact"` or `"sparse"`.
     """
 
     system: ConstrainedSystem
@@ -62,10 +74,41 @@ class Specification:
     noise_std: NoiseStd | None = None
     learn_noise: bool = False
     parameters: nn.Module | None = None
+    torque_noise: NoiseStd | str | None = None
+    inference: str = "auto"
+
+    @property
+    def learns_torque_noise(self) -> bool:
+        """Whether the noise of the motor torque is learned."""
+        return isinstance(self.torque_noise, str)
 
     def problem(self, training: Training) -> Problem:
         """The learning problem of training data."""
-        return Problem(self.system, self.priors, self.mean, training, self.parameters)
+        robot, noise = self.system.robot, self.torque_noise
+        std = None
+        if noise is not None and not isinstance(noise, str):
+            std = torch.as_tensor(noise, dtype=robot.dtype, device=robot.device).expand(robot.nq)
+        return Problem(self.system, self.priors, self.mean, training, self.parameters, std)
+
+
+def torque_noise_of(given: NoiseStd | str | None, priors: Sequence[ForcePrior]) -> NoiseStd | str | None:
+    """What is known of the noise of the motor torque.
+
+    Raises:
+        ModelError: a name other than "auto" and "learn", or a value that is not positive.
+    """
+    if given == "auto":
+        measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
+        return "learn" if measured else None
+    if given is None or given == "learn":
+        return given
+    if isinstance(given, str) or not bool((torch.as_tensor(given) > 0.0).all()):
+        raise ModelError(
+            "the noise of the motor torque is not valid",
+            expected="'auto', 'learn', None, or positive standard deviations [N m, N]",
+            got=given,
+        )
+    return given
 
 
 class ResultSettings(Settings):
@@ -88,6 +131,9 @@ class StructuredSettings(Settings):
     mean: tuple[str, ...]
     noise_std: PositiveFloat | tuple[PositiveFloat, ...] | None
     learn_noise: bool
+    torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["learn"] | None
+    inference: Literal["auto", "exact", "sparse"]
+    power: float = Field(gt=0.0, le=1.0)
     priors: tuple[dict[str, Any], ...]
     measured: tuple[str, ...]
     constant: tuple[tuple[str, ...], ...]
@@ -97,46 +143,71 @@ class StructuredSettings(Settings):
 
 def pack(
     spec: Specification,
-    training: Training,
+    problem: Problem,
     hyperparameters: Mapping[str, Tensor],
-    alpha: Tensor,
+    posterior: ForcePosterior,
     result: FitResult,
 ) -> tuple[StructuredSettings, dict[str, Tensor]]:
-    """A fit as settings and tensors.
+    """A fit as settings and tensors; an exact posterior keeps its data, a sparse one its sums over them.
 
     Args:
         spec: what was fitted.
-        training: what it is conditioned on.
+        problem: what it is conditioned on.
         hyperparameters: all learned tensors.
-        alpha: weights of the rows.
+        posterior: over the forces.
         result: how the fit went.
 
     Raises:
         ModelError: a prior or kernel is Python code.
     """
-    noise = None if spec.noise_std is None else torch.as_tensor(spec.noise_std).tolist()
+    training, latent = problem.training, posterior.latent
     own = spec.parameters if isinstance(spec.parameters, AnalyticalParameters) else None
+    exact = isinstance(latent, ExactPosterior)
     settings = StructuredSettings(
         mean=spec.mean.terms,
-        noise_std=tuple(noise) if isinstance(noise, list) else noise,
+        noise_std=_plain(spec.noise_std),
         learn_noise=spec.learn_noise,
+        torque_noise=_plain(spec.torque_noise),
+        inference=spec.inference,  # pyright: ignore[reportArgumentType]
+        power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in spec.priors),
-        measured=training.quantities,
+        measured=training.quantities if exact else (),
         constant=tuple(scale.constant for scale in training.scales),
         analytical=None if own is None else own.joints,
         result=ResultSettings(**{name: getattr(result, name) for name in ResultSettings.model_fields}),
     )
     tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
-    tensors["alpha"] = alpha
-    if own is not None:
-        tensors |= {f"start.{name}": getattr(own.start, name) for name in robot_tensors(own.start)}
-    for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
-        tensors |= {f"data.{i}.{name}": getattr(m, name) for name in COLUMNS}
-        tensors[f"data.{i}.noise_std"] = std
+    tensors |= {f"offset.{name}": value for name, value in problem.offsets.items()}
+    if problem.torque_std is not None:
+        tensors["torque_std"] = problem.torque_std
+    if isinstance(latent, ExactPosterior):
+        tensors |= {"alpha": latent.alpha, **_tensors_of(training)}
+    else:
+        assert isinstance(latent, SparsePosterior)
+        tensors |= {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
+    start = own.start if own is not None else spec.system.robot
+    tensors |= {f"start.{name}": getattr(start, name) for name in robot_tensors(start)}
     for prior, scale in zip(spec.priors, training.scales, strict=True):
         tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
         tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
     return settings, tensors
+
+
+def _tensors_of(training: Training) -> dict[str, Tensor]:
+    """The data of an exact posterior."""
+    tensors = {}
+    for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
+        tensors |= {f"data.{i}.{name}": getattr(m, name) for name in COLUMNS}
+        tensors[f"data.{i}.noise_std"] = std
+    return tensors
+
+
+def _plain(noise: Any) -> Any:
+    """A noise as what JSON can hold."""
+    if noise is None or isinstance(noise, str):
+        return noise
+    values = torch.as_tensor(noise).tolist()
+    return tuple(values) if isinstance(values, list) else values
 
 
 def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:

@@ -6,12 +6,14 @@ comparison; the default kernels are a different model.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from forcegp.paper.results import GP_MODELS, PAPER_KERNELS, SPLITS, PaperNumbers, Results
+from forcegp.paper.results import GP_MODELS, PAPER_KERNELS, SPLITS, PaperNumbers, Results, like
 from forcegp.report.html import Block, Finding
 from forcegp.report.style import INK, MARKERS, Picture, colour, draw, label
 from forcegp.report.tables import NONE, Table, number
@@ -106,9 +108,7 @@ def _curves(axes: Axes, results: Results, split: str, measure: str) -> None:
         axes.plot([], [], color=INK, linestyle=KERNEL_LINE, linewidth=1.0, label="paper's kernel")
 
 
-def _curve(
-    axes: Axes, results: Results, model: str, split: str, measure: str, style: dict[str, object]
-) -> None:
+def _curve(axes: Axes, results: Results, model: str, split: str, measure: str, style: dict[str, Any]) -> None:
     found = {n: v for n in results.sizes(model) if (v := results.values(model, split, n, measure))}
     if found:
         axes.plot(list(found), [sum(v) / len(v) for v in found.values()], **style)
@@ -143,15 +143,16 @@ def curve_table(results: Results, paper: PaperNumbers, kind: str) -> Table:
         for split in SPLITS:
             values = [number(results.values(model, split, n, f"{kind}_mae"), 4) for n in sizes]
             rows.append((f"{label(model)}, {SPLITS[split]}", *values))
-        if kind == "noisy" and model in paper.noisy_mae:
-            rows.append((f"{label(model)}, paper", *(paper_value(paper, model, n) for n in sizes)))
+        theirs = paper.beside(results, model) if kind == "noisy" else None
+        if theirs is not None:
+            rows.append((f"{label(theirs)}, paper", *(paper_value(paper, theirs, n) for n in sizes)))
     caption = f"Mean absolute error against {kind} accelerations over training points [rad/s²]"
     return Table(caption, ("N", *(str(n) for n in sizes)), tuple(rows))
 
 
-def paper_value(paper: PaperNumbers, model: str, points: int) -> str:
+def paper_value(paper: PaperNumbers, model: str | None, points: int) -> str:
     """The paper's error for a model, if it gives one for that many points."""
-    value = paper.error(model, points)
+    value = None if model is None else paper.error(model, points)
     return NONE if value is None else f"{value:g}"
 
 
@@ -172,8 +173,7 @@ def residual_table(results: Results, paper: PaperNumbers) -> Table:
 
 def against_paper(results: Results, paper: PaperNumbers, model: str) -> Finding | None:
     """Our error on the paper's split against the paper's at every N, with the paper's kernel first."""
-    like = PAPER_KERNELS.get(model, model)
-    same = like if like in results.models else model
+    same = like(results, model)
     pairs = {
         n: (ours, theirs)
         for n in paper.points

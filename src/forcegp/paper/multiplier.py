@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from matplotlib.figure import Figure
@@ -150,7 +150,7 @@ def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> Picture:
 
     def paint(figure: Figure) -> None:
         both, error = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-        filled = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ"}
+        filled: dict[str, Any] = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ"}
         for axes, centre in ((both, torch.zeros_like(mean)), (error, simulated)):
             shade(axes, data.held_out)
             axes.fill_between(data.t, mean - spread - centre, mean + spread - centre, **filled)

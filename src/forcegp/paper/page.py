@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from forcegp.paper.covariance import covariance_block
 from forcegp.paper.figures import FigureData
 from forcegp.paper.identification import identification_block, identification_finding
@@ -30,6 +32,7 @@ from forcegp.paper.task_space import task_space_block
 from forcegp.paper.trajectories import bands, tip_error
 from forcegp.report.html import Block, Finding, render
 from forcegp.report.rollouts import rollout_section, rollout_table
+from forcegp.report.style import label
 from forcegp.report.tables import Table, cell
 
 ROLLOUTS = "stages/figures/rollouts/data.json"
@@ -75,14 +78,16 @@ def render_page(results: Results, figures: FigureData) -> str:
 
 def _opening(results: Results, paper: PaperNumbers, figures: FigureData) -> Block:
     """What the page shows first: how error falls with data, and the contact force with its band."""
-    pictures = [draw_learning_curve(results, paper, "stretches", "clean")]
+    drawn = {"Error over training points": draw_learning_curve(results, paper, "stretches", "clean")}
     band = next((b for b in figures.multiplier.bands if b.model == OPENING), None)
-    pictures += [draw_multiplier(figures.multiplier, band)] if band else []
+    if band is not None:
+        drawn[f"Contact force ({label(OPENING)})"] = draw_multiplier(figures.multiplier, band)
+    pictures = tuple(dataclasses.replace(picture, title=title) for title, picture in drawn.items())
     caption = (
-        "Left: error of predicted accelerations on motion without training points. Right: the contact force "
-        "predicted from accelerations alone; the shaded time contains no training point."
+        "Error of predicted accelerations on motion without training points, and the contact force predicted "
+        "from accelerations alone; the shaded time contains no training point."
     )
-    return Block("In short", caption, tuple(pictures), "results.json")
+    return Block("In short", caption, pictures, "results.json")
 
 
 def _tables(results: Results, paper: PaperNumbers) -> dict[str, Table]:

@@ -30,7 +30,6 @@ class Profile:
         rollout_seconds: length of the trajectories that are predicted in open loop [s].
         rollout_starts: states of a further simulated run that they start from.
         rollout_samples: function samples of their bands.
-        calibration_starts: trajectories on which the bands are calibrated.
     """
 
     name: str
@@ -51,7 +50,6 @@ class Profile:
     rollout_seconds: float = 10.0
     rollout_starts: int = 16
     rollout_samples: int = 100
-    calibration_starts: int = 32
 
 
 PROFILES = {
@@ -66,10 +64,9 @@ PROFILES = {
         ("nn",),
         paper_split_baselines=False,
         identification_points=100,
-        rollout_seconds=2.0,
+        rollout_seconds=1.0,
         rollout_starts=8,
         rollout_samples=20,
-        calibration_starts=8,
     ),
     "paper": Profile(
         "paper",

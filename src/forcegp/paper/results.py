@@ -102,6 +102,12 @@ class Results(Header):
         return sum(values) / len(values) if values else None
 
 
+def like(results: Results, model: str) -> str:
+    """Our model that compares with the paper's of that name: with the paper's kernel, if it was fitted."""
+    own = PAPER_KERNELS.get(model, model)
+    return own if own in results.models else model
+
+
 class PaperNumbers(Header):
     """What the paper reports.
 
@@ -124,6 +130,10 @@ class PaperNumbers(Header):
         """The paper's error of a model at a size, if it gives one [rad/s²]."""
         known = model in self.noisy_mae and points in self.points
         return self.noisy_mae[model][self.points.index(points)] if known else None
+
+    def beside(self, results: Results, model: str) -> str | None:
+        """The paper's model that one of ours compares with, if there is one."""
+        return next((name for name in self.noisy_mae if like(results, name) == model), None)
 
 
 def paper_numbers() -> PaperNumbers:

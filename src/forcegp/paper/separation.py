@@ -20,7 +20,7 @@ from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import Observation
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.quantities import states
+from forcegp.forces.quantities import States, states
 from forcegp.gp.kernels import Linear
 from forcegp.gp.stationary import SquaredExponential
 from forcegp.models.structured_gp import StructuredGP
@@ -39,7 +39,10 @@ class Separation:
         joint_error: mean absolute error of the joint friction, relative to its mean absolute value.
         contact_error: the same of the contact's generalized friction Q_z.
         acceleration_error: mean absolute error of q̈ against noise-free values [rad/s²].
-        correlation: mean posterior correlation of Q and Q_z, −1 where only their sum is known.
+        correlation: mean posterior correlation of Q and Q_z over the held-out states in contact, −1 where
+            only their sum is known.
+        correlation_free: the same over held-out states in free motion, where no Q_z acts: 0 unless the
+            model lets the contact's friction act without contact.
     """
 
     way: str
@@ -47,6 +50,7 @@ class Separation:
     contact_error: float
     acceleration_error: float
     correlation: float
+    correlation_free: float
 
 
 def free_motion(system: ConstrainedSystem, config: SimulationConfig) -> Dataset:
@@ -65,7 +69,8 @@ def free_motion(system: ConstrainedSystem, config: SimulationConfig) -> Dataset:
     return data.replace(contact=opened, header=header)
 
 
-def _unfitted(system: ConstrainedSystem, noise_std: float) -> StructuredGP:
+def unfitted(system: ConstrainedSystem, noise_std: float) -> StructuredGP:
+    """A model of both frictions, with everything else known."""
     contact = system.contact_names[0]
     joint = JointForcePrior(Linear() + SquaredExponential(), inputs=("qd",))
     friction = ContactForcePrior(contact, Linear(("velocity",)) + SquaredExponential())
@@ -77,7 +82,7 @@ def fit_ways(
     system: ConstrainedSystem, contact: Dataset, free: Dataset, noise_std: float
 ) -> dict[str, StructuredGP]:
     """The three ways of learning, by name, from training data in contact and in free motion."""
-    ways = {way: _unfitted(system, noise_std) for way in ("contact", "two_stages", "both")}
+    ways = {way: unfitted(system, noise_std) for way in ("contact", "two_stages", "both")}
     both = [Observation(free), Observation(contact)]
     joint, friction = (prior.name for prior in ways["both"].force_priors)
     ways["contact"].fit(contact)
@@ -88,11 +93,17 @@ def fit_ways(
 
 
 @torch.no_grad()
-def judge(way: str, model: StructuredGP, test: Dataset) -> Separation:
-    """Errors of a way on test data in contact, where the simulator's forces are known."""
+def judge(way: str, model: StructuredGP, test: Dataset, free: Dataset) -> Separation:
+    """Errors of a way on held-out data, where the simulator's forces are known.
+
+    Args:
+        way: its name.
+        model: fitted.
+        test: held-out samples in contact.
+        free: held-out samples in free motion.
+    """
     system = model.system
-    active = test.active(system.contact_names)
-    at = states(system, test.q, test.qd, test.tau, active)
+    active, at = test.active(system.contact_names), _states(system, test)
     state = (test.q, test.qd, test.tau)
     known = at.eom.Q_C + at.eom.Q_G + test.tau
     joint = model.predict(*state, "joint_force", active=active, covariance=False).mean - known
@@ -104,7 +115,12 @@ def judge(way: str, model: StructuredGP, test: Dataset) -> Separation:
         _relative(contact, test.Q_z),
         float((qdd - test.qdd_clean).abs().mean()),
         float(force_correlation(model.posterior, system, at).mean()),
+        float(force_correlation(model.posterior, system, _states(system, free)).mean()),
     )
+
+
+def _states(system: ConstrainedSystem, data: Dataset) -> States:
+    return states(system, data.q, data.qd, data.tau, data.active(system.contact_names))
 
 
 def _relative(found: Tensor, truth: Tensor) -> float:
@@ -120,11 +136,16 @@ def separate(
         system: robot with a contact whose friction is unknown.
         config: of both runs.
         samples: training samples of each kind.
-        test_samples: held-out samples in contact.
+        test_samples: held-out samples of each kind, about.
     """
     contact, free = simulate(system, config).data, free_motion(system, config)
     split = split_by_stretches(contact, samples, seed=config.seed)
     held = split_by_stretches(free, samples, seed=config.seed)
-    test = contact[split.test[:: max(1, len(split.test) // test_samples)]]
+    test, test_free = _spread(contact, split.test, test_samples), _spread(free, held.test, test_samples)
     ways = fit_ways(system, contact[split.train], free[held.train], config.noise_std)
-    return [judge(way, model, test) for way, model in ways.items()]
+    return [judge(way, model, test, test_free) for way, model in ways.items()]
+
+
+def _spread(data: Dataset, rows: Tensor, most: int) -> Dataset:
+    """About `most` of some rows, evenly spread."""
+    return data[rows[:: max(1, len(rows) // most)]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from matplotlib.figure import Figure
@@ -17,8 +17,8 @@ from forcegp.report.values import Series, columns, matrix, series
 
 WIDTH = 4.6
 UNITS = {"position": "m", "velocity": "m/s", "acceleration": "m/s²"}
-PLANNED = {"linewidth": 0.9, "linestyle": (0, (4, 1.5))}
-EXECUTED = {"linewidth": 2.0, "alpha": 0.5}
+PLANNED: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (4, 1.5))}
+EXECUTED: dict[str, Any] = {"linewidth": 2.0, "alpha": 0.5}
 
 
 class TaskSpaceData(Header):

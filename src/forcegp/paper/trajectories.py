@@ -25,6 +25,8 @@ OTHER_MOTION = 1000
 """Added to the task's seed for the motion that no model has seen."""
 BAND_SECONDS = 2.0
 """Maximum duration of function samples [s]: each costs one more trajectory from every start."""
+CALIBRATION_STARTS = 2
+"""Trajectories to calibrate bands on, per trajectory to test them on, as far as the stretches suffice."""
 HORIZON = 1.0
 """Time at which tip errors are compared [s]."""
 FIFTH = 0.2
@@ -52,7 +54,6 @@ def trajectories(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]
             "seconds": sizes.rollout_seconds,
             "starts": sizes.rollout_starts,
             "samples": sizes.rollout_samples,
-            "calibration_starts": sizes.calibration_starts,
             "band_seconds": BAND_SECONDS,
         },
         inputs=[simulated, *(fit.stage for fit in fits)],
@@ -86,7 +87,7 @@ def _roll(sizes: Profile, task: Task, fits: Sequence[Fit], simulated: Stage, adv
     seconds, note = min(BAND_SECONDS, seconds), reported("function samples")
     bands = compare(sampled, data, seconds, starts, samples, system=system, progress=note)
     seconds, note = min(seconds, sizes.stretch), reported("calibration")
-    rows = _calibration_starts(task, seconds, sizes.calibration_starts)
+    rows = _calibration_starts(task, seconds, CALIBRATION_STARTS * starts)
     calibration = compare(sampled, task.data, seconds, rows, samples, system=system, progress=note)
     return with_bands(rollout_data(paths), rollout_data(bands, calibration))
 

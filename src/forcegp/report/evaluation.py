@@ -1,44 +1,163 @@
-"""The page of one evaluated model: its scores, and its predictions over a few seconds."""
+"""The page of one evaluated model: verdict, errors by joint, calibration, and predictions over time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
+from forcegp.evaluation import Evaluation
+from forcegp.evaluation.scores import JointErrors
 from forcegp.files import write_text
 from forcegp.report.html import Block, render
+from forcegp.report.style import INK, Picture, colour, draw, label
 from forcegp.report.tables import Table, cell
 from forcegp.report.window import WindowData, draw_errors, draw_predictions
 
 PAGE, WINDOW = "evaluation.html", "window.json"
-FIGURES = ("predictions.svg", "errors.svg")
+PLOTS = ("predictions.svg", "errors.svg", "calibration.svg")
+NAMES = {
+    "samples": "samples",
+    "noisy_mae": "mean absolute error, measured q̈ [rad/s²]",
+    "noisy_rmse": "root-mean-square error, measured q̈ [rad/s²]",
+    "clean_mae": "mean absolute error, noise-free q̈ [rad/s²]",
+    "clean_rmse": "root-mean-square error, noise-free q̈ [rad/s²]",
+    "coverage_noisy": "±2σ coverage, measured q̈ (nominal 0.954)",
+    "coverage_clean": "±2σ coverage, noise-free q̈ (nominal 0.954)",
+    "nlpd": "negative log predictive density [nats]",
+    "residual": "mean constraint residual |A q̈ − b| [m/s²]",
+    "residual_max": "largest constraint residual |A q̈ − b| [m/s²]",
+    "seconds_per_state": "prediction time [s/sample]",
+}
+"""What the scores over all joints are called."""
 
 
-def write_evaluation(folder: Path, title: str, scores: Mapping[str, object], window: WindowData) -> Path:
-    """Write figures, their data and a page on one model.
+def write_evaluation(
+    folder: Path, model: str, data: str, found: Evaluation, window: WindowData, fitted_to: str | None = None
+) -> Path:
+    """Write the page on one model, with its plots and their data.
 
     Args:
         folder: where the files go.
-        title: model and data.
-        scores: by name.
+        model, data: the model folder and the data file, as the page names them.
+        found: the scores.
         window: predictions over a few seconds of the data.
+        fitted_to: the file that the trivial predictors were fitted to, if not halves of the data.
 
     Returns:
         The path of the page.
     """
-    pictures = (draw_predictions(window), draw_errors(window))
-    for name, picture in zip(FIGURES, pictures, strict=True):
+    drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
+    pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
+    pictures += [draw_calibration(found)] if found.calibration else []
+    for name, picture in zip(PLOTS, pictures, strict=False):
         write_text(folder / name, picture.svg)
     write_text(folder / WINDOW, window.to_json())
-    block = Block(
-        "Predictions and errors",
-        "Left: accelerations by joint, measured in black, predicted in colour, with the band of two standard "
-        "deviations where the model gives one. Right: the same less the prediction; where the data hold the "
-        "noise-free acceleration, that is the black line.",
-        pictures,
-        WINDOW,
+    page = render(
+        "evaluation.html.j2",
+        title=f"{label(found.kind)} on {Path(data).name}",
+        model=model,
+        data=data,
+        found=found,
+        baseline_data=fitted_to or "the other half of the data",
+        tables=(*error_tables(found), *uncertainty_tables(found), score_table(found)),
+        blocks=_blocks(window, pictures),
     )
-    rows = tuple((name.replace("_", " "), cell(value)) for name, value in scores.items())
-    table = Table("Scores on this data set", ("score", "value"), rows)
-    write_text(folder / PAGE, render("evaluation.html.j2", title=title, table=table, blocks=(block,)))
+    write_text(folder / PAGE, page)
     return folder / PAGE
+
+
+def _blocks(window: WindowData, pictures: list[Picture]) -> list[Block]:
+    blocks = [
+        Block(
+            "Predictions and errors",
+            f"The first {window.seconds:.2g} s. Predictions: accelerations by joint, measured in black, "
+            f"predicted "
+            "in colour, with the ±2σ band if the model gives one. Errors: measured (grey) and, if logged, "
+            "noise-free (black) acceleration less the prediction.",
+            tuple(pictures[:2]),
+            WINDOW,
+        )
+    ]
+    if len(pictures) > 2:
+        caption = (
+            "Share of measured accelerations inside the central interval of each probability. On the "
+            "diagonal "
+            "the uncertainty is right; below it the model is overconfident, above it underconfident."
+        )
+        blocks.append(Block("Calibration", caption, tuple(pictures[2:]), "evaluation.json"))
+    return blocks
+
+
+def draw_calibration(found: Evaluation) -> Picture:
+    """Coverage over nominal probability."""
+    levels = {float(level): share for level, share in (found.calibration or {}).items()}
+
+    def paint(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot([0.4, 1.0], [0.4, 1.0], color=INK, linewidth=0.8, linestyle=":", label="nominal")
+        axes.plot(list(levels), list(levels.values()), color=colour(found.kind), marker="o", label="model")
+        axes.set_xlabel("probability of the interval")
+        axes.set_ylabel("share of samples inside")
+        axes.set_ylim(0.0, 1.02)
+        figure.legend(loc="outside upper center", ncols=2)
+
+    listed = ", ".join(f"{share:.2f} at {level:g}" for level, share in levels.items())
+    return draw(paint, (4.1, 3.4), f"Calibration, share of samples inside: {listed}.", label(found.kind))
+
+
+def error_tables(found: Evaluation) -> tuple[Table, ...]:
+    """Torque and acceleration errors by joint, beside the trivial predictors; worse ones in red.
+
+    nRMSE is the error over all samples divided by the standard deviation of the measured quantity.
+    """
+    units = {"torque": "[N m, N]", "acceleration": "[rad/s², m/s²]"}
+    tables = []
+    for unit, names in units.items() if found.predictors else ():
+        errors: dict[str, JointErrors] = {p.name: getattr(p, unit) for p in found.predictors}
+        own, *others = errors.values()
+        head = ("joint", *errors, "model, at rest", "model, nRMSE")
+        rows, bad = [], set()
+        for i, joint in enumerate(found.joint_names):
+            shown = [e.in_motion[i] for e in errors.values()]
+            rows.append((joint, *map(_short, (*shown, own.rest[i], own.normalised[i]))))
+            if any((shown[0] or 0.0) > (e.in_motion[i] or 0.0) for e in others):
+                bad.add((i, 1))
+        caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: worse than another"
+        tables.append(Table(caption, head, tuple(rows), frozenset(bad)))
+    return tuple(tables)
+
+
+def uncertainty_tables(found: Evaluation) -> tuple[Table, ...]:
+    """Coverage by joint, density beside the trivial predictors, and λ against its sensor."""
+    tables = []
+    if found.uncertainty is not None:
+        shares = zip(found.joint_names, found.uncertainty.coverage_by_joint, strict=True)
+        rows = tuple((joint, f"{share:.3f}") for joint, share in shares)
+        tables.append(
+            Table("±2σ coverage of measured accelerations (nominal 0.954)", ("joint", "share"), rows)
+        )
+    if any(p.nlpd is not None for p in found.predictors):
+        rows = tuple((p.name, "–" if p.nlpd is None else f"{-p.nlpd:.3f}") for p in found.predictors)
+        caption = "Mean log density of a measured joint acceleration [nats], higher is better"
+        tables.append(Table(caption, ("predictor", "log density"), rows))
+    if found.multipliers:
+        rows = tuple(
+            (m.contact, str(m.samples), *map(_short, (m.bias, m.spread, m.correlation, m.coverage)))
+            for m in found.multipliers
+        )
+        head = ("contact", "samples", "bias [N]", "standard deviation [N]", "correlation", "±2σ coverage")
+        tables.append(Table("Multiplier λ: predicted less logged", head, rows))
+    return tuple(tables)
+
+
+def score_table(found: Evaluation) -> Table:
+    """The scores over all joints, with units."""
+    scores = found.summary()
+    rows = tuple((name, cell(scores[key])) for key, name in NAMES.items() if scores[key] is not None)
+    return Table("Scores over all joints", ("score", "value"), rows)
+
+
+def _short(value: float | None) -> str:
+    return cell(None if value is None else float(f"{value:.3g}"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from matplotlib.figure import Figure
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.files import Header
-from forcegp.models.base import Model
+from forcegp.models.base import Predictor
 from forcegp.report.style import INK, Picture, colour, draw, label
 from forcegp.report.values import Series, as_tensor, columns, series
 
@@ -62,7 +62,7 @@ def opening(data: Dataset, seconds: float) -> Dataset:
 
 
 @torch.no_grad()
-def predicted_window(model: Model, data: Dataset, name: str) -> WindowData:
+def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
     """Mean and standard deviation of the accelerations at the samples of a window.
 
     Args:
@@ -140,7 +140,7 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
         axes.plot(window.t, measured[i], color=ink, linewidth=0.6, label="measured")
         if window.std is not None:
             spread = 2.0 * as_tensor(window.std[i])
-            band = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ", "zorder": 3}
+            band: dict[str, Any] = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ", "zorder": 3}
             axes.fill_between(window.t, mean[i] - spread, mean[i] + spread, **band)
         axes.plot(window.t, mean[i], color=shown, linewidth=1.1, label="predicted", zorder=4)
         if relative and window.clean is not None:

@@ -6,6 +6,7 @@ Imported only when an MJCF file is read, since it needs the optional package `mu
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -65,15 +66,32 @@ def read_mjcf(root: Element, path: Path) -> Tree:
     )
 
 
+_HANDLER = threading.RLock()
+"""Held while MuJoCo's handler of warnings is ours."""
+
+
 @contextmanager
 def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
-    """Collect MuJoCo's warnings, which would otherwise go to a log file in the working folder."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda text: remarks.append(f"{label}: MuJoCo warns: {text}"))
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
+    """Collect MuJoCo's warnings, which would otherwise go to a log file in the working folder.
+
+    The handler belongs to the whole process: one reader at a time replaces it, warnings of other threads
+    go on to theirs, and it is put back.
+    """
+    own = threading.get_ident()
+    with _HANDLER:
+        before = mujoco.get_mju_user_warning()
+
+        def note(text: str) -> None:
+            if threading.get_ident() == own:
+                remarks.append(f"{label}: MuJoCo warns: {text}")
+            elif before is not None:
+                before(text)
+
+        mujoco.set_mju_user_warning(note)
+        try:
+            yield
+        finally:
+            mujoco.set_mju_user_warning(before)
 
 
 def _compile(document: Element, label: str) -> Any:

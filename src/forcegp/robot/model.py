@@ -193,6 +193,13 @@ class RobotModel:
             ShapeError: one does not; the message names the argument.
         """
         for name, value in states.items():
+            if not isinstance(value, Tensor):
+                raise ShapeError(
+                    f"{name} is no tensor",
+                    expected=f"a tensor of shape (*batch, {self.nq})",
+                    got=type(value).__name__,
+                    hint=f"call torch.tensor({name}, dtype={self.dtype})",
+                )
             if value.ndim == 0 or value.shape[-1] != self.nq:
                 raise ShapeError(
                     f"{name} does not fit robot {self.name!r}",

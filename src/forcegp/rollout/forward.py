@@ -163,7 +163,7 @@ def _closed(problem: Problem, q: Tensor, qd: Tensor) -> Tensor:
         return closed
     with torch.no_grad():
         apart = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
-    return closed & ~(apart & can_open(system))
+    return closed & ~(apart & can_open(system, apart))
 
 
 def _share(progress: Progress | None, part: int, parts: int) -> Progress | None:

@@ -7,13 +7,12 @@ import re
 import sys
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from difflib import get_close_matches
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from forcegp.errors import ForceGPError, SceneError
+from forcegp.errors import ForceGPError, SceneError, near_names
 from forcegp.files import depth
 from forcegp.limits import KEY_PARTS, SCENE_BYTES, SCENE_DEPTH, SCENE_KEYS
 
@@ -42,33 +41,32 @@ class Document:
     Args:
         content: the bytes of the file.
         source: its name, for messages.
+        error: the class of error to raise, also by the methods.
 
     Raises:
-        SceneError: the file is not TOML; the message names file and line.
+        ForceGPError: of class `error`, if the file is not TOML; the message names file and line.
     """
 
-    def __init__(self, content: bytes, source: str) -> None:
-        self.source = source
+    def __init__(self, content: bytes, source: str, error: type[ForceGPError] = SceneError) -> None:
+        self.source, self.error = source, error
         if len(content) > SCENE_BYTES:
-            raise SceneError(
-                f"{source}: too large", expected=f"at most {SCENE_BYTES} bytes", got=len(content)
-            )
+            raise error(f"{source}: too large", expected=f"at most {SCENE_BYTES} bytes", got=len(content))
         try:
             text = content.decode("utf-8")
         except UnicodeDecodeError as cause:
             line = content[: cause.start].count(b"\n") + 1
-            raise SceneError(f"{source}:{line}: not UTF-8 text", got=str(cause)) from cause
-        _check_keys(text, source)
+            raise error(f"{source}:{line}: not UTF-8 text", got=str(cause)) from cause
+        _check_keys(text, source, error)
         try:
             self.data: dict[str, Any] = tomllib.loads(text)
         except (ValueError, RecursionError) as cause:
             found = re.search(r"line (\d+)", str(cause))
             line = int(found[1]) if found else text.count("\n") + 1
-            raise SceneError(
+            raise error(
                 f"{source}:{line}: not valid TOML", got=str(cause) or "brackets nested too deeply"
             ) from cause
         if depth(self.data) > SCENE_DEPTH:
-            raise SceneError(f"{source}: nested too deeply", expected=f"at most {SCENE_DEPTH} levels")
+            raise error(f"{source}: nested too deeply", expected=f"at most {SCENE_DEPTH} levels")
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
@@ -78,7 +76,7 @@ class Document:
             schema: a pydantic model, whose fields may be models, data classes or unions with a `type`.
 
         Raises:
-            SceneError: the first error in the content, with its line and key.
+            ForceGPError: the first error in the content, with its line and key.
         """
         # In JSON mode, strict validation accepts a list for a tuple and an integer for a float.
         text = json.dumps(self.data, default=str)
@@ -93,12 +91,12 @@ class Document:
         """The result of `make(*args, **options)`, whose errors are reported at a key of this file.
 
         Raises:
-            SceneError: `make` raised an error of this library.
+            ForceGPError: `make` raised an error of this library.
         """
         try:
             return make(*args, **options)
         except ForceGPError as error:
-            raise SceneError.at(self.place(key), error) from error
+            raise self.error.at(self.place(key), error) from error
 
     def place(self, key: Key) -> str:
         """`file:line: key` of a key, or of the nearest enclosing key that is in the file."""
@@ -114,27 +112,27 @@ class Document:
         where = self.source if line is None else f"{self.source}:{line}"
         return f"{where}: {dotted(known)}" if known else where
 
-    def _error(self, schema: type[BaseModel], error: ErrorDetails) -> SceneError:
+    def _error(self, schema: type[BaseModel], error: ErrorDetails) -> ForceGPError:
         """The message of a validation error."""
         key, kind, context = error["loc"], error["type"], error.get("ctx", {})
         place, last = self.place(key), str(key[-1]) if key else ""
         if isinstance(cause := context.get("error"), ForceGPError):
-            return SceneError.at(self.place(self._named(key, cause.message)), cause)
+            return self.error.at(self.place(self._named(key, cause.message)), cause)
         if kind in _UNKNOWN_KEY:
             known = _known_keys(schema, key)
-            return SceneError(f"{place}: unknown key", expected=_one_of(known), hint=_near(last, known))
+            return self.error(f"{place}: unknown key", expected=_one_of(known), hint=_near(last, known))
         if kind == "missing" and isinstance(key[-1], int):
-            return SceneError(f"{place}: too few numbers", expected=f"more than {last}")
+            return self.error(f"{place}: too few numbers", expected=f"more than {last}")
         if kind == "missing":
-            return SceneError(f"{place}: key {last!r} is missing", expected=f"{last} = …")
+            return self.error(f"{place}: key {last!r} is missing", expected=f"{last} = …")
         if kind in ("union_tag_invalid", "union_tag_not_found"):
             tags = re.findall(r"'(\w+)'", context.get("expected_tags", "")) or _tags(schema, key)
             if kind == "union_tag_not_found":
-                return SceneError(f"{place}: key 'type' is missing", expected=_one_of(tags))
+                return self.error(f"{place}: key 'type' is missing", expected=_one_of(tags))
             tag = str(context["tag"])
             message = f"{self.place((*key, 'type'))}: unknown type {tag!r}"
-            return SceneError(message, expected=_one_of(tags), hint=_near(tag, tags))
-        return SceneError(f"{place}: {error['msg'][0].lower()}{error['msg'][1:]}", got=repr(error["input"]))
+            return self.error(message, expected=_one_of(tags), hint=_near(tag, tags))
+        return self.error(f"{place}: {error['msg'][0].lower()}{error['msg'][1:]}", got=repr(error["input"]))
 
     def _named(self, key: Key, message: str) -> Key:
         """The key within a table that a message names, or the table."""
@@ -147,11 +145,11 @@ class Document:
         return key if name is None else (*key, name)
 
 
-def _check_keys(text: str, source: str) -> None:
+def _check_keys(text: str, source: str, error: type[ForceGPError]) -> None:
     """Check the number of keys and of the parts of each: a parser takes quadratic time for either."""
     keys = text.count("=") + len(_BRACKET.findall(text))
     if keys > SCENE_KEYS:
-        raise SceneError(f"{source}: too many keys and tables", expected=f"at most {SCENE_KEYS}", got=keys)
+        raise error(f"{source}: too many keys and tables", expected=f"at most {SCENE_KEYS}", got=keys)
     parts, joined = 0, False
     for token in _TOKEN.finditer(text):
         name, dot, other = token.groups()
@@ -163,7 +161,7 @@ def _check_keys(text: str, source: str) -> None:
             parts, joined = 0, False
         if parts > KEY_PARTS:
             line = text.count("\n", 0, token.start()) + 1
-            raise SceneError(f"{source}:{line}: a key of too many parts", expected=f"at most {KEY_PARTS}")
+            raise error(f"{source}:{line}: a key of too many parts", expected=f"at most {KEY_PARTS}")
 
 
 def _one_of(names: list[str]) -> str:
@@ -171,7 +169,7 @@ def _one_of(names: list[str]) -> str:
 
 
 def _near(name: str, known: list[str]) -> str | None:
-    near = get_close_matches(name, known, n=1)
+    near = near_names(name, known)
     return f"did you mean {near[0]!r}?" if near else None
 
 

@@ -17,8 +17,8 @@ from forcegp.scene.document import Document
 from forcegp.scene.sections import SceneSections
 from forcegp.simulate.config import SimulationConfig
 
-BUNDLED = ("kuka_plane",)
-"""Scenes that come with the library: the paper's task."""
+BUNDLED = ("kuka_plane", "ur5_wiping")
+"""Scenes that come with the library: the paper's task, and a UR5 with undeclared friction."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def load_scene(source: str | Path) -> Scene:
     """Read a scene file.
 
     Args:
-        source: a path, or the name of a bundled scene (`kuka_plane`).
+        source: a path, or the name of a bundled scene (`kuka_plane`, `ur5_wiping`).
 
     Returns:
         The scene; nothing but its file has been read yet.

@@ -2,9 +2,74 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from forcegp.control.motion import MotionConfig
+from forcegp.errors import ForceGPError
+
+CONTACTS = ("rigid", "solver")
+
+
+def _check(name: str, valid: bool, expected: str, got: object) -> None:
+    if not valid:
+        raise ForceGPError(f"{name} is out of range", expected=expected, got=got)
+
+
+@dataclass(frozen=True)
+class ContactSolver:
+    """The world of MuJoCo's contact solver: dry friction in joints and contact, and a rounded tip.
+
+    Args:
+        friction: Coulomb friction coefficient μ of tool and surface.
+        tip_radius: radius of the tip, a sphere that touches a surface at the scene's contact point [m].
+        joint_friction: Coulomb friction of each joint, beyond the robot file; empty is none [N m].
+        joint_damping: viscous friction of each joint, beyond the robot file; empty is none [N m s/rad].
+        stiffness_time: time constant of the contact's restoring force [s]; shorter is stiffer.
+        step: step of the engine, a whole part of the sampling period [s].
+
+    Raises:
+        ForceGPError: a value is out of range; the message names it.
+    """
+
+    friction: float = 0.3
+    tip_radius: float = 0.015
+    joint_friction: tuple[float, ...] = ()
+    joint_damping: tuple[float, ...] = ()
+    stiffness_time: float = 0.004
+    step: float = 0.0005
+
+    def __post_init__(self) -> None:
+        for name in ("tip_radius", "stiffness_time", "step"):
+            value = getattr(self, name)
+            _check(name, 0.0 < value < float("inf"), "a positive finite number", value)
+        for name in ("joint_friction", "joint_damping"):
+            values = getattr(self, name)
+            _check(name, all(0.0 <= x < float("inf") for x in values), "finite numbers, 0 or above", values)
+        _check("friction", 0.0 <= self.friction < float("inf"), "a finite number, 0 or above", self.friction)
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Imperfect sensors; the controller and the log see what they measure. The defaults are perfect.
+
+    Args:
+        encoder_resolution: step of the measured joint positions [rad, m].
+        velocity_noise: standard deviation of the noise on q̇ [rad/s, m/s].
+        torque_noise: standard deviation of the noise on the logged torque [N m, N].
+        torque_delay: time by which the logged torque lags behind the motion [s], rounded to whole samples.
+
+    Raises:
+        ForceGPError: a value is out of range; the message names it.
+    """
+
+    encoder_resolution: float = 0.0
+    velocity_noise: float = 0.0
+    torque_noise: float = 0.0
+    torque_delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            _check(name, 0.0 <= value < float("inf"), "a finite number, 0 or above", value)
 
 
 @dataclass(frozen=True)
@@ -16,8 +81,12 @@ class SimulationConfig(MotionConfig):
     Args:
         seed: of the waypoints, the postures and the noise.
         engine: `"pybullet"`, `"mujoco"` or `"auto"`.
-        viscous_friction: θ_v of F_z = −θ_v ṗ_E, tangential to the surface [N s/m].
+        contact: `"rigid"` takes contact forces from this library's own equations of motion; `"solver"`
+            leaves them to MuJoCo's contact solver, an independent truth.
+        viscous_friction: θ_v of F_z = −θ_v ṗ_E, tangential to the surface, with rigid contact [N s/m].
         noise_std: standard deviation of the noise on q̈ [rad/s²].
+        solver: friction and geometry, with `contact="solver"`.
+        sensors: resolution, noise and delay of the measurements, with `contact="solver"`.
 
     Raises:
         ForceGPError: a value is out of range; the message names it.
@@ -25,9 +94,18 @@ class SimulationConfig(MotionConfig):
 
     seed: int = 0
     engine: str = "auto"
+    contact: str = "rigid"
     viscous_friction: float = 1.0
     noise_std: float = 0.1
+    solver: ContactSolver = field(default_factory=ContactSolver)
+    sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_not_negative("viscous_friction", "noise_std")
+        _check("contact", self.contact in CONTACTS, "'rigid' or 'solver'", self.contact)
+        if self.contact == "solver":
+            _check("engine", self.engine in ("auto", "mujoco"), "'mujoco', whose solver it is", self.engine)
+            steps = self.dt / self.solver.step
+            whole = steps > 0.5 and abs(steps - round(steps)) < 1e-6
+            _check("step", whole, f"a whole part of dt = {self.dt} s", self.solver.step)

@@ -26,7 +26,7 @@ class MuJoCoEngine:
     """
 
     def __init__(self, robot: RobotModel, dt: float) -> None:
-        self._mujoco = mujoco = _import_mujoco()
+        self._mujoco = mujoco = import_mujoco()
         self._robot = robot
         self._model = model = mujoco.MjModel.from_xml_string(write_urdf(robot))
         model.opt.timestep = dt
@@ -89,12 +89,17 @@ class MuJoCoEngine:
         return torch.tensor(values, dtype=self._robot.dtype)
 
 
-def _import_mujoco() -> Any:
+def import_mujoco() -> Any:
+    """The package `mujoco`.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
     # MuJoCo's classes live in a compiled module that has no stubs.
     try:
         import mujoco
     except ImportError:
         raise MissingDependencyError(
-            "the engine 'mujoco' needs the package mujoco", hint="pip install mujoco"
+            "the engine 'mujoco' needs the package mujoco", hint='pip install "forcegp[mujoco]"'
         ) from None
     return mujoco

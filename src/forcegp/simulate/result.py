@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp import kinematics
+from forcegp import dynamics, kinematics
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.unilateral import ContactForces
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import tool_motion
 from forcegp.control.trajectory import Reference
@@ -28,6 +28,8 @@ class Log:
         multiplier, c: `(n, m)`.
         contact: `(n, n_contacts)` bool.
         saturated: `(n,)` bool, a torque limit was hit.
+        contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, where an engine of its own computed them [N].
+        measured: what sensors say instead of `q`, `qd`, `tau`, where they are not perfect.
     """
 
     q: Tensor
@@ -41,6 +43,8 @@ class Log:
     c: Tensor
     contact: Tensor
     saturated: Tensor
+    contact_forces: dict[str, dict[str, Tensor]] = field(default_factory=dict)
+    measured: dict[str, Tensor] = field(default_factory=dict)
 
     @staticmethod
     def empty(steps: int, system: ConstrainedSystem) -> Log:
@@ -64,13 +68,22 @@ class Log:
             saturated=torch.zeros(steps, dtype=torch.bool),
         )
 
-    def write(
-        self, k: int, q: Tensor, qd: Tensor, Q_u: Tensor, forces: ContactForces, *, saturated: bool
-    ) -> None:
-        """Write down step k, all but the acceleration, which is known a step later."""
-        self.q[k], self.qd[k], self.tau[k], self.Q[k] = q, qd, Q_u, forces.Q
-        self.Q_I[k], self.Q_z[k], self.multiplier[k] = forces.Q_I, forces.Q_z, forces.multiplier
-        self.c[k], self.contact[k], self.saturated[k] = forces.c, forces.closed, saturated
+    def arrays(self) -> LogRows:
+        """The columns as arrays that share their memory, to write single rows."""
+        names = (f.name for f in fields(self))
+        return LogRows({n: x.numpy() for n in names if isinstance(x := getattr(self, n), Tensor)})
+
+
+class LogRows:
+    """The columns of a log, written row by row."""
+
+    def __init__(self, columns: dict[str, np.ndarray]) -> None:
+        self._columns = columns
+
+    def write(self, k: int, **values: object) -> None:
+        """Write values of row k, by column."""
+        for name, value in values.items():
+            self._columns[name][k] = value
 
 
 @dataclass(frozen=True)
@@ -147,11 +160,18 @@ def make_result(
         c=log.c,
         saturated=int(log.saturated.sum()),
         beyond_limits=int(beyond.sum()),
-        acceleration_mismatch=acceleration_mismatch(
-            system, log.q, log.qd, log.qdd, log.Q + log.Q_z, log.contact
-        ),
+        acceleration_mismatch=_mismatch(system, config, log),
         engine=engine,
     )
+
+
+def _mismatch(system: ConstrainedSystem, config: SimulationConfig, log: Log) -> float:
+    """Largest difference of the engine's accelerations to ours, under its contact forces if it has any."""
+    if config.contact == "solver":
+        force = log.Q + log.Q_I + log.Q_z
+        M = dynamics.mass_matrix(system.robot, log.q)
+        return float((torch.linalg.solve(M, force[..., None])[..., 0] - log.qdd).abs().max())
+    return acceleration_mismatch(system, log.q, log.qd, log.qdd, log.Q + log.Q_z, log.contact)
 
 
 def _dataset(
@@ -174,16 +194,17 @@ def _dataset(
         joint_names=robot.joint_names,
         contact_names=names,
     )
+    clean = {f"{name}_clean": getattr(log, name) for name in ("qdd", *log.measured)}
     return Dataset(
         t=plan.reference.t,
-        q=log.q,
-        qd=log.qd,
+        q=log.measured.get("q", log.q),
+        qd=log.measured.get("qd", log.qd),
         qdd=log.qdd + config.noise_std * noise,
-        tau=log.tau,
+        tau=log.measured.get("tau", log.tau),
         joint_names=robot.joint_names,
         contact={name: log.contact[:, i] for i, name in enumerate(names)},
-        extras={"qdd_clean": log.qdd, "Q": log.Q, "Q_z": log.Q_z, "Q_I": log.Q_I},
-        contact_extras=_multipliers(system, log),
+        extras={**clean, "Q": log.Q, "Q_z": log.Q_z, "Q_I": log.Q_I},
+        contact_extras=_multipliers(system, log) | log.contact_forces,
         header=header,
     )
 

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import closing
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.unilateral import any_row, contact_forces, land
 from forcegp.control.plan import Plan, make_plan
-from forcegp.control.task_space import control_torque, tool_motion
-from forcegp.errors import NumericalError
+from forcegp.control.task_space import Target, control_torque
 from forcegp.simulate.config import SimulationConfig
+from forcegp.simulate.contact_solver import ContactSolverEngine
 from forcegp.simulate.engine import Engine, make_engine
+from forcegp.simulate.guard import Progress, check_speed, report, torque_limit
+from forcegp.simulate.mechanics import Mechanics
 from forcegp.simulate.result import Log, SimulationResult, make_result
+from forcegp.simulate.solver_run import follow_with_solver
 from forcegp.threads import one_thread
-
-RUNAWAY_SPEED = 50.0
-"""A joint faster than this [rad/s] is no motion that anybody planned."""
-PROGRESS_STRIDE = 24
-"""Steps between two calls of the progress function, a tenth of a second at 240 Hz."""
 
 ON_SURFACE = 1e-8
 """A contact is closed at the start where the error is below this [m]; placement leaves less."""
-
-Progress = Callable[[int, int], None]
-"""Called with the number of steps done and the number in all."""
 
 
 def simulate(
@@ -59,6 +53,10 @@ def simulate(
     generator = torch.Generator().manual_seed(config.seed)
     with torch.no_grad(), one_thread():
         plan = make_plan(system, config, generator)
+        if config.contact == "solver":
+            engine = ContactSolverEngine(system, config.dt, config.solver)
+            log = follow_with_solver(system, config, plan, engine, generator, progress)
+            return make_result(system, config, plan, log, engine.name, generator)
         with closing(make_engine(system.robot, config.dt, config.engine)) as engine:
             log = _follow(system, config, plan, engine, progress)
             return make_result(system, config, plan, log, engine.name, generator)
@@ -72,52 +70,32 @@ def _follow(
     progress: Progress | None,
 ) -> Log:
     """Step the engine through the plan."""
-    log = Log.empty(config.steps, system)
-    limit = _torque_limit(system, config)
-    closed = _closed_at_start(system, plan.start)
+    log, mechanics = Log.empty(config.steps, system), Mechanics(system, plan)
+    rows, limit, targets = log.arrays(), torque_limit(system, config).numpy(), plan.arrays()
+    closed = _closed_at_start(mechanics, plan.start.numpy())
     engine.reset(plan.start, torch.zeros_like(plan.start))
-    q, qd = engine.state()
+    q, qd = (x.numpy() for x in engine.state())
     for k in range(config.steps):
-        _check_speed(k * config.dt, q, qd)
-        landing = land(system, q, qd, closed)
+        check_speed(k * config.dt, q, qd)
+        landing = land(mechanics, q, qd, closed)
         if landing.impact:
             qd = landing.qd
-            engine.reset(q, qd)
-        eom, target = landing.eom, plan.target(k)
-        tool = tool_motion(system.robot, eom.poses, eom.motion, qd, plan.frame, plan.point)
-        wanted = control_torque(tool, eom, q, qd, target, plan.normal(eom), config.gains)
-        Q_u = wanted.clamp(-limit, limit)
-        touch = contact_forces(system, q, qd, landing, Q_u, config.viscous_friction)
-        engine.step(Q_u + touch.Q_D + touch.Q_I + touch.Q_z)
-        log.write(k, q, qd, Q_u, touch, saturated=not torch.equal(Q_u, wanted))
-        closed, (q, qd_next) = touch.closed, engine.state()
-        log.qdd[k] = (qd_next - qd) / config.dt
-        qd = qd_next
-        if progress is not None and ((k + 1) % PROGRESS_STRIDE == 0 or k + 1 == config.steps):
-            progress(k + 1, config.steps)
+            engine.reset(torch.from_numpy(q), torch.from_numpy(qd))
+        eom, target = landing.eom, Target(*(values[k] for values in targets))
+        wanted = control_torque(eom.tool, eom, q, qd, target, plan.normal(eom), config.gains)
+        Q_u = np.clip(wanted, -limit, limit)
+        forces = contact_forces(mechanics, q, qd, landing, Q_u, config.viscous_friction)
+        engine.step(torch.from_numpy(Q_u + forces.Q_D + forces.Q_I + forces.Q_z))
+        q_next, qd_next = (x.numpy() for x in engine.state())
+        rows.write(k, q=q, qd=qd, qdd=(qd_next - qd) / config.dt, tau=Q_u, saturated=(Q_u != wanted).any())
+        rows.write(k, Q=forces.Q, Q_I=forces.Q_I, Q_z=forces.Q_z)
+        rows.write(k, multiplier=forces.multiplier, c=forces.c, contact=forces.closed)
+        closed, q, qd = forces.closed, q_next, qd_next
+        report(progress, k + 1, config.steps)
     return log
 
 
-def _torque_limit(system: ConstrainedSystem, config: SimulationConfig) -> Tensor:
-    robot = system.robot
-    if config.torque_limit is None:
-        return robot.effort_limit
-    limit = torch.tensor(config.torque_limit, dtype=robot.dtype)
-    robot.check_state(torque_limit=limit)
-    return limit
-
-
-def _closed_at_start(system: ConstrainedSystem, q: Tensor) -> Tensor:
+def _closed_at_start(mechanics: Mechanics, q: np.ndarray) -> np.ndarray:
     """Constraints that hold at the start; inverse kinematics puts the tool on the surface, up to rounding."""
-    c = system.equations(q, torch.zeros_like(q)).c
-    return ~any_row(system, c.abs() > ON_SURFACE)
-
-
-def _check_speed(t: float, q: Tensor, qd: Tensor) -> None:
-    if not (bool(torch.isfinite(q).all()) and float(qd.abs().max()) < RUNAWAY_SPEED):
-        raise NumericalError(
-            f"the simulation diverges at t = {t:.4f} s",
-            expected=f"joint speeds below {RUNAWAY_SPEED:g} rad/s",
-            got=f"q = {q.tolist()}, qd = {qd.tolist()}",
-            hint="smaller gains, a longer travel time, or a rectangle further from the edge of the workspace",
-        )
+    c = mechanics.equations(q, 0.0 * q).c
+    return ~any_row(mechanics, np.abs(c) > ON_SURFACE)

@@ -32,13 +32,14 @@ def write_urdf(robot: RobotModel) -> str:
     for i, joint in enumerate(robot.joint_names):
         moments, axes = torch.linalg.eigh(robot.inertia[i])
         axes = axes * torch.linalg.det(axes).sign()
-        _link(root, _link_name(robot, i), float(robot.mass[i]), robot.com[i], axes, moments)
+        _link(root, link_name(robot, i), float(robot.mass[i]), robot.com[i], axes, moments)
         _joint(root, robot, i, joint)
     indent(root)
     return tostring(root, encoding="unicode")
 
 
-def _link_name(robot: RobotModel, index: int) -> str:
+def link_name(robot: RobotModel, index: int) -> str:
+    """Name of a link in the written file."""
     return WORLD if index == BASE else f"link_of_{robot.joint_names[index]}"
 
 
@@ -60,8 +61,8 @@ def _joint(root: Element, robot: RobotModel, i: int, name: str) -> None:
     slides = robot.joint_types[i] == "prismatic"
     joint = SubElement(root, "joint", name=name, type="prismatic" if slides else "continuous")
     SubElement(joint, "origin", xyz=_numbers(position), rpy=_numbers(_roll_pitch_yaw(rotation)))
-    SubElement(joint, "parent", link=_link_name(robot, parent))
-    SubElement(joint, "child", link=_link_name(robot, i))
+    SubElement(joint, "parent", link=link_name(robot, parent))
+    SubElement(joint, "child", link=link_name(robot, i))
     SubElement(joint, "axis", xyz=_numbers(robot.axis[i]))
     if slides:
         SubElement(joint, "limit", lower="-1e6", upper="1e6", effort="1e9", velocity="1e9")

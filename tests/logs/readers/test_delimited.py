@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import limits
 from forcegp.logs.readers import read
 
 VALUES = np.column_stack([np.arange(30) * 0.01, np.sin(np.arange(30)), -1e-7 * np.arange(30.0)])
@@ -91,6 +91,6 @@ def test_what_is_no_table_is_refused(tmp_path: Path, content: bytes, message: st
 
 
 def test_a_file_of_one_line_without_end_is_refused_before_it_is_read(tmp_path: Path) -> None:
-    (tmp_path / "run.txt").write_bytes(b"1 2\n" * 400 + b"7 " * (limits.MAX_LINE_BYTES * 4))
+    (tmp_path / "run.txt").write_bytes(b"1 2\n" * 400 + b"7 " * (limits.LINE_BYTES * 4))
     with pytest.raises(DataError):
         read(tmp_path / "run.txt")

@@ -7,15 +7,16 @@ import io
 import json
 import pickle
 import sqlite3
+import sys
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from forcegp import limits
 from forcegp.errors import DataError, MissingDependencyError
-from forcegp.logs import limits
-from forcegp.logs.readers import extras, read
+from forcegp.logs.readers import read
 from log_files import WRITERS, motion
 
 
@@ -89,7 +90,7 @@ def test_a_small_parquet_file_with_a_huge_list(tmp_path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    n = limits.MAX_COLUMNS + 1
+    n = limits.COLUMNS + 1
     pq.write_table(pa.table({"q": pa.array([[0.0] * n] * 3)}), tmp_path / "run.parquet")
     with pytest.raises(DataError, match="too many columns"):
         read(tmp_path / "run.parquet")
@@ -156,9 +157,11 @@ def test_a_lerobot_folder_whose_description_is_damaged(tmp_path: Path) -> None:
         read(path)
 
 
-def test_a_missing_reader_is_named_with_the_command() -> None:
-    with pytest.raises(MissingDependencyError, match=r"'nothing'(?s:.*)pip install 'forcegp\[import\]'"):
-        extras.require("no_such_module_at_all", "nothing", "nothing")
+def test_a_missing_reader_is_named_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, _ = WRITERS["hdf5"](tmp_path, motion(20))
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(MissingDependencyError, match=r"'h5py'(?s:.*)forcegp\[import\]"):
+        read(path)
 
 
 @pytest.mark.parametrize("name", ["run.xyz", "run.zip"])

@@ -9,7 +9,8 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from forcegp.logs import limits
+from forcegp import limits
+from forcegp.logs import bounds
 from forcegp.logs.readers.sniff import MISSING, Dialect, sniff
 from forcegp.logs.table import Column, Growing, LogTable, Progress, Stream, Wanted, foreign
 
@@ -40,7 +41,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
     with foreign(str(path), "a table of text"), path.open("rb") as file:
         for batch in _batches(path, file, dialect, chosen, kinds, progress) if chosen else ():
             read_rows = len(columns[chosen[0]]) + len(batch)
-            limits.check_values(str(path), read_rows, len(chosen))
+            bounds.check_values(str(path), read_rows, len(chosen))
             for name in chosen:
                 columns[name].append(_numbers(batch.column(name), kinds[name]))
             if rows is not None and read_rows >= rows:
@@ -128,9 +129,7 @@ class _Blocks:
         # Blanks at the edges of a line are only known once the line is complete.
         end = text.rfind(b"\n") + 1 if block else len(text)
         self._rest, text = text[end:], text[:end]
-        limits.check_count(
-            "the text", "bytes in a line", len(self._rest), limits.MAX_LINE_BYTES + BLOCK_BYTES
-        )
+        bounds.check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)
         result = _EDGES.sub(b"", _BLANKS.sub(b" ", text))
         return result if result or not block else self.read(count)
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import limits
+from forcegp.logs import bounds
 from forcegp.logs.readers import delimited
 from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
@@ -22,7 +23,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
         DataError: a file is no table of numbers, or the folder is too large.
     """
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
-    limits.check_count(str(path), "files", len(files), limits.MAX_FILES)
+    bounds.check_count(str(path), "files", len(files), limits.LOG_FILES)
     groups: dict[int, dict[str, Column]] = {}
     remarks: list[str] = []
     for number, file in enumerate(files):
@@ -37,7 +38,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
         columns = {_name(file.stem, name): values for name, values in table.streams[0].columns.items()}
         if columns:
             groups.setdefault(len(next(iter(columns.values()))), {}).update(columns)
-            limits.check_values(str(path), 1, sum(map(len, groups.values())))
+            bounds.check_values(str(path), 1, sum(map(len, groups.values())))
         if progress is not None:
             progress(number + 1, len(files))
     most = max(groups, key=lambda length: (len(groups[length]), length), default=0)

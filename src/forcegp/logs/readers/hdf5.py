@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import limits
-from forcegp.logs.readers.extras import require
+from forcegp.logs import bounds
 from forcegp.logs.table import LogTable, Progress, Wanted, arrays_to_streams, foreign
+from forcegp.optional import optional_module
 
 Arrays = dict[str, NDArray[np.generic]]
 
@@ -33,7 +34,7 @@ def read_matlab(path: Path) -> LogTable:
 
 
 def _read(path: Path, format_: str, separator: str) -> LogTable:
-    h5py = require("h5py", "h5py", "HDF5 files")
+    h5py = optional_module("h5py", "Reading HDF5 files", "import")
     remarks: list[str] = []
     arrays: Arrays = {}
     with foreign(str(path), "HDF5"), h5py.File(path, "r") as file:
@@ -48,7 +49,7 @@ def _walk(
     h5py: Any, group: Any, prefix: str, separator: str, arrays: Arrays, remarks: list[str], seen: set[Any]
 ) -> None:
     """Collect the data sets below a group, each once, though links may lead to it several times."""
-    if prefix.count(separator) > limits.MAX_DEPTH:
+    if prefix.count(separator) > limits.GROUP_DEPTH:
         raise DataError(f"{group.file.filename}: groups are nested too deeply", got=prefix[:200])
     for key in group:
         name = f"{prefix}{key}"
@@ -62,7 +63,7 @@ def _walk(
         if mark in seen:
             continue
         seen.add(mark)
-        limits.check_count(group.file.filename, "objects", len(seen), limits.MAX_COLUMNS)
+        bounds.check_count(group.file.filename, "objects", len(seen), limits.COLUMNS)
         if isinstance(item, h5py.Group):
             _walk(h5py, item, f"{name}{separator}", separator, arrays, remarks, seen)
         elif isinstance(item, h5py.Dataset):
@@ -77,5 +78,5 @@ def _take(item: Any, name: str, arrays: Arrays, remarks: list[str]) -> None:
         remarks.append(f"{name!r} lies outside the file and was left out")
     else:
         taken = sum(array.size for array in arrays.values())
-        limits.check_count(item.file.filename, "numbers", taken + item.size, limits.MAX_VALUES)
+        bounds.check_count(item.file.filename, "numbers", taken + item.size, limits.LOG_VALUES)
         arrays[name] = item[()]

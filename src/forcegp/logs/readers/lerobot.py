@@ -6,8 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import limits
+from forcegp.logs import bounds
 from forcegp.logs.readers.parquet import read_columns
 from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, foreign
 
@@ -26,13 +27,13 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
     """
     features = _features(path / "meta" / "info.json")
     files = sorted((path / "data").rglob("*.parquet"))
-    limits.check_count(str(path), "files", len(files), limits.MAX_FILES)
+    bounds.check_count(str(path), "files", len(files), limits.LOG_FILES)
     if not files:
         raise DataError(f"{path}: no episodes", expected=f"Parquet files below {path / 'data'}")
     names: dict[str, str] = {}
     for feature, description in features.items():
         for i, motor in enumerate(_motors(description)):
-            names[f"{feature}[{i}]"] = f"{feature}.{motor}"[: limits.MAX_NAME]
+            names[f"{feature}[{i}]"] = f"{feature}.{motor}"[: limits.LOG_NAME]
     remarks: list[str] = []
     with foreign(str(path), "a LeRobot data set"):
         columns = read_columns(files, lambda n: wanted(names.get(n, n)), rows, remarks, progress)
@@ -43,7 +44,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
 
 
 def _features(file: Path) -> dict[str, Any]:
-    limits.check_count(str(file), "bytes", file.stat().st_size, MAX_INFO_BYTES)
+    bounds.check_count(str(file), "bytes", file.stat().st_size, MAX_INFO_BYTES)
     try:
         info = json.loads(file.read_text(encoding="utf-8"))
         features = info["features"]
@@ -64,5 +65,5 @@ def _motors(description: Any) -> list[str]:
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))
     if isinstance(names, list) and all(isinstance(n, str) for n in names) and len(set(names)) == len(names):
-        return names[: limits.MAX_COLUMNS]
+        return names[: limits.COLUMNS]
     return []

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import limits
+from forcegp.logs import bounds
 from forcegp.logs.readers import hdf5
 from forcegp.logs.table import LogTable, Progress, Wanted, arrays_to_streams, foreign
 
@@ -35,9 +36,9 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
     arrays: dict[str, NDArray[np.generic]] = {}
     with foreign(str(path), "a MATLAB file"):
         listing = whosmat(path)
-        limits.check_count(str(path), "arrays", len(listing), limits.MAX_COLUMNS)
+        bounds.check_count(str(path), "arrays", len(listing), limits.COLUMNS)
         claimed = sum(int(np.prod(shape, dtype=object)) for _, shape, _ in listing)
-        limits.check_count(str(path), "numbers", claimed, limits.MAX_VALUES)
+        bounds.check_count(str(path), "numbers", claimed, limits.LOG_VALUES)
         plain = [
             name
             for name, _, kind in listing
@@ -54,8 +55,10 @@ def _collect(
     name: str, value: object, arrays: dict[str, NDArray[np.generic]], remarks: list[str], depth: int
 ) -> None:
     """Numeric arrays of a variable, going into structs of one element."""
-    if depth > limits.MAX_DEPTH:
-        raise DataError(f"{name[:80]}: structs are nested too deeply", expected=f"at most {limits.MAX_DEPTH}")
+    if depth > limits.GROUP_DEPTH:
+        raise DataError(
+            f"{name[:80]}: structs are nested too deeply", expected=f"at most {limits.GROUP_DEPTH}"
+        )
     if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
         for field in value.dtype.names:
             _collect(f"{name}.{field}", value.reshape(-1)[0][field], arrays, remarks, depth + 1)

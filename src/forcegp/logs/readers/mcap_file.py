@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from forcegp.logs import limits
-from forcegp.logs.readers.extras import require
+from forcegp import limits
+from forcegp.logs import bounds
 from forcegp.logs.readers.messages import KINDS, Collector, Decode, canonical, decoder
 from forcegp.logs.table import LogTable, Progress, Wanted, foreign
+from forcegp.optional import optional_module
 
 RECORD_BYTES = 256 << 20
 """Largest record, packed, that is loaded."""
@@ -20,7 +21,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
         DataError: the file is damaged or too large, or has no message of these types.
         MissingDependencyError: `mcap` or `rosbags` is not installed.
     """
-    package = require("mcap.reader", "mcap", "MCAP files")
+    package = optional_module("mcap.reader", "Reading MCAP files", "import")
     collector = Collector(str(path))
     decoders: dict[int, Decode | None] = {}
     topics: dict[str, str] = {}
@@ -29,12 +30,12 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
         summary = reader.get_summary()
         statistics = summary.statistics if summary is not None else None
         total = statistics.message_count if statistics is not None else 0
-        limits.check_count(str(path), "messages", total, limits.MAX_MESSAGES)
+        bounds.check_count(str(path), "messages", total, limits.LOG_MESSAGES)
         for schema, channel, message in reader.iter_messages():
             if channel.id not in decoders:
                 kind = canonical(schema.name) if schema is not None else ""
                 topics[channel.topic] = kind or channel.message_encoding
-                limits.check_count(str(path), "topics", len(decoders), limits.MAX_STREAMS)
+                bounds.check_count(str(path), "topics", len(decoders), limits.LOG_STREAMS)
                 known = kind in KINDS and channel.message_encoding in ("cdr", "ros1")
                 decoders[channel.id] = decoder(kind, channel.message_encoding) if known else None
             decode = decoders[channel.id]

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import limits
-from forcegp.logs.readers.extras import require
+from forcegp.logs import bounds
 from forcegp.logs.table import Column, LogTable, Stream, Wanted
+from forcegp.optional import optional_module
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
@@ -51,7 +52,7 @@ def decoder(kind: str, encoding: str) -> Decode:
     Raises:
         MissingDependencyError: `rosbags` is not installed.
     """
-    typesys = require("rosbags.typesys", "rosbags", "ROS messages")
+    typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
     if encoding == "ros1":
         store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
         return lambda raw: store.deserialize_ros1(raw, kind)
@@ -80,7 +81,7 @@ class Collector:
         Raises:
             DataError: it is too large, or its arrays do not fit its joint names.
         """
-        limits.check_count(self.source, "bytes in one message", len(raw), limits.MAX_MESSAGE_BYTES)
+        bounds.check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
         names, values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
         # One stream for a set of joints, in the order of its first message, whatever the order of the others.
@@ -94,8 +95,8 @@ class Collector:
         self._stamps.setdefault(key, []).append((stamp.sec * 10**9 + stamp.nanosec, receive_ns))
         self._numbers += len(values)
         self._messages += 1
-        limits.check_count(self.source, "numbers", self._numbers, limits.MAX_VALUES)
-        limits.check_count(self.source, "streams", len(self._rows), limits.MAX_STREAMS)
+        bounds.check_count(self.source, "numbers", self._numbers, limits.LOG_VALUES)
+        bounds.check_count(self.source, "streams", len(self._rows), limits.LOG_STREAMS)
 
     @property
     def rows(self) -> int:
@@ -163,7 +164,7 @@ def _units(kind: str, count: int) -> list[str]:
 
 def _joint_state(source: str, topic: str, message: Any) -> tuple[tuple[str, ...], list[float]]:
     """Joint names, and position, velocity and effort in their order; NaN where a quantity is empty."""
-    names = tuple(str(name)[: limits.MAX_NAME] for name in message.name)
+    names = tuple(str(name)[: limits.LOG_NAME] for name in message.name)
     if not names or len(set(names)) < len(names):
         raise DataError(f"{source}: a joint state on {topic} has no joint names, or one twice", got=names[:8])
     values: list[float] = []

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import limits
+from forcegp.logs import bounds
 from forcegp.logs.table import LogTable, Progress, Wanted, arrays_to_streams, foreign
 
 MAX_ARRAYS = 4096
@@ -30,9 +31,9 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 members = archive.infolist()
-                limits.check_count(str(path), "arrays", len(members), MAX_ARRAYS)
-                limits.check_count(
-                    str(path), "bytes", sum(m.file_size for m in members), 8 * limits.MAX_VALUES
+                bounds.check_count(str(path), "arrays", len(members), MAX_ARRAYS)
+                bounds.check_count(
+                    str(path), "bytes", sum(m.file_size for m in members), 8 * limits.LOG_VALUES
                 )
                 for member in members:
                     with archive.open(member) as file:
@@ -62,7 +63,7 @@ def _array(source: str, name: str, file: Any, size: int) -> dict[str, NDArray[np
             hint="save each quantity as an array of its own",
         )
     count = int(np.prod(shape, dtype=object)) if shape else 1
-    limits.check_count(source, "numbers", count, limits.MAX_VALUES)
+    bounds.check_count(source, "numbers", count, limits.LOG_VALUES)
     if count * dtype.itemsize > size:
         raise DataError(f"{source}: the array claims to be larger than its file", got=f"{shape} of {dtype}")
     data = file.read(count * dtype.itemsize)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import limits
+from forcegp.logs import bounds
 from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, foreign
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def read_columns(
     for path in paths:
         with pq.ParquetFile(path) as file:
             total += _check(str(path), file)
-            limits.check_values(str(path), total, 1)
+            bounds.check_values(str(path), total, 1)
     done = 0
     for path in paths:
         with pq.ParquetFile(path, pre_buffer=False) as file:
@@ -60,7 +61,7 @@ def read_columns(
                         if wanted(part) or wanted(name):
                             chunks.setdefault(part, []).append(values)
                 done += len(batch)
-                limits.check_values(str(path), done, max(len(chunks), 1))
+                bounds.check_values(str(path), done, max(len(chunks), 1))
                 if progress is not None:
                     progress(done, total)
                 if rows is not None and done >= rows:
@@ -80,10 +81,10 @@ def _joined(source: str, chunks: dict[str, list[Column]], done: int, rows: int |
 def _check(source: str, file: object) -> int:
     """Number of rows of a file whose claimed size is within the limits."""
     shape = file.metadata  # pyright: ignore[reportAttributeAccessIssue]
-    limits.check_count(source, "columns", shape.num_columns, limits.MAX_COLUMNS)
+    bounds.check_count(source, "columns", shape.num_columns, limits.COLUMNS)
     groups = [shape.row_group(i) for i in range(shape.num_row_groups)]
     numbers = sum(group.column(j).num_values for group in groups for j in range(group.num_columns))
-    limits.check_count(source, "numbers", numbers, limits.MAX_VALUES)
+    bounds.check_count(source, "numbers", numbers, limits.LOG_VALUES)
     return shape.num_rows
 
 
@@ -128,7 +129,7 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
             expected=f"{width} numbers in every row",
             got=f"{lengths[row]} in row {row}",
         )
-    limits.check_count(source, "columns", width, limits.MAX_COLUMNS)
+    bounds.check_count(source, "columns", width, limits.COLUMNS)
     flat = pc.cast(values.flatten(), pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     table = flat.reshape(len(values), width)
     return {f"{name}[{i}]": np.ascontiguousarray(table[:, i]) for i in range(width)}

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from forcegp.logs import limits
-from forcegp.logs.readers.extras import require
+from forcegp import limits
+from forcegp.logs import bounds
 from forcegp.logs.readers.messages import KINDS, Collector, canonical, decoder
 from forcegp.logs.table import LogTable, Progress, Wanted, foreign
+from forcegp.optional import optional_module
 
 
 def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
@@ -19,7 +20,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
         DataError: the bag is damaged or too large, or has no message of these types.
         MissingDependencyError: `rosbags` is not installed.
     """
-    package = require("rosbags.rosbag1", "rosbags", "ROS 1 bags")
+    package = optional_module("rosbags.rosbag1", "Reading ROS 1 bags", "import")
     return read_bag(path, package.Reader, "rosbag1", wanted, rows, progress)
 
 
@@ -35,8 +36,8 @@ def read_bag(
     encoding = "ros1" if format_ == "rosbag1" else "cdr"
     collector = Collector(str(path))
     with foreign(str(path), "a bag"), open_bag(path) as bag:
-        limits.check_count(str(path), "topics", len(bag.connections), limits.MAX_STREAMS)
-        limits.check_count(str(path), "messages", bag.message_count, limits.MAX_MESSAGES)
+        bounds.check_count(str(path), "topics", len(bag.connections), limits.LOG_STREAMS)
+        bounds.check_count(str(path), "messages", bag.message_count, limits.LOG_MESSAGES)
         topics = {c.topic: c.msgtype for c in bag.connections}
         used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
         decoders = {c.msgtype: decoder(canonical(c.msgtype), encoding) for c in used}

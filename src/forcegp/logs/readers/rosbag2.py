@@ -6,10 +6,10 @@ import re
 from pathlib import Path
 
 from forcegp.errors import DataError
-from forcegp.logs import limits
-from forcegp.logs.readers.extras import require
+from forcegp.logs import bounds
 from forcegp.logs.readers.rosbag1 import read_bag
 from forcegp.logs.table import LogTable, Progress, Wanted
+from forcegp.optional import optional_module
 
 
 def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
@@ -19,7 +19,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
         DataError: the bag is damaged, compressed or too large, or has no message of these types.
         MissingDependencyError: `rosbags` is not installed.
     """
-    package = require("rosbags.rosbag2", "rosbags", "ROS 2 bags")
+    package = optional_module("rosbags.rosbag2", "Reading ROS 2 bags", "import")
     if path.is_dir():
         _check_metadata(path)
     elif path.suffix != ".db3":
@@ -30,7 +30,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
 def _check_metadata(path: Path) -> None:
     """Refuse a bag whose unpacked size nobody knows."""
     file = path / "metadata.yaml"
-    limits.check_count(str(file), "bytes", file.stat().st_size, 8 << 20)
+    bounds.check_count(str(file), "bytes", file.stat().st_size, 8 << 20)
     text = file.read_text(encoding="utf-8", errors="replace")
     found = re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE)
     if found:

@@ -6,8 +6,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import limits
+from forcegp.logs import bounds
 
 SAMPLE_BYTES = 1 << 18
 """How much of a file is looked at."""
@@ -133,7 +134,7 @@ def _dialect(
 ) -> Dialect:
     rows = [split(line, separator) for line in lines[first : first + SAMPLE_LINES] if line.strip()]
     width = len(rows[0])
-    limits.check_count(str(path), "columns", width, limits.MAX_COLUMNS)
+    bounds.check_count(str(path), "columns", width, limits.COLUMNS)
     above = [split(line.lstrip("#%/ \t"), separator) for line in lines[:first] if line.strip()]
     above = [
         fields for fields in above if len(fields) == width or (len(fields) == width - 1 and not rows[0][-1])
@@ -145,7 +146,7 @@ def _dialect(
         if len(above) > 1 and all(_UNIT.match(f) for f in above[-1]) and any("[" in f for f in above[-1]):
             heading, unit_line = above[-2], above[-1]
         heading = [*heading, *[""] * (width - len(heading))]
-        names = [name[: limits.MAX_NAME] or f"column {i}" for i, name in enumerate(heading)]
+        names = [name[: limits.LOG_NAME] or f"column {i}" for i, name in enumerate(heading)]
         pairs = zip(names, unit_line or [], strict=False)
         units = {name: unit.strip("[]() ") for name, unit in pairs if unit.strip("[]() ")}
     for name in names:

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ import forcegp
 from forcegp import evaluate
 from forcegp.errors import DataError, ModelError
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.base import FitProgress, FitResult, Model, Prediction
+from forcegp.models.base import Prediction, Predictor
 from random_data import NOISE_STD, random_data, table_system
 
 ROUNDING = 1e-12
@@ -25,7 +26,7 @@ system = table_system()
 data = random_data(system, 3000)
 
 
-class KnownError(Model):
+class KnownError(Predictor):
     """Predicts the noise-free acceleration plus a given error, and claims a given standard deviation."""
 
     kind = "known_error"
@@ -33,9 +34,6 @@ class KnownError(Model):
     def __init__(self, error: Tensor, std: float | None, noise_std: float = NOISE_STD) -> None:
         self.system, self.error, self.std, self.noise_std = system, error, std, noise_std
         self.seen = 0
-
-    def fit(self, data: forcegp.Dataset, *, progress: FitProgress | None = None) -> FitResult:
-        raise NotImplementedError
 
     def save(self, path: str | Path) -> None:
         raise NotImplementedError
@@ -49,6 +47,7 @@ class KnownError(Model):
         *,
         active: Tensor | None = None,
         covariance: bool = True,
+        system: forcegp.ConstrainedSystem | None = None,
     ) -> Prediction:
         rows = slice(self.seen, self.seen + len(q))
         self.seen += len(q)
@@ -64,7 +63,7 @@ def gaussian(std: float, seed: int = 5) -> Tensor:
 
 def test_errors_are_the_known_ones() -> None:
     error = torch.tensor([0.1, -0.2, 0.3, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(3000, 7)
-    found = evaluate(KnownError(error, None), data)
+    found = evaluate(KnownError(error, None), data, compare=False)
     assert found.clean is not None and found.clean_mae == found.clean.mae
     assert found.clean.mae_by_joint == pytest.approx([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0], abs=ROUNDING)
     assert found.clean.mae == pytest.approx(1.6 / 7, abs=ROUNDING)
@@ -78,7 +77,7 @@ def test_errors_are_the_known_ones() -> None:
 
 
 def test_a_perfect_model_has_the_floor_of_the_paper() -> None:
-    found = evaluate(KnownError(gaussian(0.0), None), data)
+    found = evaluate(KnownError(gaussian(0.0), None), data, compare=False)
     # The mean of 21000 absolute values with standard deviation 0.06: three standard errors.
     assert found.noisy_mae == pytest.approx(
         NOISE_STD * math.sqrt(2.0 / math.pi), abs=3 * 0.06 / math.sqrt(21000)
@@ -88,7 +87,7 @@ def test_a_perfect_model_has_the_floor_of_the_paper() -> None:
 
 
 def test_an_honest_uncertainty_is_calibrated() -> None:
-    found = evaluate(KnownError(gaussian(0.2), 0.2), data)
+    found = evaluate(KnownError(gaussian(0.2), 0.2), data, compare=False)
     # Shares among 21000 numbers: three standard errors of at most sqrt(0.25 / 21000).
     tolerance = 3.0 * math.sqrt(0.25 / 21000)
     assert found.coverage_noisy == pytest.approx(0.9545, abs=tolerance)
@@ -105,7 +104,7 @@ def test_an_honest_uncertainty_is_calibrated() -> None:
 
 @pytest.mark.parametrize(("claimed", "coverage"), [(0.02, 0.6), (2.0, 1.0)])
 def test_a_dishonest_uncertainty_shows(claimed: float, coverage: float) -> None:
-    honest, other = (evaluate(KnownError(gaussian(0.2), std), data) for std in (0.2, claimed))
+    honest, other = (evaluate(KnownError(gaussian(0.2), std), data, compare=False) for std in (0.2, claimed))
     assert other.nlpd is not None and honest.nlpd is not None and other.nlpd > honest.nlpd + 0.3
     assert other.coverage_noisy is not None
     assert other.coverage_noisy > 0.999 if coverage == 1.0 else other.coverage_noisy < coverage + 0.1
@@ -113,7 +112,7 @@ def test_a_dishonest_uncertainty_shows(claimed: float, coverage: float) -> None:
 
 def test_the_residual_is_that_of_closed_contacts() -> None:
     error = gaussian(0.1)
-    found = evaluate(KnownError(error, None), data)
+    found = evaluate(KnownError(error, None), data, compare=False)
     active = data.active(["table"])
     A = system.equations(data.q, data.qd).A
     expected = (A @ error[..., None])[..., 0][active].abs()
@@ -125,10 +124,10 @@ def test_the_residual_is_that_of_closed_contacts() -> None:
 
 
 def test_chunks_do_not_matter_and_progress_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = evaluate(KnownError(gaussian(0.2), 0.2), data)
-    monkeypatch.setattr("forcegp.evaluation.CHUNK_STATES", 700)
+    whole = evaluate(KnownError(gaussian(0.2), 0.2), data, compare=False)
+    monkeypatch.setattr("forcegp.evaluation.predicted.CHUNK_STATES", 700)
     calls: list[tuple[int, int]] = []
-    parts = evaluate(KnownError(gaussian(0.2), 0.2), data, progress=lambda *x: calls.append(x))
+    parts = evaluate(KnownError(gaussian(0.2), 0.2), data, compare=False, progress=lambda *x: calls.append(x))
     assert calls == [(700, 3000), (1400, 3000), (2100, 3000), (2800, 3000), (3000, 3000)]
     same = dataclasses.replace(parts, seconds_per_state=whole.seconds_per_state)
     old, new = whole.summary(), same.summary()
@@ -143,7 +142,7 @@ def test_without_clean_accelerations() -> None:
 
 
 def test_everything_fits_into_json() -> None:
-    found = evaluate(KnownError(gaussian(0.2), 0.2), data)
+    found = evaluate(KnownError(gaussian(0.2), 0.2), data, compare=False)
     read = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert read["noisy"]["mae"] == found.noisy_mae
     assert set(found.summary()) >= {"noisy_mae", "clean_mae", "nlpd", "residual"}
@@ -165,3 +164,57 @@ def test_wrong_use_is_refused() -> None:
         evaluate(forcegp.IndependentGP(system), data[:5])
     with pytest.raises(DataError, match="joint"):
         evaluate(forcegp.AnalyticalModel(system), data.select(tuple(reversed(data.joint_names))))
+
+
+def test_a_perfect_model_is_better_than_every_trivial_predictor() -> None:
+    some = data[:200]
+    found = evaluate(KnownError(gaussian(0.01), 0.01), some, train=data[200:400])
+    assert [v.against for v in found.verdicts] == ["mean", "robot file", "least squares"]
+    assert all(v.better for v in found.verdicts) and "but" not in found.verdict
+    error = gaussian(0.01)[:200] + some.qdd_clean - some.qdd
+    M = forcegp.dynamics.mass_matrix(system.robot, some.q)
+    torque = torch.einsum("nij,nj->ni", M, error).square().mean(0).sqrt()
+    model = found.predictors[0]
+    assert model.torque.all == pytest.approx(torque.tolist(), rel=1e-9)
+    assert model.nlpd == found.nlpd
+
+
+def test_the_robot_file_is_not_better_than_itself() -> None:
+    found = evaluate(forcegp.AnalyticalModel(system), data[:100], train=data[100:200])
+    against = {v.against: v for v in found.verdicts}
+    assert against["robot file"].torque == pytest.approx(1.0) and not against["robot file"].better
+    assert "but is not better than" in found.verdict
+
+
+def test_without_training_data_each_half_is_predicted_from_the_other() -> None:
+    some = data[:100]
+    halves = evaluate(KnownError(gaussian(0.01), None), some)
+    errors = [some.qdd[50:].mean(0) - some.qdd[:50], some.qdd[:50].mean(0) - some.qdd[50:]]
+    mean = next(p for p in halves.predictors if p.name == "mean")
+    assert mean.acceleration.all == pytest.approx(torch.cat(errors).square().mean(0).sqrt().tolist())
+
+
+class KnownMultiplier(KnownError):
+    """Predicts a multiplier that is 1 N too large, with a standard deviation of 1 N."""
+
+    def force_field(self) -> Any:
+        return lambda system, at: at.q
+
+    def predict(
+        self, q: Tensor, qd: Tensor, tau: Tensor, quantity: str = "qdd", **settings: Any
+    ) -> Prediction:
+        if quantity == "qdd":
+            return super().predict(q, qd, tau, **settings)
+        rows = settings["active"][:, 0].cumsum(0)[:, None].to(q)
+        return Prediction(rows + 1.0, torch.ones(len(q), 1, 1, dtype=q.dtype))
+
+
+def test_multipliers_are_held_against_a_logged_sensor() -> None:
+    some, closed = data[:50], data.contact["table"][:50]
+    logged = closed.cumsum(0).double()
+    some = some.replace(contact_extras={"multiplier": {"table": logged}})
+    (found,) = evaluate(KnownMultiplier(gaussian(0.0), 0.1), some, compare=False).multipliers
+    assert (found.contact, found.samples) == ("table", int(closed.sum()))
+    assert found.bias == pytest.approx(1.0) and found.spread == pytest.approx(0.0, abs=1e-9)
+    assert found.correlation == pytest.approx(1.0) and found.coverage == 1.0
+    assert evaluate(KnownError(gaussian(0.0), 0.1), some, compare=False).multipliers == ()

@@ -1,0 +1,100 @@
+"""Planted faults against findings, on simulated and real logs: the confusion table of docs/checking.md.
+
+Run from the repository root: `PYTHONPATH=tests python benchmarks/check_confusion.py --out confusion.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import forcegp
+from forcegp.checks import Log, check, log_of
+from forcegp.constraints import ConstrainedSystem
+from forcegp.simulate import SimulationConfig, simulate
+from planted_faults import FAULTS, REAL, Case, found, free_log, real_iiwa, real_pendulum, serious
+
+TRUE = {
+    "real iiwa": {"friction-undeclared", "torque-offset", "joint-still", "disturbance"},
+    "real pendulum": {"friction-undeclared", "masses-mismatch", "time-gap"},
+}
+"""Findings on logs as published that are right: see docs/checking.md."""
+
+
+def free() -> Case:
+    """Free motion of the bundled arm."""
+    robot = forcegp.load_robot("kuka_iiwa")
+    return ConstrainedSystem(robot, []), free_log(robot)
+
+
+def contact() -> Case:
+    """The paper's task with lifts."""
+    system = forcegp.load_scene("kuka_plane").system()
+    config = SimulationConfig(duration=14.0, seed=11, lift_probability=0.15, engine="mujoco")
+    return system, log_of(simulate(system, config).data)
+
+
+def pendulum() -> Case:
+    """The double pendulum with both joints driven."""
+    with tempfile.TemporaryDirectory() as folder:
+        return real_pendulum(Path(folder), run=2)
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "simulated free motion": free,
+    "simulated contact": contact,
+    "real iiwa": real_iiwa,
+    "real pendulum": pendulum,
+}
+
+
+def faults_of(log: Log) -> list:
+    """The faults that can be planted in a log."""
+    touches, white = bool(log.contact), log.header.noise_std is not None
+    fitting = [f for f in FAULTS if f.contact is None or f.contact == touches]
+    return [f for f in fitting if white or not f.white]
+
+
+def table_of(name: str, case: Case) -> dict[str, object]:
+    """Counts and names of one log."""
+    clean = serious(check(*case))
+    hit, missed, others = [], {}, {}
+    for fault in faults_of(case[1]):
+        system, log, rows = fault.plant(*case)
+        report = check(system, log)
+        extra = sorted(serious(report) - clean - {fault.kind})
+        if found(fault, report, log, rows):
+            hit.append(fault.name)
+            others |= {fault.name: extra} if extra else {}
+        else:
+            missed[fault.name] = extra
+        print(f"{name}: {fault.name}: {'missed' if fault.name in missed else 'found'} {extra}", flush=True)
+    alarms = sorted(clean - TRUE.get(name, set()))
+    kinds = len({f.kind for f in FAULTS if f.name in hit})
+    return {
+        "planted": len(hit) + len(missed),
+        "found": len(hit),
+        "kinds_found": kinds,
+        "missed": missed,
+        "further_findings": others,
+        "clean_true": sorted(clean - set(alarms)),
+        "clean_false": alarms,
+    }
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--case", choices=list(CASES), action="append")
+    options = parser.parse_args()
+    names = [n for n in options.case or CASES if REAL.is_dir() or not n.startswith("real")]
+    result = {name: table_of(name, CASES[name]()) for name in names}
+    options.out.write_text(json.dumps(result, indent=2, ensure_ascii=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""`forcegp check`: is a log fit for a model?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from forcegp.cli.common import AsJson, SceneName, progress_bar, show
+
+if TYPE_CHECKING:
+    from forcegp.checks import Report
+
+NOT_USABLE = 1
+"""Exit code where a finding makes a fit worthless."""
+COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
+
+
+def check(
+    scene: SceneName,
+    data: Annotated[
+        Path, typer.Option("--data", "-d", help="Log, .parquet or .csv; NaN and gaps are findings.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="HTML page with a picture of each finding.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise, motion.
+
+    The last line says whether to go on. The exit code is 0 where a model can be fitted, 1 where a finding
+    makes a fit worthless, and 2 where scene or log cannot be read.
+
+    [bold]Examples[/bold]
+
+    forcegp check --scene kuka_plane --data run.parquet
+
+    forcegp check -s my_scene.toml -d run.parquet --out check.html --json
+    """
+    from forcegp.checks import check as run
+    from forcegp.checks import read_log
+    from forcegp.scene import load_scene
+
+    system = load_scene(scene).system()
+    log = read_log(data)
+    with progress_bar("checking", 1) as progress:
+        report = run(system, log, progress=progress)
+    if out is not None:
+        from forcegp.report.check import write_check
+
+        write_check(out, f"{data} on {scene}", report, system, log)
+    if as_json:
+        show({**report.to_dict(), "page": str(out) if out else None}, as_json)
+    else:
+        _print(report)
+        typer.echo(f"page: {out}" if out else "", nl=out is not None)
+        typer.secho(report.verdict, bold=True)
+    if not report.usable:
+        raise typer.Exit(NOT_USABLE)
+
+
+def _print(report: Report) -> None:
+    """The findings as a table."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from forcegp.checks.statistics import describe
+
+    if report.findings:
+        table = Table(box=None, pad_edge=False)
+        for heading in ("weight", "kind", "rows", "finding and remedy"):
+            table.add_column(heading, no_wrap=heading in ("weight", "kind"), overflow="fold")
+        for finding in report.findings:
+            whole = finding.intervals == ((0, report.samples),)
+            rows = (
+                "all"
+                if whole
+                else describe(finding.intervals, most=2).removeprefix("rows ").removeprefix("row ")
+            )
+            # Joint and parameter names may hold brackets, which are no markup.
+            body = Text(f"{finding.message}\n").append(f"→ {finding.remedy}", style="dim")
+            table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), finding.kind, rows, body)
+        Console().print(table)
+    for name, reason in report.skipped.items():
+        typer.echo(f"not checked: {name} ({reason})")

@@ -1,0 +1,82 @@
+"""What the equations of motion of one state need, from one compiled call: M, Q_C, Q_G and moving points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forcegp.compiled.build import cpu_kernel
+from forcegp.compiled.links import Links, cross, numbers
+from forcegp.compiled.program import Program, _joint_force, _mass_matrix, _Motion, _motion
+from forcegp.compiled.source import cpu_source
+from forcegp.robot.model import BASE, RobotModel
+
+Anchor = tuple[str, Sequence[float]]
+"""A frame, and a point in its coordinates [m]."""
+
+
+class CompiledMechanics:
+    """Mechanics of one robot at one state, as a compiled function of (q, q̇).
+
+    A call returns M, Q_C and Q_G, then for each point: axes of its frame `(3, 3)` and position in the world,
+    Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and bias acceleration J̇ q̇ `(6,)`.
+
+    Args:
+        robot: the robot, on the CPU; its parameters become constants.
+        points: the points wanted.
+
+    Raises:
+        MissingDependencyError: there is no C++ compiler.
+    """
+
+    def __init__(self, robot: RobotModel, points: Sequence[Anchor]) -> None:
+        links = Links(robot)
+        blocks = _forces(links)
+        for frame, point in points:
+            blocks += _point_blocks(links, robot, robot.frame_index(frame), np.asarray(point, dtype=float))
+        self._shapes = [block.shape for block in blocks]
+        self._sizes = [block.size for block in blocks]
+        outputs = [entry for block in blocks for entry in block.flat]
+        program = Program(("q", "qd"), (len(outputs),), links.graph, outputs)
+        source = cpu_source(program, robot.nq, robot.dtype)
+        self._arrays, self._kernel, self._dtype = source.arrays, cpu_kernel(source.text), robot.dtype
+
+    def __call__(self, q: Tensor, qd: Tensor) -> list[Tensor]:
+        """The mechanics at a state `(nq,)`, `(nq,)`."""
+        given = {"q": q, "qd": qd, "sin": torch.sin(q), "cos": torch.cos(q)}
+        out = torch.empty(1, sum(self._sizes), dtype=self._dtype)
+        self._kernel([given[name].contiguous() for name in self._arrays], out)
+        return [part.view(shape) for part, shape in zip(out[0].split(self._sizes), self._shapes, strict=True)]
+
+
+def _forces(links: Links) -> list[np.ndarray]:
+    """M, Q_C and Q_G."""
+    return [
+        _mass_matrix(links),
+        -_joint_force(links, links.vector("qd"), None, gravity=False),
+        -_joint_force(links, None, None, gravity=True),
+    ]
+
+
+def _point_blocks(links: Links, robot: RobotModel, index: int, point: np.ndarray) -> list[np.ndarray]:
+    """Rotation and position in the world, Jacobian and bias acceleration of a point of a frame."""
+    graph, parent, n = links.graph, robot.frame_parents[index], robot.nq
+    zero = graph.constants(np.zeros(3))
+    R, p, moves = graph.constants(numbers(robot.base_rotation)), zero, _Motion(zero, zero, zero, zero)
+    if parent != BASE:
+        motion = _motion(links, links.vector("qd"), None, gravity=False)
+        R, p, moves = links.R[parent], links.p[parent], motion[parent]
+    local = numbers(robot.frame_position[index]) + numbers(robot.frame_rotation[index]) @ point
+    x = p + R @ graph.constants(local)
+    J = graph.constants(np.zeros((6, n)))
+    for j in [] if parent == BASE else links.ancestors(parent):
+        J[:3, j] = links.z[j]
+        J[3:, j] = links.l[j] + cross(links.z[j], x)
+    omega, v, alpha, a = moves
+    bias = a + cross(alpha, x) + cross(omega, v + cross(omega, x))
+    rotation = R @ graph.constants(numbers(robot.frame_rotation[index]))
+    position = x + graph.constants(numbers(robot.base_position))
+    return [rotation, position, J, np.concatenate([alpha, bias])]

@@ -1,0 +1,84 @@
+"""Whether a data set fits a robot, and data sets fit each other."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+from forcegp.data.fields import Fields
+from forcegp.data.header import DataHeader
+from forcegp.errors import DataError, near_names
+from forcegp.robot.model import RobotModel
+
+
+class RobotMismatchWarning(UserWarning):
+    """The data were logged on a robot whose parameters differ from those of the robot they are used with."""
+
+
+def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
+    """Check that the joints of a log are those of a robot, in its order."""
+    if tuple(have) == tuple(want):
+        return
+    missing = [joint for joint in want if joint not in have]
+    if not missing:
+        raise DataError(
+            f"the joints of the data are not those of robot {robot!r} in its order",
+            expected=", ".join(want),
+            got=", ".join(have),
+            hint="call data.select(robot.joint_names)",
+        )
+    near = near_names(missing[0], (joint for joint in have if joint not in want))
+    raise DataError(
+        f"joint {missing[0]!r} of robot {robot!r} is not in the data",
+        expected=", ".join(want),
+        got=", ".join(have),
+        hint=f"is {near[0]!r} in the data the same joint? Rename its columns" if near else None,
+    )
+
+
+def check_robot(data: Fields, robot: RobotModel) -> None:
+    """Check that a log is of a robot's joints, in its order; other parameters of the robot are a warning."""
+    check_joints(data.joint_names, robot.joint_names, robot.name)
+    logged = data.header.robot_fingerprint
+    if logged is not None and logged != robot.fingerprint:
+        warnings.warn(
+            f"the data were logged on robot {data.header.robot!r} (fingerprint {logged}) and are used with "
+            f"{robot.name!r} ({robot.fingerprint}): inertia, kinematics, base or gravity differ",
+            RobotMismatchWarning,
+            stacklevel=3,
+        )
+
+
+def check_alike(parts: Sequence[Fields]) -> None:
+    """Check that data sets hold the same columns, so that they can be put one after another."""
+    if not parts:
+        raise DataError("no data sets to concatenate", expected="one or more data sets")
+
+    def layout(data: Fields) -> dict[str, object]:
+        return {
+            "joints": data.joint_names,
+            "contacts": tuple(data.contact),
+            "extras": sorted(data.extras),
+            "contact extras": sorted((name, *sorted(group)) for name, group in data.contact_extras.items()),
+            "types": (data.q.dtype, data.q.device),
+        }
+
+    first = layout(parts[0])
+    for number, part in enumerate(parts[1:], start=1):
+        for what, value in layout(part).items():
+            if value != first[what]:
+                raise DataError(
+                    f"the {what} of data set {number} differ from those of data set 0",
+                    expected=first[what],
+                    got=value,
+                )
+
+
+def common_header(headers: Sequence[DataHeader]) -> DataHeader:
+    """The fields on which headers agree; the others get their default."""
+    first = headers[0].model_dump()
+    agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
+    steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))
+    agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
+    agreed["ordered"] = all(header.ordered for header in headers)
+    return DataHeader(**agreed)

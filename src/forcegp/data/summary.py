@@ -1,0 +1,34 @@
+"""A data set in one line."""
+
+from __future__ import annotations
+
+import torch
+
+from forcegp.data.fields import Fields
+
+
+def summary(data: Fields) -> str:
+    """What a data set logs, without the numbers: samples, joints, duration, contacts, further quantities."""
+    robot = f" of {data.header.robot!r}" if data.header.robot else ""
+    parts = [f"{len(data)} samples of {len(data.joint_names)} joints"]
+    if len(data):
+        parts += [_time(data), *_contacts(data)]
+    also = [*data.extras, *data.contact_extras]
+    parts += [f"also logged: {', '.join(also)}"] if also else []
+    kind = str(data.q.dtype).removeprefix("torch.")
+    return f"<Dataset{robot}: {'; '.join(parts)}; {kind} on {data.q.device}>"
+
+
+def _time(data: Fields) -> str:
+    count = int(data.segment.unique().numel())
+    segments = f"{count} segment{'s' if count != 1 else ''}"
+    if not data.header.ordered:
+        return f"selected from {segments}, not in order of time"
+    _, rows = torch.unique_consecutive(data.segment, return_counts=True)
+    last = rows.cumsum(0) - 1
+    return f"{float((data.t[last] - data.t[last - rows + 1]).sum()):.4g} s in {segments}"
+
+
+def _contacts(data: Fields) -> list[str]:
+    closed = [f"{name} ({float(value.double().mean()):.0%} closed)" for name, value in data.contact.items()]
+    return [f"contact {', '.join(closed)}"] if closed else []

@@ -1,0 +1,196 @@
+"""Identification of a rigid robot by least squares, with physically consistent inertial parameters.
+
+τ = M q̈ − Q_C − Q_G − Q_D + Y(q, q̇, q̈) δπ + d q̇ + f tanh(q̇/v₀) + o + noise, where δπ corrects the
+inertial parameters of every link, and d, f, o are viscous friction, Coulomb friction and offset of every
+joint. A ridge holds every unknown near the robot file. Log-Cholesky coordinates keep every link physical
+(Rucker and Wensing 2022), so that the mass matrix stays positive definite. In contact the equations are
+projected onto the directions in which the constraint force does not act.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
+from forcegp.identification import parameter_vector, regressor
+from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, log_cholesky
+from forcegp.robot.inertia import pseudo_inertia as pseudo_inertia_of
+from forcegp.robot.model import RobotModel
+
+CHUNK_STATES = 1000
+"""States handled at a time, which bounds the memory."""
+MOST = 4000
+"""Samples used at most, evenly spaced: some hundred times the number of unknowns in equations."""
+MASS_SHARE, LENGTH = 0.3, 0.1
+"""Prior standard deviation of a link's parameters: 30 % of its mass m, m · 0.1 m and m · (0.1 m)²."""
+WIDE = 10.0
+"""Prior standard deviation of friction and offset, relative to the largest torque of the joint."""
+NOISE_PASSES, STEPS = 3, 30
+"""Re-estimations of the noise of every joint, and Levenberg-Marquardt steps in each."""
+POINT = 1e-4
+"""Share of the largest mass, at 0.1 m, that spreads a link whose parameters no extended body has."""
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """An identified rigid robot.
+
+    Attributes:
+        system: robot with the identified inertial parameters, and the contacts.
+        friction: `(3 nq,)` viscous friction, Coulomb friction and offset of every joint, beyond the file's.
+    """
+
+    system: ConstrainedSystem
+    friction: Tensor
+
+    @torch.no_grad()
+    def predict(self, data: Dataset) -> Tensor:
+        """Accelerations `(n, nq)` under the logged torques, on the constraint."""
+        parts = (data[i : i + CHUNK_STATES] for i in range(0, len(data), CHUNK_STATES))
+        return torch.cat([self._predict(part) for part in parts])
+
+    def _predict(self, data: Dataset) -> Tensor:
+        eom = self.system.equations(data.q, data.qd, data.active(self.system.contact_names))
+        lost = (_friction_columns(self.system.robot, data.qd) @ self.friction[:, None])[..., 0]
+        return eom.acceleration(eom.Q_K + data.tau - lost)
+
+
+def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
+    """Identify inertial parameters, friction and offsets from measured torques and accelerations.
+
+    Args:
+        system: robot and contacts of the robot file.
+        train: the log.
+
+    Returns:
+        The identified robot; what the motion does not excite stays as in the robot file.
+    """
+    rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
+    train, robot = train[rows.unique()], system.robot
+    prior = _prior_std(robot, train)
+    G, g, y2 = _normal_equations(system, train, prior)
+    theta, split = _start(robot), 10 * robot.nq
+    x = torch.zeros_like(prior)
+    noise = (y2 / len(train)).sqrt()
+    for _ in range(NOISE_PASSES):
+        weight = noise.clamp(min=1e-9) ** -2
+        gram = torch.einsum("j,jkl->kl", weight, G) + torch.eye(len(prior), dtype=prior.dtype)
+        theta, x = _minimise(robot, gram, weight @ g, prior[:split], theta, x[split:])
+        left = y2 - 2.0 * g @ x + torch.einsum("k,jkl,l->j", x, G, x)
+        noise = (left.clamp(min=0.0) / len(train)).sqrt()
+    mass, com, inertia = from_pseudo_inertia(from_log_cholesky(theta))
+    found = robot.replace(mass=mass, com=com, inertia=inertia)
+    return LeastSquares(system.with_robot(found), x[split:] * prior[split:])
+
+
+def _friction_columns(robot: RobotModel, qd: Tensor) -> Tensor:
+    """(diag q̇, diag tanh(q̇/v₀), 1), `(n, nq, 3 nq)`."""
+    dry = torch.tanh(qd / robot.friction_velocity)
+    return torch.cat([torch.diag_embed(x) for x in (qd, dry, torch.ones_like(qd))], dim=-1)
+
+
+def _prior_std(robot: RobotModel, train: Dataset) -> Tensor:
+    """Prior standard deviation of every unknown, `(13 nq,)`."""
+    mass = robot.mass.clamp(min=1e-3 * float(robot.mass.max()))
+    shares = torch.tensor([MASS_SHARE, *[LENGTH] * 3, *[LENGTH**2] * 6]).to(mass)
+    torque = WIDE * train.tau.abs().amax(0).clamp(min=1e-6)
+    speed = train.qd.abs().amax(0).clamp(min=1e-3)
+    return torch.cat([(mass[:, None] * shares).flatten(), torque / speed, torque, torque])
+
+
+@torch.no_grad()
+def _normal_equations(
+    system: ConstrainedSystem, train: Dataset, prior: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """WᵀW `(nq, p, p)`, Wᵀy `(nq, p)` and yᵀy `(nq,)` by joint, with unknowns scaled by the prior."""
+    p, nq = len(prior), train.nq
+    G, g, y2 = prior.new_zeros(nq, p, p), prior.new_zeros(nq, p), prior.new_zeros(nq)
+    for i in range(0, len(train), CHUNK_STATES):
+        W, y = _rows(system, train[i : i + CHUNK_STATES])
+        W = (W * prior).transpose(0, 1)
+        G += W.mT @ W
+        g += (W.mT @ y.mT[..., None])[..., 0]
+        y2 += (y**2).sum(0)
+    return G, g, y2
+
+
+def _rows(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, Tensor]:
+    """Regressor `(n, nq, 13 nq)` and torque that the robot file leaves `(n, nq)`."""
+    eom = system.equations(data.q, data.qd, data.active(system.contact_names))
+    Y = regressor(system.robot, data.q, data.qd, data.qdd)
+    W = torch.cat([Y, _friction_columns(system.robot, data.qd)], dim=-1)
+    y = data.tau + eom.Q_K - (eom.M @ data.qdd[..., None])[..., 0]
+    if eom.A.shape[-2]:
+        # N = 1 − A⁺A removes the constraint force, which lies in the range of Aᵀ.
+        N = torch.eye(data.nq, dtype=data.dtype) - torch.linalg.pinv(eom.A) @ eom.A
+        W, y = N @ W, (N @ y[..., None])[..., 0]
+    return W, y
+
+
+def _start(robot: RobotModel) -> Tensor:
+    """Log-Cholesky coordinates of the robot file `(nq, 10)`; bodies without extent get a little of it."""
+    J = pseudo_inertia_of(robot.mass, robot.com, robot.inertia)
+    least = POINT * float(robot.mass.max()) * torch.tensor([LENGTH**2] * 3 + [1.0]).to(J)
+    bad = torch.linalg.cholesky_ex(J - 1e-2 * torch.diag(least)).info != 0
+    return log_cholesky(J + bad[:, None, None] * torch.diag(least))
+
+
+def _minimise(
+    robot: RobotModel, gram: Tensor, right: Tensor, prior: Tensor, theta: Tensor, friction: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Levenberg-Marquardt on ½ xᵀ gram x − rightᵀ x over x = ((π(θ) − π₀)/S, friction)."""
+    centre, links = parameter_vector(robot).detach().reshape(-1, 10), prior.reshape(-1, 10)
+
+    def at(t: Tensor, f: Tensor) -> Tensor:
+        return torch.cat([((_parameters(from_log_cholesky(t)) - centre) / links).flatten(), f])
+
+    x, damping = at(theta, friction), 1e-3
+    value = 0.5 * x @ gram @ x - right @ x
+    for _ in range(STEPS):
+        by_link = _slopes(theta) / links[..., None]
+        J = torch.block_diag(*by_link, torch.eye(len(friction), dtype=x.dtype))
+        H, slope = J.mT @ gram @ J, J.mT @ (gram @ x - right)
+        step = torch.linalg.solve(H + damping * H.diagonal().clamp(min=1e-12).diag(), -slope)
+        t = theta + step[: theta.numel()].reshape(theta.shape)
+        f = friction + step[theta.numel() :]
+        x_new = at(t, f)
+        new = 0.5 * x_new @ gram @ x_new - right @ x_new
+        if bool(new < value):
+            done = bool(value - new < 1e-8 * value.abs())
+            theta, friction, x, value, damping = t, f, x_new, new, 0.1 * damping
+            if done:
+                break
+        else:
+            damping *= 10.0
+    return theta, x
+
+
+def _parameters(J: Tensor) -> Tensor:
+    """π `(..., 10)` of pseudo-inertias `(..., 4, 4)`, a linear map: I_o = tr(Σ) 1 − Σ."""
+    S = J[..., :3, :3]
+    I = S.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * torch.eye(3, dtype=J.dtype) - S
+    rows, columns = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+    return torch.cat([J[..., 3, 3:], J[..., :3, 3], I[..., rows, columns]], dim=-1)
+
+
+def _slopes(theta: Tensor) -> Tensor:
+    """∂π/∂θ `(nq, 10, 10)` in closed form: J = U Uᵀ, and every entry of U depends on α and one more."""
+    scale = theta[:, 0].exp()
+    dU = theta.new_zeros(len(theta), 10, 4, 4)
+    for k, (i, j) in enumerate(
+        ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)), start=1
+    ):
+        dU[:, k, i, j] = scale * (theta[:, k].exp() if i == j else 1.0)
+    s12, s23, s13, *t = (scale * theta[:, k] for k in range(4, 10))
+    for k, value in (((0, 1), s12), ((1, 2), s23), ((0, 2), s13), *(((i, 3), t[i]) for i in range(3))):
+        dU[:, 0, k[0], k[1]] = value
+    for i in range(3):
+        dU[:, 0, i, i] = dU[:, i + 1, i, i]
+    U = dU[:, 0].clone()
+    dU[:, 0, 3, 3] = U[:, 3, 3] = scale
+    dJ = dU @ U[:, None].mT
+    return _parameters(dJ + dJ.mT).mT

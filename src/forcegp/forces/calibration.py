@@ -1,0 +1,142 @@
+"""What is left of measured torques after a fit: its correlation in time, and its size on held-out stretches.
+
+Temperature, hysteresis and filters leave residuals that are correlated in time, so a log holds less evidence than
+its samples suggest. The integrated autocorrelation time says how much less. The variance of a new motion is
+measured where it counts: on stretches of the training log that the posterior has not seen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import torch
+from scipy.optimize import brentq
+from torch import Tensor
+
+from forcegp.forces.inference import force_posterior
+from forcegp.forces.learn import Problem
+from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.quantities import affine_map
+
+STRETCHES = 8
+"""Contiguous stretches that a log of fewer than three segments is divided into."""
+FEWEST = 50
+"""Samples in free motion below which nothing is calibrated."""
+NEGLIGIBLE = 0.05
+"""Autocorrelation below which the rest is noise of the estimate."""
+
+
+def autocorrelation_time(residual: Tensor, segment: Tensor) -> Tensor:
+    """Integrated autocorrelation time of each column, 1 + 2 Σ ρ_k, in samples `(d,)`.
+
+    The sum ends where ρ falls below 0.05, and at half the longest segment.
+
+    Args:
+        residual: `(n, d)` in the order of time.
+        segment: `(n,)`.
+    """
+    parts = [residual[segment == s] for s in segment.unique()]
+    longest = max(len(part) for part in parts)
+    variance = (residual**2).mean(0).clamp(min=1e-300)
+    total, open_ = torch.ones_like(variance), torch.ones_like(variance, dtype=torch.bool)
+    for lag in range(1, longest // 2):
+        pairs = [(part[:-lag], part[lag:]) for part in parts if len(part) > lag]
+        count = sum(len(a) for a, _ in pairs)
+        rho = sum(((a * b).sum(0) for a, b in pairs), start=torch.zeros_like(variance)) / (count * variance)
+        open_ &= rho > NEGLIGIBLE
+        if not bool(open_.any()):
+            break
+        total = total + torch.where(open_, 2.0 * rho, 0.0)
+    return total
+
+
+def _free(m: Measurement) -> Tensor:
+    """Rows of samples without a closed contact."""
+    return (~m.active.any(-1)).nonzero()[:, 0]
+
+
+def _motions(training: Training) -> list[int]:
+    """Measurements of accelerations."""
+    return [i for i, quantity in enumerate(training.quantities) if quantity == "qdd"]
+
+
+def likelihood_power(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> float:
+    """κ = 1/τ̄, the geometric mean over the joints of the autocorrelation time of torque residuals; at most 1."""
+    posterior = force_posterior(problem, hyperparameters)
+    logs = []
+    for i in _motions(problem.training):
+        m = problem.training.measurements[i]
+        m = m[_free(m)]
+        if len(m.q) < FEWEST:
+            continue
+        at = m.at(problem.system)
+        z = affine_map(problem.system, at, "total_force")
+        force = (at.eom.M @ m.values[..., None])[..., 0]
+        residual = force - posterior.read_mean(problem.system, at, z)
+        logs.append(autocorrelation_time(residual, m.segment).log())
+    return min(1.0, math.exp(-float(torch.stack(logs).mean()))) if logs else 1.0
+
+
+def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
+    """Standard deviation of torque noise `(nq,)` with which held-out stretches have unit normalised errors.
+
+    Each stretch is predicted from all others with the hyperparameters as they are. Of joint i, s_i² solves
+    mean(r² / (s_i² + Var r)) = 1 over all samples in free motion.
+
+    Args:
+        problem: what was learned.
+        hyperparameters: learned tensors.
+        least: the learned standard deviation, which is kept where the errors ask for less.
+    """
+    training = problem.training
+    residuals, variances = [], []
+    for i in _motions(training):
+        m = training.measurements[i]
+        group = _groups(m.segment)
+        for g in group.unique().tolist():
+            own = (group == g).nonzero()[:, 0]
+            rest = dataclasses.replace(problem, training=training.without(i, own))
+            found = _held_out(rest, hyperparameters, m[own], problem.noise_at(hyperparameters, i))
+            residuals.append(found[0])
+            variances.append(found[1])
+    if sum(len(r) for r in residuals) < FEWEST:
+        return least
+    r2, V = torch.cat(residuals) ** 2, torch.cat(variances)
+    return torch.stack([_unit_scale(r2[:, j], V[:, j], least[j]) for j in range(len(least))])
+
+
+def _groups(segment: Tensor) -> Tensor:
+    """Which stretch each sample belongs to: its segment, or an eighth of the log where segments are few."""
+    _, own = segment.unique(return_inverse=True)
+    if int(own.max()) + 1 >= 3:
+        return own
+    n = len(segment)
+    return torch.arange(n, device=segment.device) * STRETCHES // max(n, 1)
+
+
+def _held_out(
+    problem: Problem, hyperparameters: Mapping[str, Tensor], m: Measurement, noise_std: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Torque residuals of unseen samples in free motion, and their variance but for torque noise, `(n, nq)`."""
+    m = m[_free(m)]
+    posterior, system = force_posterior(problem, hyperparameters), problem.system
+    at = m.at(system)
+    z = affine_map(system, at, "total_force")
+    residual = (at.eom.M @ m.values[..., None])[..., 0] - posterior.read_mean(system, at, z)
+    spread = posterior.read_covariance(system, at, z).diagonal(dim1=-2, dim2=-1)
+    std = noise_std if noise_std.ndim == 1 else noise_std.square().mean(0).sqrt()
+    return residual, spread + (at.eom.M**2 @ std**2)
+
+
+def _unit_scale(r2: Tensor, V: Tensor, least: Tensor) -> Tensor:
+    """s with mean(r² / (s² + V)) = 1, at least `least`."""
+    low, high = 2.0 * math.log(float(least)), math.log(float(r2.mean()) + float(least) ** 2) + 1.0
+
+    def excess(log_variance: float) -> float:
+        return float((r2 / (math.exp(log_variance) + V)).mean()) - 1.0
+
+    if excess(low) <= 0.0:
+        return least
+    return torch.full_like(least, math.exp(0.5 * float(brentq(excess, low, high))))  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,130 @@
+"""A Gaussian prior on the errors of the robot file's inertial parameters, marginalised in closed form.
+
+Inverse dynamics is linear in the inertial parameters π: with π = π₀ + δ, M₀ q̈ − Q_C,0 − Q_G,0 + Y(q, q̇, q̈) δ = Q
+is an identity at the measured acceleration. So δ acts like a joint force −Y δ with a constant latent δ ~ N(0, S²),
+and least-squares identification with a ridge towards the file is a special case. A prediction takes the robot with
+the updated parameters; what remains uncertain acts through Y at the predicted acceleration.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.quantities import States
+from forcegp.gp.kernels import Constant, Kernel
+from forcegp.gp.optimise import LearningOptions, minimise
+from forcegp.identification import regressor
+from forcegp.robot.inertia import (
+    from_log_cholesky,
+    from_pseudo_inertia,
+    inertial_parameters,
+    log_cholesky,
+    pseudo_inertia,
+)
+from forcegp.robot.model import RobotModel
+
+PER_LINK = 10
+"""m, m c and the inertia about the link origin."""
+
+
+@dataclass(frozen=True)
+class InertialPrior(ForcePrior):
+    """Q = −Y(q, q̇, q̈) S δ, δ ~ N(0, diag(s_k²)): one learned scale s_k per link k, 1 at the start.
+
+    Args:
+        mass: relative standard deviation of each link's mass.
+        length: standard deviation of the first moment over the mass, and radius of gyration of the error of the
+            inertia [m].
+        kernel: covariance of the constants.
+        name: prefix of the hyperparameters.
+        masses: of the links, which the scale is relative to; those of the robot by default [kg].
+    """
+
+    mass: float = 0.3
+    length: float = 0.1
+    kernel: Kernel = field(default_factory=lambda: Constant(group=PER_LINK))
+    name: str = "inertial"
+    target: str = JOINT
+    masses: tuple[float, ...] | None = None
+
+    def around(self, robot: RobotModel) -> InertialPrior:
+        """The prior with the masses of this robot as its scale, whatever robot it is read on."""
+        return dataclasses.replace(self, masses=tuple(robot.mass.tolist()))
+
+    def outputs(self, robot: RobotModel) -> int:
+        return PER_LINK * robot.nq
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return {"one": torch.zeros_like(at.q[:, :1])}
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        # A state without a measured acceleration has the one that the analytical model predicts.
+        qdd = at.qdd
+        if qdd is None:
+            qdd = at.eom.acceleration(at.eom.Q_K + at.tau)
+        return -regressor(system.robot, at.q, at.qd, qdd) * self.scale(system.robot)
+
+    def scale(self, robot: RobotModel) -> Tensor:
+        """S `(10 nq,)`: standard deviations of π before a link's scale is learned."""
+        m = robot.mass if self.masses is None else robot.mass.new_tensor(self.masses)
+        r = self.length
+        parts = [self.mass * m, *3 * [m * r], *6 * [m * r * r]]
+        return torch.stack(parts, dim=-1).flatten().detach()
+
+    def updated(self, robot: RobotModel, mean: Tensor, precision: Tensor) -> tuple[RobotModel, Tensor]:
+        """The physically consistent robot that is most probable given δ ~ N(mean, precision⁻¹).
+
+        It minimises ½ (δ − mean)ᵀ precision (δ − mean) + Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] over the log-Cholesky
+        coordinates of the pseudo-inertias J of the links; the second term (the divergence of Lee, Wensing and Park,
+        2019, with the weight of one nat) keeps a link that the log does not determine from losing all its inertia.
+
+        Args:
+            robot: with π₀.
+            mean: of δ, `(10 nq,)`.
+            precision: of δ, `(10 nq, 10 nq)`.
+
+        Returns:
+            The robot, and the δ that it contains `(10 nq,)`. Links that are not physically consistent in the file
+            stay as they are.
+        """
+        J0 = pseudo_inertia(robot.mass, robot.com, robot.inertia)
+        sound = torch.linalg.eigvalsh(J0)[:, 0] > 0.0
+        pi0 = inertial_parameters(robot.mass, robot.com, robot.inertia)
+        scale = self.scale(robot).unflatten(0, (robot.nq, PER_LINK))
+        inverse = torch.linalg.inv(J0[sound])
+
+        def delta_of(x: Tensor) -> Tensor:
+            bodies = from_pseudo_inertia(from_log_cholesky(x))
+            delta = torch.zeros_like(pi0).index_put((sound.nonzero()[:, 0],), inertial_parameters(*bodies))
+            return torch.where(sound[:, None], (delta - pi0) / scale, 0.0).flatten()
+
+        def objective(tensors: dict[str, Tensor]) -> Tensor:
+            x = tensors["x"]
+            apart = delta_of(x) - mean
+            ratio = inverse @ from_log_cholesky(x)
+            log_det = 8.0 * x[:, 0] + 2.0 * x[:, 1:4].sum(-1)
+            divergence = ratio.diagonal(dim1=-2, dim2=-1).sum(-1) - log_det
+            return 0.5 * apart @ (precision @ apart) + divergence.sum()
+
+        if not bool(sound.any()):
+            return robot, torch.zeros_like(mean)
+        with torch.enable_grad():
+            found = minimise(objective, {"x": log_cholesky(J0[sound])}, CONSISTENT).tensors["x"]
+        rows = (sound.nonzero()[:, 0],)
+        mass, com, inertia = from_pseudo_inertia(from_log_cholesky(found))
+        moved = robot.replace(
+            mass=robot.mass.index_put(rows, mass),
+            com=robot.com.index_put(rows, com),
+            inertia=robot.inertia.index_put(rows, inertia),
+        )
+        return moved, delta_of(found).detach()
+
+
+CONSISTENT = LearningOptions(tolerance=1e-12, max_evaluations=500)
+"""How the consistent robot is found."""

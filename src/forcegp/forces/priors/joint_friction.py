@@ -1,0 +1,70 @@
+"""A prior on the friction of each joint, a function of its own velocity, and on the offset of its torque sensor.
+
+Friction that no robot file declares is the rule: viscous, Coulomb, a transition between the two (Stribeck), and a
+part that grows with the load on the bearing. Each joint reads only its own velocity, so the prior extrapolates to
+motions in which other joints do something new, and it never reads τ: in a closed loop the likeliest force would be
+the one that cancels the noise of the torque sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ModelError
+from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.quantities import States
+from forcegp.gp.kernels import Kernel, Linear
+from forcegp.robot.model import RobotModel
+
+SPEEDS = (0.02, 0.1, 0.5)
+"""Velocities at which the Coulomb features saturate [rad/s, m/s]: a sharp step, and two slower transitions."""
+
+
+@dataclass(frozen=True)
+class JointFrictionPrior(ForcePrior):
+    """Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)).
+
+    The weights w_i and the offset c_i are Gaussian and marginalised; their standard deviations are learned. A
+    kernel with a smooth part, such as `Linear() + SquaredExponential(("velocity",))`, adds a smooth remainder.
+
+    Args:
+        kernel: covariance of each component; linear in the features by default.
+        speeds: v_1, v_2, … [rad/s, m/s].
+        load: whether friction proportional to the load |Q_G,i| is a feature.
+        name: prefix of the hyperparameters.
+
+    Raises:
+        ModelError: a speed is not positive and finite.
+    """
+
+    kernel: Kernel = field(default_factory=Linear)
+    speeds: tuple[float, ...] = SPEEDS
+    load: bool = True
+    name: str = "joint_friction"
+    target: str = JOINT
+
+    def __post_init__(self) -> None:
+        if not self.speeds or not all(0.0 < v < float("inf") for v in self.speeds):
+            raise ModelError(
+                f"force prior {self.name!r} has an invalid speed",
+                expected="positive finite speeds [rad/s]",
+                got=self.speeds,
+            )
+
+    def outputs(self, robot: RobotModel) -> int:
+        return robot.nq
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        v = at.qd[..., None]
+        columns = {"velocity": v}
+        columns |= {f"coulomb_{i}": torch.tanh(v / speed) for i, speed in enumerate(self.speeds)}
+        if self.load:
+            columns["load"] = at.eom.Q_G.abs()[..., None] * columns["coulomb_0"]
+        return columns
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)

@@ -1,0 +1,79 @@
+"""A sparse posterior as named tensors, to be saved and loaded.
+
+The eigenvectors are kept with the sums: computed anew they may differ in sign or rotation, and the sums
+belong to one choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import ModelError
+from forcegp.gp.basis import LatentBasis, ProcessBasis
+from forcegp.gp.decomposition import split
+from forcegp.gp.kernels import Parameters, sub
+from forcegp.gp.sparse import SparsePosterior
+from forcegp.gp.spectrum import Spectrum
+from forcegp.gp.structured_covariance import Process
+from forcegp.gp.sums import Moments
+
+MOMENTS = ("v", "yy", "rows", "prior", "missed")
+
+
+def tensors_of_posterior(posterior: SparsePosterior) -> dict[str, Tensor]:
+    """Everything but processes and hyperparameters, by name."""
+    tensors = {f"moments.{name}": getattr(posterior.moments, name) for name in MOMENTS}
+    tensors |= {"L": posterior.L, "jitter": torch.tensor(posterior.jitter, dtype=torch.float64)}
+    for p, part in enumerate(posterior.basis.parts):
+        tensors[f"{p}.components"] = torch.tensor(part.components)
+        tensors |= {f"{p}.inducing.{name}": x for name, x in part.inducing.items()}
+        for k, spectrum in enumerate(part.spectra):
+            tensors[f"{p}.{k}.values"], tensors[f"{p}.{k}.vectors"] = spectrum.values, spectrum.vectors
+            tensors[f"{p}.{k}.dropped"] = torch.tensor(spectrum.dropped)
+    # A copy of its own for each, as files do not keep views.
+    return {name: x.detach().clone(memory_format=torch.contiguous_format) for name, x in tensors.items()}
+
+
+def posterior_of_tensors(
+    processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
+) -> SparsePosterior:
+    """The posterior that `tensors_of_posterior` was given.
+
+    Args:
+        processes: the processes.
+        params: log-hyperparameters.
+        tensors: as given by `tensors_of_posterior`.
+
+    Raises:
+        ModelError: a tensor is missing, or does not fit the processes.
+    """
+    try:
+        parts = tuple(_part(p, process, params, tensors) for p, process in enumerate(processes))
+        moments = Moments(*(tensors[f"moments.{name}"] for name in MOMENTS))
+        L, jitter = tensors["L"], float(tensors["jitter"])
+    except KeyError as error:
+        raise ModelError("a saved sparse posterior is not complete", expected=f"a tensor {error}") from None
+    basis = LatentBasis(tuple(processes), dict(params), parts)
+    size = (basis.size, basis.size)
+    if L.shape != size or moments.v.shape != size[:1] or moments.prior.shape != (len(parts),):
+        raise ModelError(
+            "a saved sparse posterior does not fit its processes",
+            expected=f"{basis.size} basis functions of {len(parts)} processes",
+            got=f"{len(moments.v)} of {len(moments.prior)}",
+        )
+    return SparsePosterior(basis, moments, L, jitter)
+
+
+def _part(p: int, process: Process, params: Parameters, tensors: Mapping[str, Tensor]) -> ProcessBasis:
+    inducing = sub(tensors, f"{p}.inducing")
+    if not inducing:
+        raise KeyError(f"{p}.inducing")
+    components = int(tensors[f"{p}.components"])
+    spectra = ()
+    if f"{p}.0.values" in tensors:
+        given = [sub(tensors, f"{p}.{k}") for k in range(components)]
+        spectra = tuple(Spectrum(s["values"], s["vectors"], int(s["dropped"])) for s in given)
+    return ProcessBasis(split(process.kernel), sub(params, process.prefix), components, inducing, spectra)

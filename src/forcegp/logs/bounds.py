@@ -1,0 +1,35 @@
+"""Checks of what a foreign log claims, before the work is done; the bounds are in `forcegp.limits`.
+
+A small compressed file can claim to hold more than memory does.
+"""
+
+from __future__ import annotations
+
+from forcegp import limits
+from forcegp.errors import DataError
+
+
+def check_count(source: str, what: str, count: int, most: int) -> None:
+    """Raise `DataError` where a log claims more than `most` of something.
+
+    Args:
+        source: name of the file, for the message.
+        what: what is counted, in the plural.
+        count: the claim.
+        most: the bound.
+
+    >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
+    """
+    if count > most:
+        raise DataError(
+            f"{source}: the log claims too many {what}",
+            expected=f"at most {most:,}",
+            got=f"{count:,}",
+            hint="split the log, or export only the columns that are needed",
+        )
+
+
+def check_values(source: str, rows: int, columns: int) -> None:
+    """Raise `DataError` where a table is wider or larger than what is read at once."""
+    check_count(source, "columns", columns, limits.COLUMNS)
+    check_count(source, f"numbers ({rows:,} rows × {columns} columns)", rows * columns, limits.LOG_VALUES)

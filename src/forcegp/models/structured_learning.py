@@ -1,0 +1,179 @@
+"""How a structured Gaussian process is learned: on which samples, with which inference, in which steps.
+
+1. Samples at rest say nothing but that friction is below a limit; robots that are measured learn from motion.
+2. Hyperparameters are learned on a part of a long log, or on all of a short one.
+3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more.
+4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
+5. The noise of the torque is enlarged to what held-out stretches of the training log ask for.
+6. The posterior is conditioned on all samples.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.forces.calibration import held_out_torque_std, likelihood_power
+from forcegp.forces.inference import (
+    force_posterior,
+    is_finite,
+    is_sparse,
+    with_inducing,
+    without_inducing,
+)
+from forcegp.forces.learn import TORQUE_NOISE, Problem, Search
+from forcegp.forces.measurements import Training
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.gp.optimise import Learned, Progress
+from forcegp.gp.structured_covariance import Block
+from forcegp.models.structured_spec import Specification
+from forcegp.robot.model import RobotModel
+
+LEARN_SAMPLES = 800
+"""Samples that hyperparameters are learned on where priors are finite features."""
+LEARN_SAMPLES_INDUCING = 400
+"""Samples that hyperparameters are learned on, exactly, where a longer log is conditioned on sparsely."""
+REST_SPEED = 0.01
+"""A sample is at rest where no joint moves faster [rad/s, m/s]."""
+FEWEST_MOVING = 20
+"""With fewer samples in motion, samples at rest are kept."""
+FIRST_POWER = 0.25
+"""Power of the likelihood before the correlation of its residuals is known."""
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What was learned, and the problem that the posterior is conditioned on.
+
+    Attributes:
+        problem: all samples, the updated robot, and the noise.
+        hyperparameters: learned and held.
+        learned: how the optimisation went.
+        warnings: doubts that came up.
+    """
+
+    problem: Problem
+    hyperparameters: dict[str, Tensor]
+    learned: Learned | None
+    warnings: tuple[str, ...] = ()
+
+
+def in_motion(spec: Specification, training: Training) -> tuple[Training, tuple[str, ...]]:
+    """The samples in motion, for models that learn the torque noise of a measured robot."""
+    if not spec.learns_torque_noise:
+        return training, ()
+    moving = training.moving(REST_SPEED)
+    if moving.samples < FEWEST_MOVING:
+        return training, (
+            f"only {moving.samples} samples are in motion: friction cannot be told from noise at rest",
+        )
+    return moving, ()
+
+
+def subset(spec: Specification, problem: Problem) -> Problem:
+    """The problem on the samples that hyperparameters are learned on."""
+    training, finite = problem.training, is_finite(problem.priors)
+    if not is_sparse(spec.inference, problem.priors, training.samples):
+        return problem
+    most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
+    if training.samples > most:
+        # Neighbours in time show how long residuals are correlated; elsewhere samples far apart say most.
+        training = training.evenly(most) if spec.learns_torque_noise else training.thinned(most)
+    problem = dataclasses.replace(problem, training=training)
+    return without_inducing(problem) if finite else problem
+
+
+def solve(
+    spec: Specification,
+    problem: Problem,
+    search: Search,
+    progress: Progress | None = None,
+    begin: Mapping[str, Tensor] | None = None,
+) -> Lesson:
+    """Learn what is free in a search, then prepare the problem that is conditioned on.
+
+    Args:
+        spec: the model.
+        problem: all samples.
+        search: what is learned and what is held.
+        progress: called after each evaluation.
+        begin: where to begin.
+    """
+    part = subset(spec, problem)
+    correlated = spec.learns_torque_noise and TORQUE_NOISE in search.start
+    if correlated:
+        part = dataclasses.replace(part, power=FIRST_POWER)
+    learned = search.solve(part, progress, begin)
+    values = {**search.held, **learned.tensors}
+    if correlated:
+        part = dataclasses.replace(part, power=likelihood_power(part, values))
+        learned = search.solve(part, progress, learned.tensors)
+        values = {**search.held, **learned.tensors}
+        part = with_updated_robot(part, values)
+        values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
+    whole = dataclasses.replace(
+        part,
+        training=problem.training,
+        power=_power_of_all(part, problem.training),
+        inducing=None,
+    )
+    return Lesson(prepared(spec, whole, values), values, learned)
+
+
+def _power_of_all(part: Problem, training: Training) -> float:
+    """κ of all samples: as much evidence as the part that was learned on, if that was tempered."""
+    if part.power == 1.0:
+        return 1.0
+    return part.power * part.training.samples / training.samples
+
+
+def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
+    """The problem with the inference that its samples ask for."""
+    if not is_sparse(spec.inference, problem.priors, problem.training.samples):
+        return problem
+    return without_inducing(problem) if is_finite(problem.priors) else with_inducing(problem, values)
+
+
+@torch.no_grad()
+def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Problem:
+    """The problem with the robot at the posterior mean of its inertial parameters (a Gauss–Newton step)."""
+    for p, prior in enumerate(problem.priors):
+        if isinstance(prior, InertialPrior) and problem.parameters is None:
+            posterior = force_posterior(problem, values)
+            features = _one_row(posterior, problem)
+            mean = posterior.latent.latent_mean(p, features[p])[0]
+            robot, moved = prior.updated(
+                problem.system.robot, mean, _precision(posterior, features, p, problem.system.robot)
+            )
+            # The prior keeps the scale of the file's parameters, not that of the updated ones.
+            return dataclasses.replace(
+                problem,
+                system=problem.system.with_robot(robot),
+                priors=tuple(prior.around(problem.system.robot) if q is prior else q for q in problem.priors),
+                offsets={**problem.offsets, prior.name: -moved},
+                pinned=(prior.name,),
+            )
+    return problem
+
+
+def _one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
+    """Kernel inputs of every prior at the first sample; constants have the same value everywhere."""
+    m = problem.training.measurements[0]
+    at = m[torch.zeros(1, dtype=torch.int64, device=m.q.device)].at(problem.system)
+    return [posterior.features_of(p, problem.system, at) for p in range(len(problem.priors))]
+
+
+def _precision(
+    posterior: ForcePosterior, features: list[dict[str, Tensor]], p: int, robot: RobotModel
+) -> Tensor:
+    """Inverse posterior covariance of the components of prior p, all others marginalised."""
+    widths = [prior.outputs(robot) for prior in posterior.priors]
+    eye = torch.eye(widths[p], dtype=robot.dtype, device=robot.device)
+    operators = [eye[None] if q == p else eye.new_zeros(1, widths[p], w) for q, w in enumerate(widths)]
+    block = Block(tuple(features), tuple(operators), eye[:1])
+    return torch.linalg.inv(posterior.latent.covariance(block)[0])

@@ -1,0 +1,232 @@
+"""MuJoCo with its own contact solver: contact and dry friction that this library did not compute."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
+from forcegp.errors import ForceGPError, UnsupportedRobotError
+from forcegp.robot.model import BASE, RobotModel
+from forcegp.simulate.config import ContactSolver
+from forcegp.simulate.mujoco import import_mujoco
+from forcegp.simulate.urdf import link_name, write_urdf
+from forcegp.types import JointVector
+
+CYLINDER_LENGTH = 100.0
+"""Half length of the cylinder that stands for an infinite one [m]."""
+IMPEDANCE = [0.01, 0.95, 0.0002, 0.5, 2.0]
+"""MuJoCo's impedance: it grows from almost nothing within 0.2 mm, so that the force has no jump."""
+SOLVED = 1e-15
+"""Tolerance of the solver, so tight that forces and acceleration obey Newton's equation to rounding."""
+NO_FORCE = 1e-9
+"""A contact that presses with less counts as open [N]."""
+
+
+class SolvedForces(NamedTuple):
+    """What the engine's solver gives at a state under a torque.
+
+    Attributes:
+        qdd: `(nq,)` acceleration [rad/s², m/s²].
+        Q: `(nq,)` joint forces other than contact: Q_C + Q_G + Q_u and joint friction [N m].
+        Q_I, Q_z: `(nq,)` generalized normal and friction force of the contacts [N m].
+        multiplier: `(n_contacts,)` normal force [N].
+        F_I, F_z: `(n_contacts, 3)` normal and friction force on the tip, world axes [N].
+    """
+
+    qdd: np.ndarray
+    Q: np.ndarray
+    Q_I: np.ndarray
+    Q_z: np.ndarray
+    multiplier: np.ndarray
+    F_I: np.ndarray
+    F_z: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Geometry ids of a surface and of the tip that may touch it, and the tip's body."""
+
+    surface: int
+    tip: int
+    body: int
+
+
+class ContactSolverEngine:
+    """A robot in a MuJoCo world with solid surfaces and rounded tips, moved by motor torques alone.
+
+    Args:
+        system: robot and contacts, each with a plane, a sphere or a cylinder.
+        dt: sampling period, during which a torque is held [s].
+        solver: friction and geometry.
+
+    Raises:
+        MissingDependencyError: MuJoCo is not installed.
+        ForceGPError: a constraint without a geometry, or friction for another number of joints.
+        UnsupportedRobotError: the robot file declares Stribeck friction, which MuJoCo does not model.
+    """
+
+    def __init__(self, system: ConstrainedSystem, dt: float, solver: ContactSolver) -> None:
+        self._mujoco = mujoco = import_mujoco()
+        self._system, robot = system, system.robot
+        self._model = model = self._compile(system, solver)
+        model.opt.timestep = solver.step
+        model.opt.gravity[:] = robot.gravity.numpy()
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        model.opt.tolerance = SOLVED
+        self._substeps = round(dt / solver.step)
+        self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
+        model.dof_armature[self._dof] = robot.armature.numpy()
+        model.dof_damping[self._dof] = robot.damping.numpy() + _per_joint(robot, solver, "joint_damping")
+        model.dof_frictionloss[self._dof] = robot.friction.numpy() + _per_joint(
+            robot, solver, "joint_friction"
+        )
+        self._pairs = [self._pair(i) for i in range(len(system.contacts))]
+        self._no_contact = np.zeros((0, 2, robot.nq)), np.zeros((0, 2, 3))
+        self._data = mujoco.MjData(model)
+
+    @property
+    def name(self) -> str:
+        """Name and version, for the record."""
+        return f"mujoco {self._mujoco.__version__}, contact solver"
+
+    def reset(self, q: JointVector, qd: JointVector) -> None:
+        """Put the robot at q `(nq,)` moving at qd `(nq,)`."""
+        self._data.qpos[self._dof] = q.numpy()
+        self._data.qvel[self._dof] = qd.numpy()
+
+    def state(self) -> tuple[JointVector, JointVector]:
+        """The present q and qd, `(nq,)` each [rad, rad/s]."""
+        dtype = self._system.robot.dtype
+        q, qd = self._data.qpos[self._dof], self._data.qvel[self._dof]
+        return torch.tensor(q, dtype=dtype), torch.tensor(qd, dtype=dtype)
+
+    def forces(self, torque: np.ndarray) -> SolvedForces:
+        """Acceleration and forces at the present state under a motor torque `(nq,)` [N m]."""
+        data, dof = self._data, self._dof
+        data.qfrc_applied[dof] = torque
+        self._mujoco.mj_forward(self._model, data)
+        contacts = [self._contact_force(pair) for pair in self._pairs]
+        Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else self._no_contact
+        Q_I, Q_z = Q.sum(0)
+        whole = data.qfrc_applied + data.qfrc_passive + data.qfrc_constraint - data.qfrc_bias
+        return SolvedForces(
+            qdd=data.qacc[dof].copy(),
+            Q=whole[dof] - Q_I - Q_z,
+            Q_I=Q_I,
+            Q_z=Q_z,
+            multiplier=np.linalg.norm(F[:, 0], axis=-1),
+            F_I=F[:, 0],
+            F_z=F[:, 1],
+        )
+
+    def step(self) -> None:
+        """Advance by the sampling period under the torque last given to `forces`."""
+        self._mujoco.mj_step(self._model, self._data, self._substeps)
+
+    def close(self) -> None:
+        """Release the engine's resources: MuJoCo holds none."""
+
+    def _contact_force(self, pair: _Pair) -> tuple[np.ndarray, np.ndarray]:
+        """Normal and friction force on the tip of one pair, generalized `(2, nq)` and Cartesian `(2, 3)`."""
+        model, data = self._model, self._data
+        Q, F = np.zeros((2, len(self._dof))), np.zeros((2, 3))
+        wrench, jacobian = np.zeros(6), np.zeros((3, model.nv))
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            if {contact.geom1, contact.geom2} != {pair.surface, pair.tip}:
+                continue
+            # MuJoCo gives the force on its second geometry, in axes whose first is the normal towards it.
+            sign = 1.0 if contact.geom2 == pair.tip else -1.0
+            self._mujoco.mj_contactForce(model, data, i, wrench)
+            axes = sign * contact.frame.reshape(3, 3)
+            self._mujoco.mj_jac(model, data, jacobian, None, contact.pos, pair.body)
+            for part, force in enumerate((wrench[0] * axes[0], wrench[1:3] @ axes[1:])):
+                F[part] += force
+                Q[part] += (jacobian.T @ force)[self._dof]
+        return Q, F
+
+    def _compile(self, system: ConstrainedSystem, solver: ContactSolver) -> Any:
+        """The robot with a tip and a surface for each contact; only these pairs can touch."""
+        mujoco, robot = self._mujoco, system.robot
+        spec = mujoco.MjSpec.from_string(write_urdf(robot))
+        for i, contact in enumerate(system.contacts):
+            if not isinstance(contact, SurfaceContact):
+                raise ForceGPError(
+                    f"the contact solver has no geometry for the constraint {contact.name!r}",
+                    expected="contacts of a point with a surface",
+                    hint='use contact = "rigid"',
+                )
+            body, position = _tip(robot, contact, solver.tip_radius)
+            ghost = {"contype": 0, "conaffinity": 0, "mass": 0.0}
+            link = spec.worldbody if body == BASE else spec.body(link_name(robot, body))
+            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+            link.add_geom(name=f"tip_{i}", type=sphere, size=[solver.tip_radius, 0, 0], pos=position, **ghost)
+            spec.worldbody.add_geom(name=f"surface_{i}", **_shape(mujoco, contact), **ghost)
+            pair = spec.add_pair(geomname1=f"surface_{i}", geomname2=f"tip_{i}")
+            pair.condim = 3
+            pair.friction = [solver.friction, solver.friction, 0.0, 0.0, 0.0]
+            pair.solref = [solver.stiffness_time, 1.0]
+            pair.solimp = IMPEDANCE
+        return spec.compile()
+
+    def _pair(self, i: int) -> _Pair:
+        surface, tip = (self._model.geom(f"{part}_{i}").id for part in ("surface", "tip"))
+        return _Pair(surface, tip, int(self._model.geom_bodyid[tip]))
+
+
+def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarray:
+    values = getattr(solver, name)
+    if len(values) not in (0, robot.nq):
+        raise ForceGPError(f"{name} does not fit the robot", expected=f"{robot.nq} numbers", got=values)
+    if bool((robot.stribeck != 0.0).any()):
+        raise UnsupportedRobotError(
+            f"robot {robot.name!r} declares Stribeck friction, which MuJoCo does not model",
+            hint='use contact = "rigid"',
+        )
+    return np.array(values or [0.0] * robot.nq)
+
+
+def _tip(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int, np.ndarray]:
+    """The link that carries the tip, and the centre of the tip in the link's coordinates.
+
+    The tip is a sphere that ends at the contact point, on the line from the frame's origin to that point.
+    """
+    index = robot.frame_index(contact.frame)
+    point = np.array(contact.point, dtype=float)
+    length = float(np.linalg.norm(point))
+    axis = point / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+    R, p = robot.frame_rotation[index].numpy(), robot.frame_position[index].numpy()
+    return robot.frame_parents[index], p + R @ (point - radius * axis)
+
+
+def _shape(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
+    """Type, size and pose of the geometry of a surface."""
+    surface, geom = contact.surface, mujoco.mjtGeom
+    if isinstance(surface, Plane):
+        normal = np.array(surface.normal)
+        pose = {"pos": surface.offset * normal, "quat": _turn_of_z(normal)}
+        return {"type": geom.mjGEOM_PLANE, "size": [0.0, 0.0, 1.0], **pose}
+    if isinstance(surface, Sphere):
+        return {"type": geom.mjGEOM_SPHERE, "size": [surface.radius, 0.0, 0.0], "pos": [*surface.center]}
+    if isinstance(surface, Cylinder):
+        size = [surface.radius, CYLINDER_LENGTH, 0.0]
+        pose = {"pos": [*surface.center], "quat": _turn_of_z(surface.axis)}
+        return {"type": geom.mjGEOM_CYLINDER, "size": size, **pose}
+    raise ForceGPError(
+        f"the contact solver has no geometry for the surface of {contact.name!r}",
+        expected="a plane, a sphere or a cylinder",
+        got=type(surface).__name__,
+        hint='use contact = "rigid"',
+    )
+
+
+def _turn_of_z(axis: object) -> np.ndarray:
+    """Quaternion `(w, x, y, z)` of a rotation that takes the z axis to a unit vector."""
+    rotation, _ = Rotation.align_vectors(np.reshape(axis, (1, 3)), [[0.0, 0.0, 1.0]])
+    return rotation.as_quat()[[3, 0, 1, 2]]

@@ -1,0 +1,154 @@
+"""Equations of motion and tool motion of one state at a time, in NumPy.
+
+At a single state, the overhead of tensors is many times the work on them. So the simulator takes the robot's
+mechanics from a compiled kernel where the machine has a C++ compiler, and otherwise from the functions for
+batches, and solves for the multiplier in NumPy. Constraints, contact mechanics and control are shared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+from torch import Tensor
+
+from forcegp.compiled.mechanics import CompiledMechanics
+from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.contact import Anchor, Constraint, ContactPoint, MovingPoint
+from forcegp.constraints.gauss import RANK_TOLERANCE
+from forcegp.control.plan import Plan
+from forcegp.control.task_space import ToolMotion, tool_motion
+from forcegp.dynamics import damping_force
+from forcegp.errors import MissingDependencyError
+
+Vector = NDArray[np.floating]
+Blocks = Callable[[Tensor, Tensor], Sequence[Tensor]]
+"""M, Q_C and Q_G at a state, then rotation, position, Jacobian and bias acceleration of each point."""
+POINT = 4
+
+
+@dataclass(frozen=True, eq=False)
+class StateEquations:
+    """The constrained equations of motion at one state; see `forcegp.constraints.gauss.Equations`.
+
+    Attributes:
+        M, A, b, c, cd, Q_C, Q_D, Q_K: as there, without a batch.
+        contact_points: the touching point of each surface contact, by name.
+        tool: motion of the tool.
+    """
+
+    M: Vector
+    A: Vector
+    b: Vector
+    c: Vector
+    cd: Vector
+    Q_C: Vector
+    Q_D: Vector
+    Q_K: Vector
+    contact_points: dict[str, ContactPoint]
+    tool: ToolMotion
+
+    @cached_property
+    def _M_cholesky(self) -> Vector:
+        return lapack.dpotrf(self.M, lower=1)[0]
+
+    @cached_property
+    def _M_inv_At(self) -> Vector:
+        return lapack.dpotrs(self._M_cholesky, self.A.T, lower=1)[0]
+
+    @cached_property
+    def _constraint_inertia(self) -> Vector:
+        """(A M⁻¹ Aᵀ)⁺; redundant and inactive rows count as zero."""
+        S = self.A @ self._M_inv_At
+        if S.shape == (1, 1):
+            return 1.0 / S if S[0, 0] != 0.0 else S
+        return np.linalg.pinv(S, hermitian=True, rcond=RANK_TOLERANCE)
+
+    @property
+    def L(self) -> Vector:
+        """L = M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ `(nq, m)`."""
+        return self._M_inv_At @ self._constraint_inertia
+
+    def multiplier(self, Q_bar: Vector) -> Vector:
+        """λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) `(m,)`."""
+        return self._constraint_inertia @ (self.b - self._M_inv_At.T @ Q_bar)
+
+
+class Mechanics:
+    """A system whose equations of motion are asked for at one state at a time.
+
+    Args:
+        system: robot and contacts.
+        plan: names the tool point.
+
+    Attributes:
+        contacts, m: those of the system.
+        compiled: whether the kernel is used, and not the functions for batches.
+    """
+
+    def __init__(self, system: ConstrainedSystem, plan: Plan) -> None:
+        self._system, self.contacts, self.m = system, system.contacts, system.m
+        tool = (plan.frame, plan.point)
+        self._anchors = [tool, *(a for contact in system.contacts for a in contact.anchors if a != tool)]
+        self._places = [[self._anchors.index(a) for a in contact.anchors] for contact in system.contacts]
+        self._rows = np.array([contact.rows for contact in system.contacts], dtype=int)
+        self._blocks, self.compiled = _blocks(system, self._anchors)
+
+    def equations(self, q: Vector, qd: Vector, active: NDArray[np.bool_] | None = None) -> StateEquations:
+        """The equations of motion at a state `(nq,)`; `active` `(n_contacts,)` defaults to all."""
+        state = torch.from_numpy(q), torch.from_numpy(qd)
+        M, Q_C, Q_G, *points = self._blocks(*state)
+        frames = [points[i : i + POINT] for i in range(0, len(points), POINT)]
+        moving = [MovingPoint.of(p, J, bias[3:], state[1]) for _, p, J, bias in frames]
+        found = [
+            contact.terms_of([moving[k] for k in places])
+            for contact, places in zip(self.contacts, self._places, strict=True)
+        ]
+        nq = len(q)
+        c = np.concatenate([np.zeros(0), *(x.c.numpy() for x in found)])
+        A = np.concatenate([np.zeros((0, nq)), *(x.A.numpy() for x in found)])
+        b = np.concatenate([np.zeros(0), *(x.b.numpy() for x in found)])
+        cd = A @ qd
+        if self._system.baumgarte is not None:
+            b = self._system.baumgarte.stabilized(*(torch.from_numpy(x) for x in (b, c, cd))).numpy()
+        rows = np.ones(len(b)) if active is None else np.repeat(active, self._rows)
+        Q_C, Q_D = Q_C.numpy(), damping_force(self._system.robot, state[1]).numpy()
+        rotation, position, jacobian, bias = (x.numpy() for x in frames[0])
+        return StateEquations(
+            M=M.numpy(),
+            A=A * rows[:, None],
+            b=b * rows,
+            c=c,
+            cd=cd,
+            Q_C=Q_C,
+            Q_D=Q_D,
+            Q_K=Q_C + Q_G.numpy() + Q_D,
+            contact_points=_contact_points(self.contacts, found),
+            tool=ToolMotion(rotation, position, jacobian @ qd, jacobian, bias),
+        )
+
+
+def _contact_points(contacts: Sequence[Constraint], found: Sequence) -> dict[str, ContactPoint]:
+    named = ((contact.name, terms.point) for contact, terms in zip(contacts, found, strict=True))
+    return {name: ContactPoint(*(x.numpy() for x in at)) for name, at in named if at is not None}
+
+
+def _blocks(system: ConstrainedSystem, anchors: Sequence[Anchor]) -> tuple[Blocks, bool]:
+    """The mechanics of the robot and of points of it at one state, and whether they are compiled."""
+    try:
+        return CompiledMechanics(system.robot, anchors), True
+    except MissingDependencyError:
+        pass
+
+    def eager(q: Tensor, qd: Tensor) -> Sequence[Tensor]:
+        eom = system.equations(q, qd)
+        tools = [tool_motion(system.robot, eom.poses, eom.motion, qd, *anchor) for anchor in anchors]
+        points = [x for t in tools for x in (t.rotation, t.position, t.jacobian, t.bias)]
+        return [eom.M, eom.Q_C, eom.Q_G, *points]
+
+    return eager, False

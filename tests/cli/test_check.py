@@ -1,0 +1,95 @@
+"""`forcegp check`: table, JSON, page, last line and exit code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import forcegp
+from forcegp.checks import KINDS, Log
+from forcegp.cli import app
+from planted_faults import free_log
+
+SCENE = '[robot]\nmodel = "double_pendulum"\n'
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "scene.toml").write_text(SCENE)
+    return tmp_path
+
+
+def write(log: Log, path: Path) -> None:
+    """A log as a file, without the checks of a data set."""
+    columns: dict[str, np.ndarray] = {"t": log.t}
+    for name in ("q", "qd", "qdd", "tau"):
+        columns |= {f"{name}.{j}": getattr(log, name)[:, k] for k, j in enumerate(log.joint_names)}
+    header = log.header.model_copy(update={"joint_names": log.joint_names})
+    table = pa.table(columns).replace_schema_metadata({b"forcegp": header.to_json().encode()})
+    pq.write_table(table, path)
+
+
+def run(folder: Path, log: Log, *options: str) -> Any:
+    write(log, folder / "run.parquet")
+    files = ["-s", str(folder / "scene.toml"), "-d", str(folder / "run.parquet")]
+    return CliRunner().invoke(app, ["check", *files, *options])
+
+
+@pytest.fixture
+def log() -> Log:
+    return free_log(forcegp.load_robot("double_pendulum"), seconds=10.0)
+
+
+def test_a_log_in_order_may_go_on(folder: Path, log: Log) -> None:
+    done = run(folder, log)
+    assert done.exit_code == 0, done.output
+    assert done.stdout.splitlines()[-1] == "verdict: go on"
+
+
+def test_a_fault_stops_with_rows_and_remedy(folder: Path, log: Log) -> None:
+    tau = -log.tau
+    tau[1200, 0] = np.nan
+    done = run(folder, log.replace(tau=tau))
+    assert done.exit_code == 1
+    assert done.stdout.splitlines()[-1] == "verdict: stop; repair 2 errors before fitting a model"
+    assert "not-finite" in done.stdout and "1200" in done.stdout and "torque-sign" in done.stdout
+    assert KINDS["torque-sign"].remedy.split()[0] in done.stdout
+
+
+def test_json_holds_every_finding(folder: Path, log: Log) -> None:
+    done = run(folder, log.replace(t=1e3 * log.t), "--json")
+    result = json.loads(done.stdout)
+    assert done.exit_code == 1 and result["usable"] is False and result["samples"] == len(log)
+    first = result["findings"][0]
+    assert first["kind"] == "time-unit" and first["severity"] == "error"
+    assert first["intervals"] == [[0, len(log)]] and first["remedy"]
+    assert first["evidence"]["seconds_per_unit"] == pytest.approx(1e-3, rel=0.02)
+
+
+def test_the_page_holds_all_and_fetches_nothing(folder: Path, log: Log) -> None:
+    tau, t = log.tau.copy(), log.t.copy()
+    tau[900, 1] += 30.0
+    t[1500:] += 0.2
+    page = folder / "check.html"
+    run(folder, log.replace(tau=-tau, t=t), "--out", str(page))
+    text = page.read_text()
+    for kind in ("torque-sign", "spike", "time-gap"):
+        assert kind in text and KINDS[kind].remedy.split("/")[0] in text
+    assert "verdict: stop" in text and text.count("data:image/svg+xml") >= 4
+    assert "http://" not in text.replace("http://www.w3.org", "") and "<script" not in text
+
+
+def test_the_function_takes_a_data_set(log: Log) -> None:
+    robot = forcegp.load_robot("double_pendulum")
+    columns = {name: torch.from_numpy(getattr(log, name)) for name in ("t", "q", "qd", "qdd", "tau")}
+    data = forcegp.Dataset(**columns, joint_names=robot.joint_names)
+    report = forcegp.check(forcegp.ConstrainedSystem(robot), data)
+    assert report.usable and report.count("error") == 0

@@ -1,0 +1,111 @@
+"""Everything in the library that writes to disk: versions to write, and how to read which one is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+import forcegp
+from forcegp.compiled import cache
+from forcegp.data import Dataset
+from forcegp.exchange import recover
+from forcegp.files import atomic_directory, write_text
+from forcegp.models.base import Predictor
+from forcegp.storage.checkpoint import Checkpoint
+from logs import random_log
+from random_data import table_system
+
+Write = Callable[[Path, int], None]
+Read = Callable[[Path], int]
+
+START = {"a": torch.zeros(3, dtype=torch.float64)}
+LOGS = {version: random_log(seed=version) for version in (1, 2)}
+SYSTEM = table_system()
+
+
+@dataclass(frozen=True)
+class Writer:
+    """Writes version 1 or 2 to a path, and reads which one is there; reading a mixture is an error.
+
+    Attributes:
+        also: what else may be there while version 2 is written: the first evaluation, no kernel yet.
+    """
+
+    name: str
+    ending: str
+    write: Write
+    read: Read
+    also: int = 2
+
+
+def write_text_file(path: Path, version: int) -> None:
+    write_text(path, str(version))
+
+
+def read_text_file(path: Path) -> int:
+    return int(path.read_text())
+
+
+def write_folder(path: Path, version: int) -> None:
+    with atomic_directory(path) as temporary:
+        (temporary / "a").write_text(str(version))
+        (temporary / "deeper").mkdir()
+        (temporary / "deeper" / "b").write_text(str(version))
+
+
+def read_folder(path: Path) -> int:
+    recover(path)
+    a, b = (path / "a").read_text(), (path / "deeper" / "b").read_text()
+    assert a == b, "a mixture of two folders"
+    return int(a)
+
+
+def read_log(path: Path) -> int:
+    seed = Dataset.read(path).header.seed
+    assert seed is not None
+    return seed
+
+
+def model(version: int) -> Predictor:
+    """An analytical model, which needs no fit to be saved."""
+    robot = SYSTEM.robot.replace(mass=SYSTEM.robot.mass * version)
+    return forcegp.AnalyticalModel(SYSTEM.with_robot(robot))
+
+
+def read_model(path: Path) -> int:
+    mass = forcegp.load_model(path).system.robot.mass
+    return int((mass / SYSTEM.robot.mass).mean().round())
+
+
+def write_checkpoint(path: Path, version: int) -> None:
+    checkpoint = Checkpoint(path, "key")
+    objective = checkpoint.recorded(lambda tensors: tensors["a"].sum())
+    for number in range(version):
+        objective({"a": START["a"] + number})
+    checkpoint.write()
+
+
+def write_kernel(path: Path, version: int) -> None:
+    cache.store(cache.private_folder(path), f"key{version}", b"library" * version)
+
+
+def read_kernel(path: Path) -> int:
+    found = [version for version in (1, 2) if cache.find(cache.private_folder(path), f"key{version}")]
+    return max(found, default=0)
+
+
+def read_checkpoint(path: Path) -> int:
+    return Checkpoint(path, "key").read(START)
+
+
+WRITERS = (
+    Writer("text", ".txt", write_text_file, read_text_file),
+    Writer("folder", "", write_folder, read_folder),
+    Writer("log", ".parquet", lambda path, version: LOGS[version].write(path), read_log),
+    Writer("model", "", lambda path, version: model(version).save(path), read_model),
+    Writer("checkpoint", ".ckpt", write_checkpoint, read_checkpoint, also=1),
+    Writer("kernels", "", write_kernel, read_kernel, also=0),
+)

@@ -1,0 +1,133 @@
+"""Contact intervals: from the wrench, from λ, from the distance, against what is known of a motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import forcegp
+from forcegp.errors import DataError, MappingError
+from forcegp.logs import contact, parse_mapping
+from forcegp.logs.report import Report
+from forcegp.logs.sections import ContactSection
+from forcegp.logs.signals import Signals
+
+FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
+DT, ROWS = 1.0 / 200.0, 1600
+
+
+@pytest.fixture(scope="module")
+def pressed() -> tuple[forcegp.ConstrainedSystem, Signals, np.ndarray]:
+    """An arm that moves freely, and is pushed by 15 to 25 N along the normal in known intervals.
+
+    The torque is what the rigid body needs, with noise; the wrench is in world axes.
+    """
+    robot = forcegp.load_robot("kuka_iiwa")
+    t = np.arange(ROWS) * DT
+    rate = np.array([0.5, 0.7, 0.6, 0.9, 1.1, 0.8, 1.3])
+    phase = np.linspace(0.0, 2.0, 7)
+    x = t[:, None] * rate + phase
+    start = np.array([0.0, 0.6, 0.0, -1.4, 0.0, 0.9, 0.0])
+    q, qd, qdd = (
+        torch.from_numpy(v)
+        for v in (start + 0.2 * np.sin(x), 0.2 * rate * np.cos(x), -0.2 * rate**2 * np.sin(x))
+    )
+    closed = ((t > 1.0) & (t < 3.0)) | ((t > 4.5) & (t < 6.0))
+    force = np.where(closed, 20.0 + 5.0 * np.sin(2.0 * t), 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
+    J = forcegp.kinematics.point_jacobian(robot, q, FRAME, POINT)
+    pushed = (J.mT @ torch.from_numpy(force)[..., None])[..., 0]
+    tau = (
+        forcegp.dynamics.inverse_dynamics(robot, q, qd, qdd)
+        - forcegp.dynamics.damping_force(robot, qd)
+        - pushed
+    )
+    random = np.random.default_rng(0)
+    vectors = {
+        "q": q.numpy(),
+        "qd": qd.numpy(),
+        "qdd": qdd.numpy(),
+        "tau": tau.numpy() + 0.05 * random.standard_normal(q.shape),
+    }
+    vectors["wrench"] = np.hstack([force + 0.5 * random.standard_normal(force.shape), np.zeros((ROWS, 3))])
+    table = forcegp.SurfaceContact("table", FRAME, POINT, forcegp.Plane())
+    signals = Signals(robot.joint_names, t, np.arange(ROWS), np.zeros(ROWS, np.int64), vectors)
+    return forcegp.ConstrainedSystem(robot, [table]), signals, closed
+
+
+def mapping(source: str, more: str = "", name: str = "table") -> object:
+    toml = (
+        '[time]\ncolumn = "t"\n[position]\ncolumn = "q{joint}"\nunit = "rad"\n'
+        '[torque]\ncolumn = "i{joint}"\nunit = "Nm"\n'
+        f'[wrench]\nforce = ["x", "y", "z"]\nframe = "{FRAME}"\naxes = "world"\n'
+        f'[contact.{name}]\nsource = "{source}"\n{more}\n'
+    )
+    return parse_mapping(toml.encode(), "m.toml")
+
+
+@pytest.mark.parametrize("source", ["wrench", "multiplier"])
+def test_forces_show_the_intervals(
+    pressed: tuple[forcegp.ConstrainedSystem, Signals, np.ndarray], source: str
+) -> None:
+    system, signals, closed = pressed
+    report = Report("log")
+    (found,) = contact.detect(signals, system, mapping(source), report)  # type: ignore[arg-type]
+    assert (signals.contact["table"] == closed).mean() >= 0.99
+    assert len(found.intervals) == 2 and found.intervals[0][0] == pytest.approx(1.0, abs=2.5 * DT)
+    assert 15.0 < found.closed_level < 25.0 and abs(found.open_level) < 2.0
+    assert report.findings[0].kind == "contact" and "2 closed intervals" in report.findings[0].message
+
+
+def test_the_multiplier_is_the_force_along_the_normal(
+    pressed: tuple[forcegp.ConstrainedSystem, Signals, np.ndarray],
+) -> None:
+    system, signals, closed = pressed
+    estimate = contact.evidence.multiplier(signals, system, system.contacts[0])  # type: ignore[arg-type]
+    truth = np.where(closed, 20.0 + 5.0 * np.sin(2.0 * signals.t), 0.0)
+    # The noise of the torque, 0.05 N m on levers of about half a metre, is below 1 N.
+    assert np.abs(estimate - truth).std() < 1.0 and abs((estimate - truth).mean()) < 0.1
+
+
+def test_the_distance_shows_the_intervals(
+    pressed: tuple[forcegp.ConstrainedSystem, Signals, np.ndarray],
+) -> None:
+    system, signals, _ = pressed
+    position = forcegp.kinematics.point_position(
+        system.robot, torch.from_numpy(signals.vectors["q"]), FRAME, POINT
+    )
+    height = position[:, 2].numpy()
+    offset = float(np.quantile(height, 0.3))
+    table = forcegp.SurfaceContact("table", FRAME, POINT, forcegp.Plane(offset=offset - 1e-3))
+    lower = forcegp.ConstrainedSystem(system.robot, [table])
+    contact.detect(signals, lower, mapping("distance", "shortest = 0.0"), Report("log"))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(signals.contact["table"], height <= offset)
+
+
+def test_one_state_only_is_not_split_in_two() -> None:
+    noise = np.random.default_rng(0).standard_normal(2000)
+    with pytest.raises(DataError, match=r"does not show when contact 'table'(?s:.*)always, never"):
+        contact.force_levels(noise, "table", ContactSection(source="wrench"))
+
+
+def test_short_intervals_take_the_state_around_them() -> None:
+    t = np.arange(100) * 0.01
+    closed = (t > 0.3) & (t < 0.7)
+    closed[[10, 50]] ^= True
+    signals = Signals(("a",), t, np.arange(100), np.zeros(100, np.int64), {})
+    assert contact._merge_short(closed, signals, 0.05) == 2
+    np.testing.assert_array_equal(closed, (t > 0.3) & (t < 0.7))
+
+
+def test_what_is_not_said_of_a_contact_is_an_error(
+    pressed: tuple[forcegp.ConstrainedSystem, Signals, np.ndarray],
+) -> None:
+    system, signals, _ = pressed
+    with pytest.raises(MappingError, match=r"m.toml:\d+: contact.wall: the scene has no contact 'wall'"):
+        contact.detect(signals, system, mapping("always", name="wall"), Report("log"))  # type: ignore[arg-type]
+    text = (
+        b'[time]\ncolumn = "t"\n[position]\ncolumn = "q"\nunit = "rad"\n[torque]\ncolumn = "i"\nunit = "Nm"\n'
+    )
+    with pytest.raises(MappingError, match="nothing says whether contact 'table' is closed"):
+        contact.detect(signals, system, parse_mapping(text, "m.toml"), Report("log"))
+    contact.detect(signals, system, mapping("always"), Report("log"))  # type: ignore[arg-type]
+    assert signals.contact["table"].all()

@@ -1,0 +1,119 @@
+"""Proposed mappings: headings, units and signs of logs as different programs write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import forcegp
+from forcegp.errors import MappingError
+from forcegp.logs import guess, headings, read_log
+from log_files import REAL, WRITERS, motion, real_logs
+from robots import ARMS
+
+ROWS, DT = 600, 0.006
+
+
+def kuka_log() -> tuple[forcegp.ConstrainedSystem, dict[str, np.ndarray]]:
+    """A motion of the bundled arm that presses on its table with 20 N, torques by inverse dynamics."""
+    system = forcegp.load_scene("kuka_plane").system()
+    robot = system.robot
+    t = np.arange(ROWS) * DT
+    rate = np.array([1.0, 1.4, 1.2, 1.8, 2.1, 1.6, 2.3])
+    x = t[:, None] * rate + np.linspace(0.0, 2.0, 7)
+    start = np.array([0.0, 0.6, 0.0, -1.4, 0.0, 0.9, 0.0])
+    q, qd, qdd = start + 0.6 * np.sin(x), 0.6 * rate * np.cos(x), -0.6 * rate**2 * np.sin(x)
+    state = [torch.from_numpy(v) for v in (q, qd, qdd)]
+    J = forcegp.kinematics.point_jacobian(robot, state[0], "lbr_iiwa_link_7", (0, 0, 0.1))
+    tau = forcegp.dynamics.inverse_dynamics(robot, *state) - 20.0 * J[:, 2]
+    friction = 0.5 * np.tanh(qd / 0.01) + 0.3 * qd
+    noise = 0.02 * np.random.default_rng(0).standard_normal(q.shape)
+    return system, {"t": t, "q": q, "qd": qd, "tau": tau.numpy() + friction + noise}
+
+
+def written(folder: Path, columns: dict[str, np.ndarray], separator: str, decimal: str) -> Path:
+    rows = [
+        separator.join(repr(float(x)).replace(".", decimal) for x in row)
+        for row in zip(*columns.values(), strict=True)
+    ]
+    (folder / "run.csv").write_text("\n".join([separator.join(columns), *rows]), encoding="utf-8")
+    return folder / "run.csv"
+
+
+@pytest.mark.parametrize(
+    ("angle", "speed", "sign"), [("deg", "deg/s", 1.0), ("rad", "rad/s", -1.0), ("deg", "rpm", -1.0)]
+)
+def test_units_and_signs_are_found_from_the_values(
+    tmp_path: Path, angle: str, speed: str, sign: float
+) -> None:
+    system, log = kuka_log()
+    factor = {"rad": 1.0, "deg": 180.0 / np.pi, "rad/s": 1.0, "deg/s": 180.0 / np.pi, "rpm": 30.0 / np.pi}
+    columns = {"Zeit": 1e3 * log["t"]}
+    for i in range(7):
+        columns[f"Achse{i + 1}_Pos"] = factor[angle] * log["q"][:, i]
+        columns[f"Achse{i + 1}_Speed"] = factor[speed] * log["qd"][:, i]
+        columns[f"Achse{i + 1}_Torque"] = sign * log["tau"][:, i]
+        columns[f"Achse{i + 1}_Temp"] = np.full(ROWS, 30.0 + i)
+    path = written(tmp_path, columns, ";", ",")
+    proposal = guess.guess_mapping(path, system)
+    sections = proposal.mapping().sections
+    assert sections.time.unit == "ms" and sections.position.unit == angle
+    assert sections.velocity is not None and sections.velocity.unit == speed
+    assert sections.torque.sign == sign and sections.torque.unit == "Nm"
+    assert any("base to tip" in doubt for doubt in proposal.doubts), "numbers are no names"
+    # Friction of half a newton metre per joint hides nothing: 20 N show as one state.
+    assert sections.contact["table"].source == "always"
+    data = read_log(path, system, proposal.mapping())
+    np.testing.assert_allclose(data.q.numpy(), log["q"], atol=1e-12)
+    np.testing.assert_allclose(data.qd.numpy(), log["qd"], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["rosbag 1", "mcap", "csv", "npz", "lerobot"])
+def test_formats_with_names_leave_no_doubt_about_joints(kind: str, tmp_path: Path) -> None:
+    path, _ = WRITERS[kind](tmp_path, motion())
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    proposal = guess.guess_mapping(path, system)
+    mapping = proposal.mapping()
+    numbered = kind in ("npz", "lerobot")
+    assert any("base to tip" in doubt for doubt in proposal.doubts) == numbered
+    if not numbered:
+        assert "likeness" not in " ".join(proposal.doubts)
+        data = read_log(path, system, mapping)
+        np.testing.assert_array_equal(data.q.numpy(), motion().q)
+
+
+def test_declared_units_are_taken_from_headings() -> None:
+    from forcegp.logs.table import Stream
+
+    stream = Stream("", {}, {"pos": "[deg]"})
+    names = ("pos", "q1 [rad]", "vel (deg/s)", "tau_Nm", "t_ms", "x")
+    assert [headings.declared_unit(n, stream) for n in names] == ["deg", "rad", "deg/s", "Nm", "ms", None]
+
+
+def test_logs_whose_columns_say_nothing(tmp_path: Path) -> None:
+    system, log = kuka_log()
+    with pytest.raises(MappingError, match="no column increases like time"):
+        guess.guess_mapping(written(tmp_path, {"a": log["q"][:, 0]}, ",", "."), system)
+    with pytest.raises(MappingError, match=r"no columns were recognised as the position of 7 joints"):
+        guess.guess_mapping(written(tmp_path, {"t": log["t"], "a": log["q"][:, 0]}, ",", "."), system)
+
+
+@real_logs
+def test_the_sign_of_a_real_arms_torque() -> None:
+    robot = forcegp.load_robot(REAL / "kuka_iiwa14" / "iiwa14.urdf")
+    system = forcegp.ConstrainedSystem(robot)
+    sections = guess.guess_mapping(REAL / "kuka_iiwa14" / "motion_b", system).mapping().sections
+    assert sections.torque.sign == -1.0 and sections.position.unit == "rad" and sections.time.unit == "s"
+
+
+@real_logs
+def test_names_that_are_only_alike_are_matched_and_doubted() -> None:
+    robot = next(arm for arm in ARMS if arm.name == "ur3").load()
+    proposal = guess.guess_mapping(REAL / "ur3" / "id1.bag", forcegp.ConstrainedSystem(robot))
+    joints = proposal.mapping().sections.joints
+    assert list(joints.values()) == ["Base", "Shoulder", "Elbow", "Wrist 1", "Wrist 2", "Wrist 3"]
+    assert any("likeness" in doubt for doubt in proposal.doubts)
+    assert proposal.mapping().sections.torque.sign == -1.0

@@ -1,0 +1,75 @@
+"""Models asked with arguments of the wrong kind; run as a script by test_wrong_kinds.py."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import tempfile
+from pathlib import Path
+
+import torch
+
+import forcegp
+from random_data import random_data, table_system
+from raw_errors import outcomes
+
+SYSTEM = table_system()
+DATA = random_data(SYSTEM, 8)
+Q, QD, TAU = DATA.q, DATA.qd, DATA.tau
+MODEL = forcegp.StructuredGP(SYSTEM, noise_std=0.1)
+MODEL.fit(DATA, options=forcegp.LearningOptions(max_evaluations=1))
+ROBOT = SYSTEM.robot
+
+
+def fit_with(**options: object) -> object:
+    return forcegp.StructuredGP(SYSTEM, **options).fit(DATA)  # type: ignore[arg-type]
+
+
+CALLS = {
+    "quantity=5": lambda: MODEL.predict(Q, QD, TAU, quantity=5),
+    "quantity=None": lambda: MODEL.predict(Q, QD, TAU, quantity=None),
+    "quantity=[5]": lambda: MODEL.predict(Q, QD, TAU, quantity=[5]),
+    "quantity=[[]]": lambda: MODEL.predict(Q, QD, TAU, quantity=[["qdd"]]),
+    "q=list": lambda: MODEL.predict(Q.tolist(), QD, TAU),
+    "qd=numpy": lambda: MODEL.predict(Q, QD.numpy(), TAU),
+    "tau=None": lambda: MODEL.predict(Q, QD, None),
+    "qd=1e300": lambda: MODEL.predict(Q, torch.full_like(QD, 1e300), TAU),
+    "q=nan": lambda: MODEL.predict(torch.full_like(Q, float("nan")), QD, TAU),
+    "active=list": lambda: MODEL.predict(Q, QD, TAU, active=[True]),
+    "active=shape": lambda: MODEL.predict(Q, QD, TAU, active=torch.ones(3, 5, dtype=torch.bool)),
+    "batch": lambda: MODEL.predict(Q[:3], QD[:4], TAU[:5]),
+    "noise_std=text": lambda: fit_with(noise_std="loud"),
+    "noise_std=negative": lambda: fit_with(noise_std=-0.1),
+    "noise_std=[None]": lambda: fit_with(noise_std=[None] * 7),
+    "data=list": lambda: forcegp.StructuredGP(SYSTEM, noise_std=0.1).fit([1, 2]),
+    "data=None": lambda: forcegp.StructuredGP(SYSTEM, noise_std=0.1).fit(None),
+    "checkpoint=folder": lambda: MODEL.fit(DATA, checkpoint=tempfile.gettempdir()),
+    "mass_matrix(list)": lambda: forcegp.dynamics.mass_matrix(ROBOT, [0.0] * 7),
+    "frame_pose(list)": lambda: forcegp.kinematics.frame_pose(ROBOT, [0.0] * 7, ROBOT.frame_names[-1]),
+    "load_model(5)": lambda: forcegp.load_model("/dev/null"),
+}
+
+
+def copies() -> None:
+    """A model through pickle and deepcopy predicts the same bits."""
+    expected = MODEL.predict(Q, QD, TAU)
+    for name, copied in (
+        ("pickle", lambda: pickle.loads(pickle.dumps(MODEL))),
+        ("pickle of the fit", lambda: pickle.loads(pickle.dumps(MODEL.fitted))),
+        ("deepcopy", lambda: copy.deepcopy(MODEL)),
+    ):
+        found = copied().predict(Q, QD, TAU)
+        same = torch.equal(found.mean, expected.mean) and torch.equal(found.covariance, expected.covariance)
+        print(name, "same" if same else "different")
+    with tempfile.TemporaryDirectory() as folder:
+        MODEL.save(Path(folder) / "model")
+        found = forcegp.load_model(Path(folder) / "model").predict(Q, QD, TAU)
+        print("save and load", "same" if torch.equal(found.mean, expected.mean) else "different")
+
+
+if __name__ == "__main__":
+    outcomes(CALLS)
+    try:
+        copies()
+    except Exception as error:
+        print("COPY", type(error).__name__, str(error)[:300])

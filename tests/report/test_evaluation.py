@@ -1,0 +1,59 @@
+"""The page of an evaluation: title, verdict, red where it is bad, tables with units, nothing fetched."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from forcegp import AnalyticalModel, evaluate
+from forcegp.report.evaluation import error_tables, score_table, write_evaluation
+from forcegp.report.window import opening, predicted_window
+from random_data import random_data, table_system
+
+system = table_system()
+data = random_data(system, 80)
+model = AnalyticalModel(system)
+found = evaluate(model, data)
+window = predicted_window(model, opening(data, 0.2), model.kind)
+
+
+def page(folder: Path, name: str = "model", log: str = "logs/test.parquet") -> str:
+    """The text of the page."""
+    return write_evaluation(folder, name, log, found, window).read_text(encoding="utf-8")
+
+
+def test_the_page_opens_with_the_kind_of_model_the_data_and_the_verdict(tmp_path: Path) -> None:
+    text = page(tmp_path)
+    assert "<h1>Analytical model on test.parquet</h1>" in text
+    assert found.verdict in text and text.index(found.verdict) < text.index("<h2>")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"evaluation.html", "window.json", "predictions.svg", "errors.svg"}
+
+
+def test_what_is_worse_than_a_trivial_predictor_is_red(tmp_path: Path) -> None:
+    text = page(tmp_path)
+    for verdict in found.verdicts:
+        item = re.search(rf"<li([^>]*)>{re.escape(verdict.text())}", text)
+        assert item and ("bad" in item.group(1)) == (not verdict.better)
+    torque = error_tables(found)[0]
+    assert torque.bad and all(column == 1 for _, column in torque.bad)
+    for i, row in enumerate(torque.rows):
+        worse = any(float(row[1]) > float(other) for other in row[2:5])
+        # Cells are rounded, so that only clear differences are compared.
+        if min(abs(float(row[1]) - float(other)) for other in row[2:5]) > 1e-2 * float(row[1]):
+            assert ((i, 1) in torque.bad) == worse
+
+
+def test_tables_have_units_and_a_row_per_joint() -> None:
+    for table, unit in zip(error_tables(found), ("[N m, N]", "[rad/s², m/s²]"), strict=True):
+        assert unit in table.caption and [row[0] for row in table.rows] == list(data.joint_names)
+    assert all(
+        "[" in row[0] or "coverage" in row[0] or row[0] == "samples" for row in score_table(found).rows
+    )
+
+
+def test_text_from_outside_is_escaped_and_nothing_is_fetched(tmp_path: Path) -> None:
+    text = page(tmp_path, "<script>alert(1)</script>", "<b>log</b>")
+    assert "<script>" not in text and "<b>log" not in text
+    addresses = re.findall(r'(?:src|href)="([^"]*)"', text)
+    assert addresses and all(address.startswith("data:") for address in addresses)

@@ -1,0 +1,109 @@
+"""One thread within a block, and nobody else notices: not other threads, and nothing afterwards."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+
+import forcegp
+from forcegp.threads import one_thread
+from random_data import random_data, table_system
+
+SCRIPT = """
+import threading, torch
+from forcegp.threads import one_thread
+torch.set_num_threads(3)
+seen, entered, left = {}, threading.Event(), threading.Event()
+
+def other():
+    seen["other"] = torch.get_num_threads()
+    torch.ones(100) @ torch.ones(100)
+    left.wait()
+    seen["other later"] = torch.get_num_threads()
+
+with one_thread():
+    seen["inside"] = torch.get_num_threads()
+    thread = threading.Thread(target=other); thread.start()
+left.set(); thread.join()
+seen["after"] = torch.get_num_threads()
+
+def enter_and_leave_late(): # leaves after the main thread has left
+    with one_thread():
+        entered.set(); left.wait()
+
+left.clear()
+thread = threading.Thread(target=enter_and_leave_late)
+with one_thread():
+    thread.start(); entered.wait()
+left.set(); thread.join()
+seen["after both"] = torch.get_num_threads()
+thread = threading.Thread(target=lambda: seen.update(new=torch.get_num_threads()))
+thread.start(); thread.join()
+print(seen)
+"""
+
+
+def test_other_threads_and_later_calls_keep_their_number() -> None:
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+    expected = {"inside": 1, "other": 3, "other later": 3, "after": 3, "after both": 3, "new": 3}
+    assert ast.literal_eval(done.stdout) == expected
+
+
+def test_threads_that_predict_get_the_same_numbers() -> None:
+    system = table_system()
+    model = forcegp.StructuredGP(system, noise_std=0.1)
+    model.fit(random_data(system, 12), options=forcegp.LearningOptions(max_evaluations=2))
+    test = random_data(system, 20, seed=1)
+    alone = model.predict(test.q, test.qd, test.tau)
+    found: list[forcegp.Prediction | BaseException] = []
+
+    def predict() -> None:
+        try:
+            for _ in range(3):
+                found.append(model.predict(test.q, test.qd, test.tau))
+        except BaseException as error:
+            found.append(error)
+
+    threads = [threading.Thread(target=predict) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 12
+    for prediction in found:
+        assert isinstance(prediction, type(alone)), prediction
+        assert torch.equal(prediction.mean, alone.mean)
+        assert torch.equal(prediction.covariance, alone.covariance)  # type: ignore[arg-type]
+
+
+def test_an_error_inside_restores_the_number() -> None:
+    before = torch.get_num_threads()
+    with pytest.raises(KeyError), one_thread():
+        raise KeyError
+    assert torch.get_num_threads() == before
+
+
+def test_reading_mjcf_leaves_the_warning_handler_of_mujoco(tmp_path) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    heard: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    handler = heard.append
+    mujoco.set_mju_user_warning(handler)
+    try:
+        model = '<mujoco><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>'
+        (tmp_path / "arm.xml").write_text(model)
+        threads = [
+            threading.Thread(target=forcegp.load_robot, args=(tmp_path / "arm.xml",)) for _ in range(8)
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert mujoco.get_mju_user_warning() is handler
+    finally:
+        mujoco.set_mju_user_warning(before)
