@@ -134,9 +134,7 @@ class Mechanics:
 
 def _moving_point(position: Vector, jacobian: Vector, bias: Vector, qd: Vector) -> MovingPoint:
     """The motion of a point as the constraints read it, in tensors."""
-    twist = jacobian @ qd
-    parts = (position, twist[3:], bias, jacobian[3:], twist[:3], jacobian[:3])
-    return MovingPoint(*(torch.from_numpy(x) for x in parts))
+    return MovingPoint.of(*(torch.from_numpy(x) for x in (position, jacobian, bias, qd)))
 
 
 def _contact_points(contacts: Sequence[Constraint], found: Sequence) -> dict[str, ContactPoint]:
