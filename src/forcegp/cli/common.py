@@ -85,5 +85,6 @@ def data_of_robot(data: Dataset, robot: RobotModel) -> Dataset:
 
 
 def noise_std_of(option: float | None, scene: Scene) -> float | None:
-    """The noise of accelerations that a model is told: the option, else the scene's, else what the log states."""
+    """The noise of accelerations that a model is told: the option, else the scene's, else what the log
+    states."""
     return option if option is not None else scene.noise_std

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 CHUNK = 2000
 """States predicted at once: bounds the memory, and moves the progress bar."""
 PER_CONTACT = ("multiplier", "contact_force")
-"""Quantities with one value, or one vector, a contact; the others have one component a joint."""
+"""Quantities with one value or one vector per contact; the others have one component per joint."""
 
 
 def predict(
@@ -79,9 +79,19 @@ def _with_columns(
     """The data set with a predicted quantity among its logged ones."""
     if quantity not in PER_CONTACT:
         return data.replace(extras={**data.extras, name: values})
-    parts = values.split(values.shape[-1] // max(1, len(system.contacts)), dim=-1)
+    sizes = _components(system, quantity)
     named = {
         contact: part[:, 0] if part.shape[-1] == 1 else part
-        for contact, part in zip(system.contact_names, parts, strict=True)
+        for contact, part in zip(sizes, values.split(list(sizes.values()), dim=-1), strict=True)
     }
     return data.replace(contact_extras={**data.contact_extras, name: named})
+
+
+def _components(system: ConstrainedSystem, quantity: str) -> dict[str, int]:
+    """Number of components by contact: rows of a multiplier, or a Cartesian force where there is a
+    surface."""
+    from forcegp.constraints import SurfaceContact
+
+    if quantity == "multiplier":
+        return {contact.name: contact.rows for contact in system.contacts}
+    return {contact.name: 3 for contact in system.contacts if isinstance(contact, SurfaceContact)}

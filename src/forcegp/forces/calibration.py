@@ -1,7 +1,8 @@
 """What is left of measured torques after a fit: its correlation in time, and its size on held-out stretches.
 
-Temperature, hysteresis and filters leave residuals that are correlated in time, so a log holds less evidence than
-its samples suggest. The integrated autocorrelation time says how much less. The variance of a new motion is
+Temperature, hysteresis and filters leave residuals that are correlated in time, so a log holds less evidence
+than its samples suggest. The integrated autocorrelation time says how much less. The variance of a new
+motion is
 measured where it counts: on stretches of the training log that the posterior has not seen.
 """
 
@@ -63,7 +64,8 @@ def _motions(training: Training) -> list[int]:
 
 
 def likelihood_power(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> float:
-    """κ = 1/τ̄, the geometric mean over the joints of the autocorrelation time of torque residuals; at most 1."""
+    """κ = 1/τ̄, the geometric mean over the joints of the autocorrelation time of torque residuals; at most
+    1."""
     posterior = force_posterior(problem, hyperparameters)
     logs = []
     for i in _motions(problem.training):
@@ -119,7 +121,8 @@ def _groups(segment: Tensor) -> Tensor:
 def _held_out(
     problem: Problem, hyperparameters: Mapping[str, Tensor], m: Measurement, noise_std: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Torque residuals of unseen samples in free motion, and their variance but for torque noise, `(n, nq)`."""
+    """Torque residuals of unseen samples in free motion, and their variance but for torque noise, `(n,
+    nq)`."""
     m = m[_free(m)]
     posterior, system = force_posterior(problem, hyperparameters), problem.system
     at = m.at(system)

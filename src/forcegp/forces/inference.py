@@ -1,4 +1,5 @@
-"""Conditioning forces on data: exactly, or sparsely through the features and inducing points of their priors."""
+"""Conditioning forces on data: exactly, or sparsely through the features and inducing points of their
+priors."""
 
 from __future__ import annotations
 

@@ -51,7 +51,8 @@ class ForcePosterior:
         mean: prior mean of Q.
         latent: the conditioned processes.
         offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
-        central: processes that means are read from, where some forces are pinned to zero; `latent` by default.
+        central: processes that means are read from, where some forces are pinned to zero; `latent` by
+            default.
     """
 
     priors: tuple[ForcePrior, ...]

@@ -91,7 +91,8 @@ def create(
     Args:
         name: a key of `MODELS`.
         system: robot and contacts.
-        noise_std: of measured accelerations [rad/s², m/s²], for models that have one; default what the log states.
+        noise_std: of measured accelerations [rad/s², m/s²], for models that have one; default what the log
+            states.
         seed: of random initial values, for models that have any.
         options: further arguments of the model's class.
 

@@ -86,8 +86,8 @@ class Specification:
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
         """The specification with what was left to the data filled in.
 
-        Around the analytical forces of a measured robot the default priors are `measured_priors`. The noise of
-        accelerations is learned with that of the torque where nobody states it.
+        Around the analytical forces of a measured robot the default priors are `measured_priors`. The noise
+        of accelerations is learned with that of the torque where nobody states it.
         """
         spec = self
         if spec.automatic and not is_simulated(data):

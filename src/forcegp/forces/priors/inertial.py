@@ -1,9 +1,10 @@
 """A Gaussian prior on the errors of the robot file's inertial parameters, marginalised in closed form.
 
-Inverse dynamics is linear in the inertial parameters π: with π = π₀ + δ, M₀ q̈ − Q_C,0 − Q_G,0 + Y(q, q̇, q̈) δ = Q
-is an identity at the measured acceleration. So δ acts like a joint force −Y δ with a constant latent δ ~ N(0, S²),
-and least-squares identification with a ridge towards the file is a special case. A prediction takes the robot with
-the updated parameters; what remains uncertain acts through Y at the predicted acceleration.
+Inverse dynamics is linear in the inertial parameters π: with π = π₀ + δ, M₀ q̈ − Q_C,0 − Q_G,0 + Y(q, q̇,
+q̈) δ = Q is an identity at the measured acceleration. So δ acts like a joint force −Y δ with a constant
+latent δ ~ N(0, S²), and least-squares identification with a ridge towards the file is a special case. A
+prediction takes the robot with the updated parameters; what remains uncertain acts through Y at the
+predicted acceleration.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ class InertialPrior(ForcePrior):
 
     Args:
         mass: relative standard deviation of each link's mass.
-        length: standard deviation of the first moment over the mass, and radius of gyration of the error of the
-            inertia [m].
+        length: standard deviation of the first moment over the mass, and radius of gyration of the error of
+            the inertia [m].
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
         masses: of the links, which the scale is relative to; those of the robot by default [kg].
@@ -80,9 +81,10 @@ class InertialPrior(ForcePrior):
     def updated(self, robot: RobotModel, mean: Tensor, precision: Tensor) -> tuple[RobotModel, Tensor]:
         """The physically consistent robot that is most probable given δ ~ N(mean, precision⁻¹).
 
-        It minimises ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] over the log-Cholesky
-        coordinates of the pseudo-inertias J of the links; the second term (the divergence of Lee, Wensing and Park,
-        2019, with the weight γ = 0.01) keeps a link that the log does not determine from losing all its inertia.
+        It minimises ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] over the
+        log-Cholesky coordinates of the pseudo-inertias J of the links; the second term (the divergence of
+        Lee, Wensing and Park, 2019, with the weight γ = 0.01) keeps a link that the log does not determine
+        from losing all its inertia.
 
         Args:
             robot: with π₀.
@@ -90,8 +92,8 @@ class InertialPrior(ForcePrior):
             precision: of δ, `(10 nq, 10 nq)`.
 
         Returns:
-            The robot, and the δ that it contains `(10 nq,)`. Links that are not physically consistent in the file
-            stay as they are.
+            The robot, and the δ that it contains `(10 nq,)`. Links that are not physically consistent in the
+            file stay as they are.
         """
         J0 = pseudo_inertia(robot.mass, robot.com, robot.inertia)
         sound = torch.linalg.eigvalsh(J0)[:, 0] > 0.0

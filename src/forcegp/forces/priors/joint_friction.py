@@ -1,9 +1,11 @@
-"""A prior on the friction of each joint, a function of its own velocity, and on the offset of its torque sensor.
+"""A prior on the friction of each joint, a function of its own velocity, and on the offset of its torque
+sensor.
 
-Friction that no robot file declares is the rule: viscous, Coulomb, a transition between the two (Stribeck), and a
-part that grows with the load on the bearing. Each joint reads only its own velocity, so the prior extrapolates to
-motions in which other joints do something new, and it never reads τ: in a closed loop the likeliest force would be
-the one that cancels the noise of the torque sensor.
+Friction that no robot file declares is the rule: viscous, Coulomb, a transition between the two (Stribeck),
+and a part that grows with the load on the bearing. Each joint reads only its own velocity, so the prior
+extrapolates to
+motions in which other joints do something new, and it never reads τ: in a closed loop the likeliest force
+would be the one that cancels the noise of the torque sensor.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from forcegp.gp.kernels import Kernel, Linear
 from forcegp.robot.model import RobotModel
 
 SPEEDS = (0.02, 0.1, 0.5)
-"""Velocities at which the Coulomb features saturate [rad/s, m/s]: a sharp step, and two slower transitions."""
+"""Velocities at which the Coulomb features saturate [rad/s, m/s]: a sharp step, and two slower
+transitions."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,8 @@ class JointFrictionPrior(ForcePrior):
     """Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)).
 
     The weights w_i and the offset c_i are Gaussian and marginalised; their standard deviations are learned. A
-    kernel with a smooth part, such as `Linear() + SquaredExponential(("velocity",))`, adds a smooth remainder.
+    kernel with a smooth part, such as `Linear() + SquaredExponential(("velocity",))`, adds a smooth
+    remainder.
 
     Args:
         kernel: covariance of each component; linear in the features by default.
