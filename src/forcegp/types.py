@@ -7,13 +7,13 @@ enforces them at run time.
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
+
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 from torch import Tensor
 
-Array = Tensor | NDArray[np.floating] | NDArray[np.bool_]
-"""Arguments of formulas that serve tensors of any batch and NumPy arrays of one state."""
+Array = Any
+"""Tensors of any batch or NumPy arrays of one state, in formulas that serve both (shapes in docstrings)."""
 Scalars = Float[Tensor, "*batch"]
 Vector3 = Float[Tensor, "*batch 3"]
 Rotation = Float[Tensor, "*batch 3 3"]

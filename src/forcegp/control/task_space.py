@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from scipy.linalg import lapack
+from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
 from forcegp import kinematics
@@ -25,6 +25,8 @@ from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
 from forcegp.types import Array, JointVector
 
+POTRF, POTRS = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
+"""LAPACK's Cholesky factorisation and solve, without the overhead of wrappers."""
 SINGULAR = 1e-3
 """Below this smallest pivot of √(J Jᵀ) the task asks for joint speeds a thousand times its own."""
 
@@ -189,8 +191,8 @@ def _solve(G: Array, x: Array) -> tuple[Array, float]:
         factor, failed = torch.linalg.cholesky_ex(G)
         pivot = 0.0 if bool(failed.any()) else float(factor.diagonal(dim1=-2, dim2=-1).min())
         return torch.cholesky_solve(x, factor), pivot
-    factor, failed = lapack.dpotrf(G, lower=1)
-    solved, _ = lapack.dpotrs(factor, x, lower=1)
+    factor, failed = POTRF(G, lower=1)
+    solved, _ = POTRS(factor, x, lower=1)
     return solved, 0.0 if failed else float(factor.diagonal().min())
 
 

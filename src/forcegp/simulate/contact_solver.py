@@ -226,7 +226,7 @@ def _shape(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
     )
 
 
-def _turn_of_z(axis: object) -> np.ndarray:
+def _turn_of_z(axis: Any) -> np.ndarray:
     """Quaternion `(w, x, y, z)` of a rotation that takes the z axis to a unit vector."""
-    rotation, _ = Rotation.align_vectors(np.reshape(axis, (1, 3)), [[0.0, 0.0, 1.0]])
+    rotation = Rotation.align_vectors(np.reshape(axis, (1, 3)), [[0.0, 0.0, 1.0]])[0]
     return rotation.as_quat()[[3, 0, 1, 2]]

@@ -14,14 +14,13 @@ from functools import cached_property
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from forcegp.compiled.mechanics import CompiledMechanics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import Anchor, Constraint, ContactPoint, MovingPoint
 from forcegp.constraints.gauss import RANK_TOLERANCE
 from forcegp.control.plan import Plan
-from forcegp.control.task_space import ToolMotion, tool_motion
+from forcegp.control.task_space import POTRF, POTRS, ToolMotion, tool_motion
 from forcegp.errors import MissingDependencyError
 from forcegp.friction import JointFriction
 
@@ -54,11 +53,11 @@ class StateEquations:
 
     @cached_property
     def _M_cholesky(self) -> Vector:
-        return lapack.dpotrf(self.M, lower=1)[0]
+        return POTRF(self.M, lower=1)[0]
 
     @cached_property
     def _M_inv_At(self) -> Vector:
-        return lapack.dpotrs(self._M_cholesky, self.A.T, lower=1)[0]
+        return POTRS(self._M_cholesky, self.A.T, lower=1)[0]
 
     @cached_property
     def _constraint_inertia(self) -> Vector:
