@@ -6,7 +6,7 @@ READY  := $(VENV)/.ready
 PROFILE ?= quick
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce test lint types package benchmark clean
+.PHONY: help setup reproduce test lint types package benchmark clean attack
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -48,6 +48,13 @@ benchmark: $(READY)  ## every benchmark, results as JSON under out/benchmarks
 	  echo "[benchmark] $$name"; $(BIN)/python benchmarks/$$name.py --json $(OUT)/benchmarks/$$name.json || exit 1; \
 	done
 	@echo "[benchmark] results are in $(OUT)/benchmarks"
+
+attack: $(READY) ## 20,000 inputs per reader, faults at every step, 50 kills per command (hours)
+	@$(BIN)/python -m pip install --quiet "atheris>=3; python_version >= '3.11'" || echo "[attack] without atheris"
+	PYTHONPATH=src $(BIN)/python fuzz/attack.py --inputs 20000 --engine mutate
+	PYTHONPATH=src $(BIN)/python fuzz/attack.py --inputs 20000
+	FORCEGP_ATTACK=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/faults tests/robot/test_fuzz.py
+	@echo "[attack] no findings"
 
 clean:           ## remove what the targets made
 	rm -rf $(VENV) $(OUT) build dist .pytest_cache .ruff_cache

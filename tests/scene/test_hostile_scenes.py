@@ -38,6 +38,19 @@ HOSTILE = {
     "a lone surrogate": 'x = "\\ud800"',
     "a null character": "x = \x00",
 }
+NAMES = {"too long": "a" * 5000, "with a null character": "a\\u0000b", "a folder": ".", "empty": ""}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_robot_whose_name_no_file_can_have_is_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text(f'[robot]\nmodel = "{NAMES[name]}"\n')
+    with pytest.raises(SceneError, match="no such robot"):
+        load_scene(tmp_path / "scene.toml").system()
+
+
+def test_a_scene_whose_name_no_file_can_have_is_refused() -> None:
+    with pytest.raises(SceneError, match="no such scene"):
+        load_scene("a" * 5000)
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -54,7 +54,7 @@ class Scene:
         section = self.sections.robot
         bundled = section.model in BUNDLED_ROBOTS
         source = section.model if bundled else self.folder / section.model
-        if not bundled and not Path(source).is_file():
+        if not bundled and not _is_file(Path(source)):
             near = get_close_matches(section.model, BUNDLED_ROBOTS, n=1)
             raise SceneError(
                 f"{self.document.place(('robot', 'model'))}: no such robot",
@@ -84,6 +84,14 @@ class Scene:
         return at(("contact",), ConstrainedSystem, robot, constraints, baumgarte=sections.baumgarte)
 
 
+def _is_file(path: Path) -> bool:
+    """Whether a file is there; a name that no file can have is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def load_scene(source: str | Path) -> Scene:
     """Read a scene file.
 
@@ -102,7 +110,7 @@ def load_scene(source: str | Path) -> Scene:
     """
     bundled = str(source) in BUNDLED
     path = Path(str(files("forcegp.scene") / "bundled" / f"{source}.toml")) if bundled else Path(source)
-    if not path.is_file():
+    if not _is_file(path):
         beside = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
         near = get_close_matches(str(source), [*BUNDLED, *beside], n=1)
         raise SceneError(
