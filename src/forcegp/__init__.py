@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from forcegp.forces.priors.joint import JointForcePrior
     from forcegp.forces.priors.normal_force import NormalForcePrior
     from forcegp.forces.priors.operator import OperatorForcePrior
+    from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
     from forcegp.gp.optimise import LearningOptions
     from forcegp.logs import read_log
     from forcegp.models.analytical import AnalyticalModel

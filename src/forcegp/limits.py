@@ -49,8 +49,6 @@ SCENE_BYTES = MIB
 """A scene file."""
 KEY_PARTS = 16
 """Parts of a dotted key of a scene."""
-SCENE_DEPTH = 32
-"""Tables and lists inside each other in a scene."""
 SCENE_KEYS = 2000
 """Keys and tables of a scene."""
 

@@ -312,3 +312,12 @@ def test_arguments_that_do_not_fit_are_refused() -> None:
         system.contact("plan")
     with pytest.raises(ForceGPError, match=r"two contacts are named 'plane'"):
         ConstrainedSystem(system.robot, [system.contacts[0], system.contacts[0]])
+
+
+def test_the_summary_names_robot_and_contacts() -> None:
+    robot = forcegp.load_robot("kuka_iiwa")
+    system = ConstrainedSystem(robot, [SurfaceContact("table", FLANGE, (0, 0, 0.1), Plane())], Baumgarte())
+    mass = f"{float(robot.mass.sum()):.4g} kg"
+    assert repr(robot) == f"<RobotModel 'kuka_iiwa': 7 joints; {mass}; float64 on cpu>"
+    assert repr(system) == f"<ConstrainedSystem: {robot!r}; SurfaceContact 'table'; {Baumgarte()!r}>"
+    assert "no contacts>" in repr(ConstrainedSystem(robot))

@@ -166,7 +166,7 @@ def test_wrong_requests_are_refused(robot: forcegp.RobotModel) -> None:
         AnalyticalParameters(robot, {"mass": "all", "inertia": [LAST]})
     flat = robot.replace(inertia=robot.inertia * torch.tensor([1.0, 1.0, 9.0], dtype=robot.dtype).diag())
     with pytest.raises(
-        InertiaError, match=r"link of joint 'lbr_iiwa_joint_2' is not physical(.|\n)*mass or com singly"
+        InertiaError, match=r"link of joint 'lbr_iiwa_joint_2' is not physical(.|\n)*mass or com alone"
     ):
         AnalyticalParameters(flat, {"inertia": "all"})
     massless = robot.replace(mass=torch.zeros_like(robot.mass))

@@ -172,11 +172,13 @@ def test_missing_scenes(tmp_path: Path) -> None:
         b"[[robot]]",
         b"",
         b"contact = {}",
+        *(b"a = " + b"[" * levels + b"]" * levels for levels in (40, 150, 250, 400)),
+        *(b"robot = " + b"{a = " * levels + b"1" + b"}" * levels for levels in (40, 150, 250)),
         b".".join([b"a"] * 20_000) + b" = 1",
         b"\n".join([b"robot = {", b"a" + b".a" * 500 + b" = 1}"]),
         b".".join([b"a"] * 1_000) + b" = 1",
     ],
-    ids=range(11),
+    ids=range(18),
 )
 def test_hostile_scenes(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "scene.toml"

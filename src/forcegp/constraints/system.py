@@ -83,6 +83,12 @@ class ConstrainedSystem:
         for contact in self.contacts:
             contact.check(self.robot)
 
+    def __repr__(self) -> str:
+        """One line with robot and contacts, without the numbers."""
+        contacts = ", ".join(f"{type(contact).__name__} {contact.name!r}" for contact in self.contacts)
+        rule = f"; {self.baumgarte}" if self.baumgarte is not None else ""
+        return f"<ConstrainedSystem: {self.robot!r}; {contacts or 'no contacts'}{rule}>"
+
     @property
     def contact_names(self) -> tuple[str, ...]:
         """Names of the constraints, in order."""

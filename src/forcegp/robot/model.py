@@ -1,7 +1,7 @@
 """The frozen description of a robot: a tree of one-degree-of-freedom joints with rigid links.
 
 Joint `i` moves link `i`. Its frame sits at `placement` in the frame of its parent link; the link frame
-is the joint frame after the motion. All inertial figures of link `i` are in the axes of link frame `i`,
+is the joint frame after the motion. All inertial parameters of link `i` are in the axes of link frame `i`,
 the inertia about the centre of mass. Fixed joints are folded into the links; their frames keep a name.
 """
 
@@ -30,7 +30,7 @@ class RobotModel:
     Args:
         name: name of the robot.
         joint_names: the moving joints, parents before children.
-        joint_types: `"revolute"` or `"prismatic"`, one a joint (continuous joints are revolute).
+        joint_types: `"revolute"` or `"prismatic"`, one per joint (continuous joints are revolute).
         parents: index of the parent joint of each joint, −1 for the base.
         placement_rotation: `(nq, 3, 3)` joint frame in the parent link frame at q = 0.
         placement_position: `(nq, 3)` [m].
@@ -51,7 +51,7 @@ class RobotModel:
         frame_rotation, frame_position: `(nf, 3, 3)`, `(nf, 3)` pose in that joint's link frame.
         base_rotation, base_position: pose of the base in the world `(3, 3)`, `(3,)` [m].
         gravity: `(3,)` gravitational acceleration in the world [m/s²].
-        remarks: what the loader accepted though it is doubtful, one sentence each.
+        remarks: doubtful properties of the file that the loader accepted, one sentence each.
     """
 
     name: str
@@ -82,6 +82,14 @@ class RobotModel:
     base_position: Tensor
     gravity: Tensor
     remarks: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """One line that says which robot it is, without the numbers."""
+        moving = sum(1 for kind in self.joint_types if kind == "prismatic")
+        kinds = f", {moving} of them prismatic" if moving else ""
+        mass = float(self.mass.detach().sum())
+        kind = str(self.dtype).removeprefix("torch.")
+        return f"<RobotModel {self.name!r}: {self.nq} joints{kinds}; {mass:.4g} kg; {kind} on {self.device}>"
 
     @property
     def nq(self) -> int:
@@ -125,7 +133,7 @@ class RobotModel:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over joint names, kinematics and inertial figures: tells whether two robots are equal."""
+        """SHA-256 of joint names, kinematics and inertial parameters: equal for equal robots."""
         digest = hashlib.sha256(repr((self.joint_names, self.joint_types, self.parents)).encode())
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)

@@ -1,4 +1,4 @@
-"""Analytical parameters θ_A: the figures of a robot that are learned. The robot is frozen; θ_A makes robots.
+"""Analytical parameters θ_A: the parameters of a robot that are learned. θ_A makes new, frozen robots.
 
 | quantity            | coordinates of each joint j                                         | number |
 |---------------------|---------------------------------------------------------------------|--------|
@@ -8,7 +8,7 @@
 | `offset`            | turn (rotation vector) and shift [m] of j's placement               | 6      |
 | `damping`, `friction`, `stribeck`, `stribeck_velocity`, `friction_velocity`, `armature` | log | 1 each |
 
-Every value of the coordinates is a physical robot, as long as the robot they start from is one.
+Every value of the coordinates is a physical robot if the initial robot is physical.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ POSITIVE = (
 )  # fmt: skip
 QUANTITIES = ("inertia", "com", "offset", *POSITIVE)
 SMALLEST = 1e-3
-"""Where a friction or drive figure starts that is zero in the robot, since its logarithm is learned."""
+"""Initial value of a friction or drive parameter that is zero in the robot, as its logarithm is learned."""
 
 
 class AnalyticalParameters(nn.Module):
-    """The learnable figures of a robot; calling the module gives the robot that they describe.
+    """The learnable parameters of a robot; calling the module returns the robot that they describe.
 
-    The state dict holds one tensor a quantity, `coordinates.<quantity>`, one row a joint. They live on the
+    The state dict has one tensor per quantity, `coordinates.<quantity>`, one row per joint. They are on the
     robot's device and in its precision: to change these, start from `robot.to(...)`.
 
     Args:
-        robot: the robot whose figures are the starting point, and all figures that are not learned.
+        robot: provides the initial values, and the parameters that are not learned.
         learn: joint names by quantity, or `"all"` joints, such as `{"mass": ["joint_7"], "damping": "all"}`.
             The inertia, mass and centre of mass named by a joint are those of the link that it moves.
 
     Raises:
         UnknownNameError: a quantity or a joint does not exist.
-        ModelError: nothing is learned, or the inertia of a link is learned twice.
-        InertiaError: the inertia of a link that is to be learned whole is not physical.
+        ModelError: no parameter is selected, or the inertia of a link is selected twice.
+        InertiaError: `inertia` is learned for a link whose inertia is not physical.
     """
 
     def __init__(self, robot: RobotModel, learn: Mapping[str, Sequence[str] | Literal["all"]]) -> None:
@@ -60,7 +60,7 @@ class AnalyticalParameters(nn.Module):
         self.coordinates = nn.ParameterDict({name: self._initial(name) for name in self.joints})
 
     def forward(self) -> RobotModel:
-        """The robot with the learned figures, differentiable in the coordinates."""
+        """The robot with the learned parameters, differentiable in the coordinates."""
         fields: dict[str, Tensor] = {}
         for quantity, x in self.coordinates.items():
             for name, rows in self._fields(quantity, x).items():
@@ -76,13 +76,13 @@ class AnalyticalParameters(nn.Module):
         length: float = 0.0,
         angle: float = 0.0,
     ) -> None:
-        """Draw all coordinates uniformly from a window about the robot that they started from.
+        """Draw all coordinates uniformly from a window around the initial robot.
 
         Args:
             generator: the source of randomness.
-            relative: half width for logarithms: a figure varies by a factor of up to e^{±relative}.
+            relative: half width for logarithms: a parameter varies by a factor of up to e^{±relative}.
             length: half width for centres of mass, shifts and lengths [m].
-            angle: half width for turns [rad].
+            angle: half width for rotations [rad].
         """
         for quantity, x in self.coordinates.items():
             half = torch.full_like(x, relative)
@@ -138,12 +138,12 @@ def _joints(robot: RobotModel, quantity: str, names: Sequence[str] | Literal["al
 
 def _check(joints: Mapping[str, tuple[str, ...]]) -> None:
     if not any(joints.values()):
-        raise ModelError("no analytical parameter is to be learned", expected="joints of some quantity")
+        raise ModelError("no analytical parameter is selected", expected="joints of some quantity")
     for part in ("mass", "com"):
         twice = set(joints.get("inertia", ())) & set(joints.get(part, ()))
         if twice:
             raise ModelError(
-                f"{part} and inertia of the link of joint {min(twice)!r} are both to be learned",
+                f"{part} and inertia of the link of joint {min(twice)!r} are both selected",
                 expected="one of them",
                 hint=f"inertia contains {part}: remove {part} for this joint",
             )
@@ -157,7 +157,7 @@ def _check_inertia(robot: RobotModel, joint: str, row: int) -> None:
             f"the inertia of the link of joint {joint!r} is not physical, so it has no log-Cholesky form",
             expected=error.expected,
             got=error.got,
-            hint="learn its mass or com singly, or start from a robot with a physical inertia",
+            hint="learn its mass or com alone, or start from a robot with a physical inertia",
         ) from error
 
 

@@ -13,8 +13,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from forcegp.errors import ForceGPError, SceneError, near_names
-from forcegp.files import depth
-from forcegp.limits import KEY_PARTS, SCENE_BYTES, SCENE_DEPTH, SCENE_KEYS
+from forcegp.limits import KEY_PARTS, SCENE_BYTES, SCENE_KEYS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -65,8 +64,6 @@ class Document:
             raise error(
                 f"{source}:{line}: not valid TOML", got=str(cause) or "brackets nested too deeply"
             ) from cause
-        if depth(self.data) > SCENE_DEPTH:
-            raise error(f"{source}: nested too deeply", expected=f"at most {SCENE_DEPTH} levels")
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
@@ -79,9 +76,10 @@ class Document:
             ForceGPError: the first error in the content, with its line and key.
         """
         # In JSON mode, strict validation accepts a list for a tuple and an integer for a float.
-        text = json.dumps(self.data, default=str)
         try:
-            return schema.model_validate_json(text)
+            return schema.model_validate_json(json.dumps(self.data, default=str))
+        except RecursionError as error:
+            raise self.error(f"{self.source}: nested too deeply") from error
         except ValidationError as error:
             # A misspelt key is also a missing one: the spelling is what has to be corrected.
             errors = sorted(error.errors(), key=lambda found: found["type"] not in _UNKNOWN_KEY)
@@ -118,6 +116,8 @@ class Document:
         place, last = self.place(key), str(key[-1]) if key else ""
         if isinstance(cause := context.get("error"), ForceGPError):
             return self.error.at(self.place(self._named(key, cause.message)), cause)
+        if kind == "json_invalid":  # well-formed, as it was just written, but too deep for the validator
+            return self.error(f"{self.source}: nested too deeply", got=context.get("error"))
         if kind in _UNKNOWN_KEY:
             known = _known_keys(schema, key)
             return self.error(f"{place}: unknown key", expected=_one_of(known), hint=_near(last, known))
