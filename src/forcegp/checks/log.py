@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.checks.statistics import Array, intervals, robust_std
-from forcegp.data.check import check_joints
+from forcegp.data.compatible import check_joints
 from forcegp.data.columns import JOINT_VECTORS, parse
 from forcegp.data.dataset import Dataset
 from forcegp.data.derivative import SavitzkyGolay, differentiate
