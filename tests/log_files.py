@@ -43,12 +43,11 @@ def mapping(
     velocity: str = "qd_{joint}",
     torque: str = "tau_{joint}",
     joints: dict[str, str] | None = None,
-    more: str = "",
 ) -> str:
-    """A mapping in SI units."""  # fmt: skip
+    """A mapping in SI units."""
     names = "".join(f'{joint} = "{name}"\n' for joint, name in (joints or {}).items())
     return (
-        f'[time]\ncolumn = "{time}"\n{more}\n[joints]\n{names}\n'
+        f'[time]\ncolumn = "{time}"\n\n[joints]\n{names}\n'
         f'[position]\ncolumn = "{position}"\nunit = "rad"\n'
         f'[velocity]\ncolumn = "{velocity}"\nunit = "rad/s"\n'
         f'[torque]\ncolumn = "{torque}"\nunit = "Nm"\n'
@@ -57,10 +56,8 @@ def mapping(
 
 def table(m: Motion) -> dict[str, NDArray[np.float64]]:
     """The motion as named columns."""
-    columns = {"t": m.t}
-    for name, values in (("q", m.q), ("qd", m.qd), ("tau", m.tau)):
-        columns |= {f"{name}_{joint}": values[:, i] for i, joint in enumerate(JOINTS)}
-    return columns
+    named = (("q", m.q), ("qd", m.qd), ("tau", m.tau))
+    return {"t": m.t} | {f"{n}_{joint}": x[:, i] for n, x in named for i, joint in enumerate(JOINTS)}
 
 
 def write_csv(folder: Path, m: Motion) -> tuple[Path, str]:

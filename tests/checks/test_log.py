@@ -61,7 +61,7 @@ def test_joints_are_matched_by_name() -> None:
     assert matched.joint_names == robot.joint_names
     np.testing.assert_array_equal(matched.tau, log.tau[:, [1, 0]])
     with pytest.raises(DataError, match=r"is not in the data"):
-        of_robot(log_of(random_log(20)), robot)
+        of_robot(log_of(random_log(20, joints=("elbow", "wrist"))), robot)
 
 
 def test_an_unknown_kind_is_refused() -> None:
@@ -69,3 +69,11 @@ def test_an_unknown_kind_is_refused() -> None:
 
     with pytest.raises(UnknownNameError, match="did you mean 'time-gap'"):
         Finding("time-gab", "", ((0, 1),))
+
+
+def test_every_kind_is_documented() -> None:
+    from forcegp.checks import KINDS
+
+    page = (Path(__file__).parents[2] / "docs/checking.md").read_text(encoding="utf-8")
+    for name, kind in KINDS.items():
+        assert f"| `{name}` | {kind.family} | {kind.severity} | {kind.title} | {kind.remedy} |" in page

@@ -1,4 +1,4 @@
-"""Friction that opposes sliding, proportional to the multiplier: the coupled equations, and that it takes energy."""
+"""Friction proportional to the multiplier solves the coupled equations; all friction takes energy."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def pressed(system: forcegp.ConstrainedSystem) -> States:
 
 def coupled(system: forcegp.ConstrainedSystem, at: States, mu: float) -> tuple[np.ndarray, np.ndarray]:
     """λ and Q_z = −μ λ Jᵀ s(v) by a dense solve of M q̈ − (Aᵀ + μ u) λ = Q_K + τ, A q̈ = b."""
-    Q, (n,) = (at.eom.Q_K + at.tau).numpy(), np.array([system.contacts[0].surface.normal])  # type: ignore[attr-defined]
+    Q, along = (at.eom.Q_K + at.tau).numpy(), np.diag([1.0, 1.0, 0.0])
     multipliers, forces = [], []
     for i in range(N):
         J = at.eom.contact_points["table"].jacobian[i].numpy()
-        v = (np.eye(3) - n.T @ n) @ J @ at.qd[i].numpy()
+        v = along @ J @ at.qd[i].numpy()
         u = -J.T @ v / np.sqrt(v @ v + EPS**2)
         A = at.eom.A[i].numpy()
         K = np.block([[at.eom.M[i].numpy(), -(A[0] + mu * u)[:, None]], [A, np.zeros((1, 1))]])

@@ -88,7 +88,7 @@ def test_free_motion_read_from_contact_knows_its_error(kind: str, surface: str) 
 
 
 def test_the_coordinate_off_a_plane_is_no_input() -> None:
-    """10 mm off the plane on which a force was learned, it is the same."""
+    """A point of the robot has the same inputs whatever the height of the surface."""
     model = fitted("any force")
     data = motion("learned", 0, 4.0)[::40]
     forces = [

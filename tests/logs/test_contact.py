@@ -97,10 +97,12 @@ def test_the_distance_shows_the_intervals(
     )
     height = position[:, 2].numpy()
     offset = float(np.quantile(height, 0.3))
-    table = forcegp.SurfaceContact("table", FRAME, POINT, forcegp.Plane(offset=offset - 1e-3))
-    lower = forcegp.ConstrainedSystem(system.robot, [table])
-    contact.detect(signals, lower, mapping("distance", "shortest = 0.0"), Report("log"))  # type: ignore[arg-type]
-    np.testing.assert_array_equal(signals.contact["table"], height <= offset)
+    table = forcegp.SurfaceContact("table", FRAME, POINT, forcegp.Plane(offset=offset))
+    system = forcegp.ConstrainedSystem(system.robot, [table])
+    more = "shortest = 0.0\nthreshold = 0.02"
+    contact.detect(signals, system, mapping("distance", more), Report("log"))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(signals.contact["table"], np.abs(height - offset) <= 0.02)
+    assert signals.contact["table"].any() and not signals.contact["table"].all()
 
 
 def test_one_state_only_is_not_split_in_two() -> None:

@@ -118,7 +118,7 @@ def _fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tup
     Rows that stay off the fit, such as those labelled too early, are trimmed round by round.
     """
     p = path.p - np.median(path.p[closed], axis=0)
-    keep, slope = closed.copy(), np.zeros(3)
+    keep, slope, theta = closed.copy(), np.zeros(3), np.zeros(3)
     offset = float(np.median(path.c[closed]))
     if not isinstance(contact.surface, Plane):
         return offset, slope, np.full(len(p), offset)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, SupportsFloat
+from typing import Any, SupportsFloat
 
-from forcegp.checks.kinds import KINDS
+from forcegp.checks.kinds import KINDS, Severity
 from forcegp.errors import UnknownNameError
 
-Severity = Literal["note", "warning", "error"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """From the gravest to the lightest."""
 

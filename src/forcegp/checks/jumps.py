@@ -7,7 +7,7 @@ import numpy as np
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.log import Log
-from forcegp.checks.statistics import Array, describe, intervals, robust_std
+from forcegp.checks.statistics import Array, any_row, describe, intervals, robust_std
 from forcegp.checks.values import resolution
 from forcegp.constraints import ConstrainedSystem
 
@@ -48,10 +48,10 @@ def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
     jumps = _jumps(log.q, log.qd, log)
     if not jumps.any():
         return [], log
-    rows = intervals(jumps.any(axis=1))
+    rows = intervals(any_row(jumps))
     joints = tuple(log.joint_names[j] for j in np.flatnonzero(jumps.any(axis=0)))
     text = f"the position of {', '.join(joints)} jumps at {describe(rows)}"
-    segment = log.segment + np.cumsum(jumps.any(axis=1))
+    segment = log.segment + np.cumsum(any_row(jumps))
     return [Finding("position-jump", text, rows, joints)], log.replace(segment=segment)
 
 
@@ -62,9 +62,9 @@ def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
     jumps = _jumps(log.qd, log.qdd, log)
     if not jumps.any():
         return [], log
-    rows = intervals(jumps.any(axis=1))
+    rows = intervals(any_row(jumps))
     joints = tuple(log.joint_names[j] for j in np.flatnonzero(jumps.any(axis=0)))
     text = f"the velocity jumps, as at an impact, at {describe(rows)}"
-    around = jumps.any(axis=1)
+    around = any_row(jumps)
     around[:-1] |= around[1:]
     return [Finding("impact", text, rows, joints)], log.mask(around)

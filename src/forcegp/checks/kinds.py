@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+Severity = Literal["note", "warning", "error"]
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -18,12 +20,12 @@ class Kind:
     """
 
     family: str
-    severity: Literal["note", "warning", "error"]
+    severity: Severity
     title: str
     remedy: str
 
 
-_TABLE = (
+_TABLE: tuple[tuple[str, str, Severity, str, str], ...] = (
     # clock
     ("time-repeated", "clock", "error", "repeated time stamps", "drop the duplicate rows"),
     ("time-backward", "clock", "error", "time runs backward", "sort by time, or start a new segment there"),
@@ -123,5 +125,5 @@ _TABLE = (
     ("force-directions", "excitation", "warning", "one sliding direction", "slide in several directions"),
 )
 
-KINDS: dict[str, Kind] = {name: Kind(*rest) for name, *rest in _TABLE}
+KINDS: dict[str, Kind] = {row[0]: Kind(*row[1:]) for row in _TABLE}
 """Every kind of finding by name, family by family."""

@@ -73,7 +73,8 @@ def match(log: Log, value: str, rate: str) -> Match | None:
         low, high, correlation = cross / own, other / cross, cross / np.sqrt(own * other)
     speed = np.sqrt(other)
     moving = speed > 1e-3 * speed.max()
-    return Match(change, integral, *np.nan_to_num((low, high, correlation)), moving)
+    low, high, correlation = np.nan_to_num((low, high, correlation))
+    return Match(change, integral, low, high, correlation, moving)
 
 
 def _without_jumps(change: Array, integral: Array) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ import numpy as np
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.log import Log
-from forcegp.checks.statistics import Array, describe, intervals
+from forcegp.checks.statistics import Array, any_row, describe, intervals
 from forcegp.constraints import ConstrainedSystem
 
 DEGREE = np.pi / 180.0
@@ -104,7 +104,7 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
                     clipped[a:b, j] = True
     if not clipped.any():
         return [], log
-    rows = intervals(clipped.any(axis=1))
+    rows = intervals(any_row(clipped))
     joints = tuple(log.joint_names[j] for j in np.flatnonzero(clipped.any(axis=0)))
     text = f"the torque of {', '.join(joints)} stays at its largest value in {describe(rows)}"
     return [Finding("torque-saturated", text, rows, joints)], log

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.checks.statistics import Array, intervals, robust_std
+from forcegp.data.columns import parse
 from forcegp.data.compatible import check_joints
-from forcegp.data.columns import JOINT_VECTORS, parse
 from forcegp.data.dataset import Dataset
 from forcegp.data.derivative import SavitzkyGolay, differentiate
+from forcegp.data.fields import JOINT_VECTORS
 from forcegp.data.header import DataHeader
 from forcegp.data.table import read_table
 from forcegp.errors import DataError

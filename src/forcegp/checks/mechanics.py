@@ -11,11 +11,11 @@ from forcegp.checks.excitation import still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of
-from forcegp.checks.hypotheses import friction_columns, robot_columns
+from forcegp.checks.hypotheses import LAGS, friction_columns, robot_columns
 from forcegp.checks.log import Log
 from forcegp.checks.residual import projector, residual
 from forcegp.checks.smooth import smoothed
-from forcegp.checks.statistics import MAD_TO_STD, describe, intervals
+from forcegp.checks.statistics import MAD_TO_STD, any_row, describe, intervals
 from forcegp.constraints import ConstrainedSystem
 
 LEAST_ROWS = 200
@@ -48,15 +48,21 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     if found:
         return found, log
     smooth = smoothed(log)
+    if not _enough(smooth):
+        return [], log
     told = explain(system, smooth)
     disturbed, rows = _disturbances(system, told)
-    if disturbed:
+    if disturbed and _enough(smooth.mask(rows)):
         # What happened in these rows must pass neither for friction nor for a mass.
         told = explain(system, smooth.mask(rows))
     found = [*told.findings, *_friction(told), *_offsets(told), *_unexplained(told)]
     for repair in told.repairs:
         log = repair(log)
     return [*found, *disturbed], log
+
+
+def _enough(log: Log) -> bool:
+    return len(log.rows(LEAST_ROWS, margin=max(LAGS))) == LEAST_ROWS
 
 
 def _without_torque(log: Log) -> Outcome:
@@ -152,10 +158,10 @@ def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Fi
     level = np.log(energy + FLOOR**2)
     # An arm at rest leaves little unexplained; it is no measure for one that moves.
     speed = np.abs(log.qd[rows]).max(axis=1)
-    moving = level[speed > MOVING * np.percentile(speed, 99)]
+    moving = level[speed >= MOVING * np.percentile(speed, 99)]
     middle = np.median(moving)
     spread = max(MAD_TO_STD * np.median(np.abs(moving - middle)), 0.2)
-    visible = (np.abs(trace) > VISIBLE * told.problem.size).any(axis=1)
+    visible = any_row(np.abs(trace) > VISIBLE * told.problem.size)
     bad = level > min(middle + DISTURBANCE * spread, np.percentile(moving, 90) + 2.0 * np.log(LOUD))
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)

@@ -36,6 +36,11 @@ def intervals(mask: NDArray[np.bool_], join: int = 0) -> tuple[tuple[int, int], 
     return tuple(joined)
 
 
+def any_row(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """`(n,)` bool, rows of `(n, d)` in which any column is true."""
+    return np.asarray(mask.any(axis=1))
+
+
 def describe(spans: tuple[tuple[int, int], ...], most: int = 3) -> str:
     """Rows in words, such as `row 4` or `rows 4 to 9, 20 to 31 and 5 more intervals`."""
     texts = [f"{a}" if b - a == 1 else f"{a} to {b - 1}" for a, b in spans[:most]]

@@ -49,6 +49,7 @@ def import_(
 
     forcegp import run.bag --robot ur3.urdf --mapping ur3_bag --out log.parquet
     """
+    from forcegp.destination import check_destination, write_or_keep
     from forcegp.errors import ForceGPError
     from forcegp.logs import import_log
 
@@ -60,9 +61,10 @@ def import_(
         return
     if out is None or out.suffix.lower() != ".parquet":
         raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
+    check_destination(out)
     with progress_bar(f"reading {log.name}", 1) as advance:
-        imported = import_log(log, system, mapping, progress=lambda done, total: advance(done, total))
-    imported.data.write(out)
+        imported = import_log(log, system, mapping, progress=advance)
+    write_or_keep(imported.data.write, out)
     result = _json(imported) if as_json else _summary(imported)
     if fit_surface is not None:
         result |= _surfaces(imported, system, fit_surface)

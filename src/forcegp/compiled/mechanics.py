@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from forcegp.compiled.build import cpu_kernel
 from forcegp.compiled.links import Links, cross, numbers
@@ -14,6 +15,7 @@ from forcegp.compiled.program import Program, _joint_force, _mass_matrix, _Motio
 from forcegp.compiled.source import cpu_source
 from forcegp.robot.model import BASE, RobotModel
 
+Vector = NDArray[np.floating]
 Anchor = tuple[str, Sequence[float]]
 """A frame, and a point in its coordinates [m]."""
 
@@ -37,19 +39,20 @@ class CompiledMechanics:
         blocks = _forces(links)
         for frame, point in points:
             blocks += _point_blocks(links, robot, robot.frame_index(frame), np.asarray(point, dtype=float))
-        self._shapes = [block.shape for block in blocks]
-        self._sizes = [block.size for block in blocks]
+        ends = np.cumsum([0, *(block.size for block in blocks)]).tolist()
+        self._places = [(slice(*at), x.shape) for at, x in zip(pairwise(ends), blocks, strict=True)]
         outputs = [entry for block in blocks for entry in block.flat]
         program = Program(("q", "qd"), (len(outputs),), links.graph, outputs)
         source = cpu_source(program, robot.nq, robot.dtype)
         self._arrays, self._kernel, self._dtype = source.arrays, cpu_kernel(source.text), robot.dtype
 
-    def __call__(self, q: Tensor, qd: Tensor) -> list[Tensor]:
+    def __call__(self, q: Vector, qd: Vector) -> list[Vector]:
         """The mechanics at a state `(nq,)`, `(nq,)`."""
-        given = {"q": q, "qd": qd, "sin": torch.sin(q), "cos": torch.cos(q)}
-        out = torch.empty(1, sum(self._sizes), dtype=self._dtype)
-        self._kernel([given[name].contiguous() for name in self._arrays], out)
-        return [part.view(shape) for part, shape in zip(out[0].split(self._sizes), self._shapes, strict=True)]
+        given = {"q": q, "qd": qd, "sin": np.sin(q), "cos": np.cos(q)}
+        out = torch.empty(1, self._places[-1][0].stop, dtype=self._dtype)
+        self._kernel([torch.from_numpy(np.ascontiguousarray(given[name])) for name in self._arrays], out)
+        flat = out.numpy()[0]
+        return [flat[place].reshape(shape) for place, shape in self._places]
 
 
 def _forces(links: Links) -> list[np.ndarray]:

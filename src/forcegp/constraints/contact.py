@@ -30,16 +30,22 @@ class MovingPoint(NamedTuple):
         position, velocity: `(*batch, 3)` in the world [m], [m/s].
         bias: `(*batch, 3)` acceleration at q̈ = 0 [m/s²].
         jacobian: J `(*batch, 3, nq)`, world axes.
-        angular_velocity: `(*batch, 3)` of the frame [rad/s].
-        angular_jacobian: `(*batch, 3, nq)` of the frame.
+        turning: ω `(*batch, 3)` of the frame [rad/s].
+        angular: J_ω `(*batch, 3, nq)`.
     """
 
     position: Tensor
     velocity: Tensor
     bias: Tensor
     jacobian: Tensor
-    angular_velocity: Tensor
-    angular_jacobian: Tensor
+    turning: Tensor
+    angular: Tensor
+
+    @classmethod
+    def of(cls, position: Tensor, jacobian: Tensor, bias: Tensor, qd: Tensor) -> MovingPoint:
+        """From the position, the Jacobian `(*batch, 6, nq)` (angular rows first), the bias and q̇."""
+        rate = (jacobian @ qd[..., None])[..., 0]
+        return cls(position, rate[..., 3:], bias, jacobian[..., 3:, :], rate[..., :3], jacobian[..., :3, :])
 
 
 class ContactPoint(NamedTuple):
@@ -108,10 +114,9 @@ def _moving_point(
     """The motion of a point fixed in a frame, from the motion of the links."""
     index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
     J = kinematics.jacobian_of_poses(robot, poses, index, x)
-    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)
+    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)[..., 3:]
     position = kinematics.point_of_poses(robot, poses, index, x) + robot.base_position
-    twist = (J @ qd[..., None])[..., 0]
-    return MovingPoint(position, twist[..., 3:], bias[..., 3:], J[..., 3:, :], twist[..., :3], J[..., :3, :])
+    return MovingPoint.of(position, J, bias, qd)
 
 
 @dataclass(frozen=True)
@@ -170,20 +175,23 @@ class SurfaceContact(Constraint):
     def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
         (tip,) = points
         surface = self.center_surface
-        at = ContactPoint(tip.position, tip.velocity, tip.jacobian, surface.gradient(tip.position))
-        A = at.normal[..., None, :] @ at.jacobian
-        b = -((at.normal * tip.bias).sum(-1) + surface.curvature(tip.position, tip.velocity))
-        if self.radius:
-            at = _rounded(at, tip, self.radius)
+        normal = surface.gradient(tip.position)
+        A = normal[..., None, :] @ tip.jacobian
+        b = -((normal * tip.bias).sum(-1) + surface.curvature(tip.position, tip.velocity))
+        at = self._touching(tip, normal)
         return ConstraintTerms(surface.value(tip.position)[..., None], A, b[..., None], at)
 
-
-def _rounded(center: ContactPoint, tip: MovingPoint, radius: float) -> ContactPoint:
-    """The material point of a ball that touches, from the motion of the ball's centre."""
-    arm = -radius * center.normal
-    J = center.jacobian - kinematics.skew(arm) @ tip.angular_jacobian
-    velocity = center.velocity + torch.linalg.cross(tip.angular_velocity, arm)
-    return ContactPoint(center.position + arm, velocity, J, center.normal)
+    def _touching(self, tip: MovingPoint, normal: Tensor) -> ContactPoint:
+        """The material point that touches."""
+        if not self.radius:
+            return ContactPoint(tip.position, tip.velocity, tip.jacobian, normal)
+        arm = -self.radius * normal
+        return ContactPoint(
+            tip.position + arm,
+            tip.velocity + kinematics.cross(tip.turning, arm),
+            tip.jacobian - kinematics.skew(arm) @ tip.angular,
+            normal,
+        )
 
 
 @dataclass(frozen=True)

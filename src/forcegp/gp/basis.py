@@ -181,7 +181,7 @@ class LatentBasis:
         n, V, prior, missed = points(features[0]), [], [], []
         for part, x in zip(self.parts, features, strict=True):
             values, explained = part.values(x)
-            V.append(values.transpose(0, 1).reshape(n, -1)[:, part.columns])
+            V.append(values.transpose(0, 1).reshape(n, -1).index_select(1, part.columns))
             prior.append(part.rest_variance(x))
             missed.append(prior[-1] - explained)
         return torch.cat(V, dim=-1), torch.cat(prior).mT, torch.cat(missed).mT

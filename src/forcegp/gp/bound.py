@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -127,9 +128,10 @@ class _BoundGradient:
         S = (W.mT @ W).permute(1, 2, 0).contiguous()
         c = (W.mT @ block.target[..., None])[..., 0]
         own: Gradient = {}
-        dV, DV = self._basis_gradient(V, S, c)
+        dV = self._basis_gradient(V, S, c)
         if self.deep:
-            dS = torch.stack([self._by_component(V * DV_l) for DV_l in DV], dim=-1)
+            columns = self.basis.columns
+            dS = torch.stack([self._by_component(V * (V[:, l] @ self.D[l])) for l in columns], dim=-1)
             dS = 0.5 * (dS + dS.mT) + 0.5 * torch.diag_embed(missed)
             dc = -self._by_component(V * self.m)
             dW = 2.0 * W @ dS + block.target[..., None] * dc[:, None, :]
@@ -141,29 +143,26 @@ class _BoundGradient:
             own |= self._through_kernel(p, block.features[p], dV, 0.5 * weight)
         return own
 
-    def _basis_gradient(self, V: Tensor, S: Tensor, c: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Derivative for V `(n, size)`, and D_·l V_l of each component l where they are needed."""
-        owner = self.basis.owner
+    def _basis_gradient(self, V: Tensor, S: Tensor, c: Tensor) -> Tensor:
+        """Derivative for V `(n, size)`."""
+        owner, columns = self.basis.owner, self.basis.columns
         weight = torch.diagonal(S, dim1=0, dim2=1)
-        dV = -self.m * c[:, owner]
-        inducing = self._from_inducing
-        dV[:, inducing] -= V[:, inducing] * weight[:, owner[inducing]]
-        kept = []
-        for l, own in enumerate(self.basis.columns):
-            DV = V[:, own] @ self.D[own]
-            dV += 2.0 * DV * S[:, l].mT[:, owner]
-            if self.deep:
-                kept.append(DV)
-        return dV, kept
+        dV = torch.addcmul(-self.m * c[:, owner], V * self.from_inducing, weight[:, owner], value=-1.0)
+        twice, weighted = 2.0 * S, torch.empty_like(V)
+        for k, own in enumerate(columns):
+            for l, other in enumerate(columns):
+                torch.mul(V[:, other], twice[k, l, :, None], out=weighted[:, other])
+            dV[:, own].addmm_(weighted, self.D[:, own])
+        return dV
 
-    @property
-    def _from_inducing(self) -> Tensor:
-        """The basis functions of inducing points, whose squares are missed no more."""
+    @cached_property
+    def from_inducing(self) -> Tensor:
+        """1 for basis functions of inducing points, whose squares are missed no more, else 0 `(size,)`."""
         chosen = []
         for part in self.basis.parts:
             position = part.columns % max(part.used.shape[1], 1)
             chosen.append(position < part.used.shape[1] - part.finite_size)
-        return torch.cat(chosen).nonzero()[:, 0]
+        return torch.cat(chosen).to(self.m)
 
     def _by_component(self, x: Tensor) -> Tensor:
         """Sums over the basis functions of each component, `(n, components)`."""
@@ -172,9 +171,9 @@ class _BoundGradient:
     def _through_kernel(self, p: int, features: Features, dV: Tensor, weight: Tensor) -> Gradient:
         """Derivatives of one chunk through k(x, Z), φ(x) and k(x, x)."""
         part, prefix = self.basis.parts[p], self.basis.processes[p].prefix
-        filled = dV.new_zeros(part.used.numel(), len(dV))
-        filled[part.columns] = dV[:, self.basis.of_process(p)].mT
-        filled = filled.unflatten(0, part.used.shape).mT
+        filled = dV.new_zeros(len(dV), part.used.numel())
+        filled.index_copy_(1, part.columns, dV[:, self.basis.of_process(p)])
+        filled = filled.unflatten(1, part.used.shape).transpose(0, 1)
         width = filled.shape[-1] - part.finite_size
         params = {key: value.requires_grad_() for key, value in _detached(part.params).items()}
         x = _detached(features)

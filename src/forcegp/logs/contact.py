@@ -125,7 +125,7 @@ def _detect(
         values = evidence.distance(signals, system, contact)
         high = section.threshold if section.threshold is not None else TOUCHING
         low = section.release if section.release is not None else high
-        closed = hysteresis(-values, -high, -low, signals.segment)
+        closed = hysteresis(-np.abs(values), -high, -low, signals.segment)
     else:
         if section.source == "wrench":
             values = evidence.normal_force(signals, system, mapping, contact)
@@ -134,7 +134,7 @@ def _detect(
         high, low = force_levels(values, contact.name, section)
         closed = hysteresis(values, high, low, signals.segment)
     merged = _merge_short(closed, signals, section.shortest)
-    level = {state: _level(values[closed == state]) for state in (True, False)}
+    level = {state: level_and_spread(values[closed == state]) for state in (True, False)}
     spans = [rows for rows in runs(signals.segment, closed) if closed[rows.start]]
     times = tuple((float(signals.t[s.start]), float(signals.t[s.stop - 1])) for s in spans)
     return closed, Evidence(
@@ -160,8 +160,8 @@ def force_levels(values: Array, name: str, section: ContactSection) -> tuple[flo
     with np.errstate(divide="ignore", invalid="ignore"):
         between = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
     high = float(edges[1:][int(np.nanargmax(between[:-1]))])
-    open_level, open_spread = _level(values[values <= high])
-    closed_level, _ = _level(values[values > high])
+    open_level, open_spread = level_and_spread(values[values <= high])
+    closed_level, _ = level_and_spread(values[values > high])
     if not closed_level - open_level > SEPARATION * open_spread:
         raise DataError(
             f"the {section.source} does not show when contact {name!r} is closed",
@@ -199,7 +199,7 @@ def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -
     return count
 
 
-def _level(values: Array) -> tuple[float, float]:
+def level_and_spread(values: Array) -> tuple[float, float]:
     if not len(values):
         return float("nan"), float("nan")
     middle = float(np.median(values))

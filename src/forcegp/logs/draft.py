@@ -89,7 +89,7 @@ class Draft:
         return "\n".join(lines) + "\n"
 
     def _family(self, name: str, family: Family) -> list[str]:
-        named = ["columns", family.by_joint] if family.by_joint else ["column", family.pattern]
+        named: list[object] = ["columns", family.by_joint] if family.by_joint else ["column", family.pattern]
         pairs: list[list[object]] = [named, ["stream", family.stream or None]]
         pairs += [["unit", family.unit], ["sign", None if family.sign == 1.0 else family.sign]]
         if name == "torque" and family.unit in ("A", "mA"):

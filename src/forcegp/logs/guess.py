@@ -6,7 +6,6 @@ torque with the inverse dynamics of the scene's robot, gravity included. What is
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,18 +13,16 @@ import numpy as np
 import torch
 
 from forcegp import dynamics
-from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.errors import DataError
-from forcegp.logs import evidence, headings, smoothing, units
-from forcegp.logs.contact import force_levels
+from forcegp.constraints import ConstrainedSystem
+from forcegp.logs import headings, smoothing, units
 from forcegp.logs.draft import Draft
 from forcegp.logs.gather import gather
+from forcegp.logs.guess_contact import propose_contacts
 from forcegp.logs.mapping import Mapping, parse_mapping
 from forcegp.logs.readers import read
 from forcegp.logs.report import Report
-from forcegp.logs.sections import ContactSection
 from forcegp.logs.signals import Array, Signals
-from forcegp.logs.table import LogTable, Progress, Stream
+from forcegp.logs.table import Progress, Stream
 
 ROWS = 100_000
 """Rows that are looked at."""
@@ -37,8 +34,6 @@ MOST_RADIANS, LEAST_DEGREES = 60.0, 3.2
 """Positions beyond the first are in degrees; below the second, an arm in degrees would hardly move."""
 CLEARER = 1.5
 """A unit is certain if the torque fits so much better than in the other one."""
-LEAST_FORCE = 1.0
-"""A contact that is always closed presses with more than this [N]."""
 NEAR = 1.3
 """A ratio is that of a unit if it is within this factor."""
 
@@ -78,7 +73,7 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
     headings.find_families(stream, system.robot, draft)
     headings.find_wrench(table, system.robot, draft)
     _try(path, draft, system, _possible_units(draft, stream))
-    _contacts(path, table, draft, system)
+    propose_contacts(table, draft, system, lambda: _signals(path, draft, system))
     return Guess(draft.toml(), tuple(draft.doubts))
 
 
@@ -222,35 +217,3 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
             product = float(left[:, 0] @ left[:, 1])
             slopes[i], correlation[i] = product / power[0], product / float(np.sqrt(power[0] * power[1]))
     return slopes, correlation
-
-
-def _contacts(path: str | Path, table: LogTable, draft: Draft, system: ConstrainedSystem) -> None:
-    """How the state of each contact of the scene may be known."""
-    trial: Signals | None = None
-    for contact in system.contacts:
-        name = contact.name
-        column = next(
-            (c for c in table.names if "contact" in c.lower() and (name in c or system.m == 1)), None
-        )
-        if column is not None and np.isin(table.stream_of(column).columns[column], (0.0, 1.0)).all():
-            draft.contacts[name] = ['source = "column"', f"column = {json.dumps(column)}"]
-        elif draft.wrench or not isinstance(contact, SurfaceContact):
-            draft.contacts[name] = ['source = "wrench"' if draft.wrench else 'source = "always"']
-        else:
-            trial = _signals(path, draft, system) if trial is None else trial
-            values = evidence.multiplier(trial, system, contact)
-            source, reason = _state(values, name)
-            draft.contacts[name] = [f'source = "{source}"   # or "multiplier", "distance", "always", "never"']
-            draft.say(f"contact {name}", f"no contact column; {reason}", doubt=True)
-
-
-def _state(values: Array, name: str) -> tuple[str, str]:
-    """Whether λ of the rigid body shows two states, or which one it shows."""
-    middle = float(np.median(values))
-    spread = 1.4826 * float(np.median(np.abs(values - middle)))
-    try:
-        high, low = force_levels(values, name, ContactSection(source="multiplier"))
-    except DataError:
-        source = "always" if middle > max(2.0 * spread, LEAST_FORCE) else "never"
-        return source, f"λ of the rigid body shows one state, {middle:.3g} ± {spread:.2g} N"
-    return "multiplier", f"λ of the rigid body shows two states, parted at {low:.3g} to {high:.3g} N"

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.linalg import lapack
-from torch import Tensor
 
 from forcegp.compiled.mechanics import CompiledMechanics
 from forcegp.constraints import ConstrainedSystem
@@ -23,11 +22,11 @@ from forcegp.constraints.contact import Anchor, Constraint, ContactPoint, Moving
 from forcegp.constraints.gauss import RANK_TOLERANCE
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import ToolMotion, tool_motion
-from forcegp.dynamics import damping_force
 from forcegp.errors import MissingDependencyError
+from forcegp.friction import JointFriction
 
 Vector = NDArray[np.floating]
-Blocks = Callable[[Tensor, Tensor], Sequence[Tensor]]
+Blocks = Callable[[Vector, Vector], Sequence[Vector]]
 """M, Q_C and Q_G at a state, then rotation, position, Jacobian and bias acceleration of each point."""
 POINT = 4
 
@@ -97,17 +96,14 @@ class Mechanics:
         self._anchors = [tool, *(a for contact in system.contacts for a in contact.anchors if a != tool)]
         self._places = [[self._anchors.index(a) for a in contact.anchors] for contact in system.contacts]
         self._rows = np.array([contact.rows for contact in system.contacts], dtype=int)
+        self._friction = JointFriction.of(system.robot)
         self._blocks, self.compiled = _blocks(system, self._anchors)
 
     def equations(self, q: Vector, qd: Vector, active: NDArray[np.bool_] | None = None) -> StateEquations:
         """The equations of motion at a state `(nq,)`; `active` `(n_contacts,)` defaults to all."""
-        state = torch.from_numpy(q), torch.from_numpy(qd)
-        M, Q_C, Q_G, *points = self._blocks(*state)
+        M, Q_C, Q_G, *points = self._blocks(q, qd)
         frames = [points[i : i + POINT] for i in range(0, len(points), POINT)]
-        qd_ = state[1]
-        moving = [
-            MovingPoint(p, J[3:] @ qd_, bias[3:], J[3:], J[:3] @ qd_, J[:3]) for _, p, J, bias in frames
-        ]
+        moving = [_moving_point(p, J, bias[3:], qd) for _, p, J, bias in frames]
         found = [
             contact.terms_of([moving[k] for k in places])
             for contact, places in zip(self.contacts, self._places, strict=True)
@@ -120,20 +116,25 @@ class Mechanics:
         if self._system.baumgarte is not None:
             b = self._system.baumgarte.stabilized(*(torch.from_numpy(x) for x in (b, c, cd))).numpy()
         rows = np.ones(len(b)) if active is None else np.repeat(active, self._rows)
-        Q_C, Q_D = Q_C.numpy(), damping_force(self._system.robot, state[1]).numpy()
-        rotation, position, jacobian, bias = (x.numpy() for x in frames[0])
+        Q_D = self._friction.force(torch.from_numpy(qd)).numpy()
+        rotation, position, jacobian, bias = frames[0]
         return StateEquations(
-            M=M.numpy(),
+            M=M,
             A=A * rows[:, None],
             b=b * rows,
             c=c,
             cd=cd,
             Q_C=Q_C,
             Q_D=Q_D,
-            Q_K=Q_C + Q_G.numpy() + Q_D,
+            Q_K=Q_C + Q_G + Q_D,
             contact_points=_contact_points(self.contacts, found),
             tool=ToolMotion(rotation, position, jacobian @ qd, jacobian, bias),
         )
+
+
+def _moving_point(position: Vector, jacobian: Vector, bias: Vector, qd: Vector) -> MovingPoint:
+    """The motion of a point as the constraints read it, in tensors."""
+    return MovingPoint.of(*(torch.from_numpy(x) for x in (position, jacobian, bias, qd)))
 
 
 def _contact_points(contacts: Sequence[Constraint], found: Sequence) -> dict[str, ContactPoint]:
@@ -148,10 +149,11 @@ def _blocks(system: ConstrainedSystem, anchors: Sequence[Anchor]) -> tuple[Block
     except MissingDependencyError:
         pass
 
-    def eager(q: Tensor, qd: Tensor) -> Sequence[Tensor]:
-        eom = system.equations(q, qd)
-        tools = [tool_motion(system.robot, eom.poses, eom.motion, qd, *anchor) for anchor in anchors]
+    def eager(q: Vector, qd: Vector) -> Sequence[Vector]:
+        state = torch.from_numpy(q), torch.from_numpy(qd)
+        eom = system.equations(*state)
+        tools = [tool_motion(system.robot, eom.poses, eom.motion, state[1], *anchor) for anchor in anchors]
         points = [x for t in tools for x in (t.rotation, t.position, t.jacobian, t.bias)]
-        return [eom.M, eom.Q_C, eom.Q_G, *points]
+        return [x.numpy() for x in (eom.M, eom.Q_C, eom.Q_G, *points)]
 
     return eager, False

@@ -117,7 +117,9 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, st
     numbers = sum(is_number(f, decimal) and f != "" for fields in after for f in fields) / len(after)
     # A comma inside a number must not be taken for a separator, nor a separator for a decimal mark.
     preferred = 0.01 if decimal == "." else 0.0
-    return (numbers + preferred if same == 1.0 else 0.0), separator, decimal, first
+    # Two decimal commas split two columns into three fields, of which "1;1" is no number.
+    left_over = min(0.1 * (width - numbers), 0.5 * numbers)
+    return (numbers + preferred - left_over if same == 1.0 else 0.0), separator, decimal, first
 
 
 def _numeric(fields: list[str], decimal: str) -> bool:
