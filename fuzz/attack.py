@@ -103,7 +103,9 @@ def one_target(target: str, engine: str, inputs: int, seed: int) -> bool:
     if current.exists():
         data = current.read_bytes()
         current.rename(current.with_name(f"finding-{hashlib.sha256(data).hexdigest()[:12]}"))
-    print(f"[attack] {target}: FINDING after {took}\n{done.stderr[:1500]} … {done.stderr[-1500:]}", flush=True)
+    print(
+        f"[attack] {target}: FINDING after {took}\n{done.stderr[:1500]} … {done.stderr[-1500:]}", flush=True
+    )
     return False
 
 
