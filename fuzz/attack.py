@@ -1,7 +1,7 @@
 """Feed every reader mutated files, and report each that does not end in an answer.
 
-    python fuzz/attack.py --inputs 20000                    every target, coverage-guided where atheris is installed
-    python fuzz/attack.py --inputs 20000 --engine mutate    by random mutation alone
+    python fuzz/attack.py --inputs 20000                  every target, by coverage where atheris is installed
+    python fuzz/attack.py --inputs 20000 --engine mutate  by random mutation alone
     python fuzz/attack.py --target csv --input FILE         one input, with its traceback
 
 A finding is a raw exception, a crash, more than 5 s, or more than 1 GiB; it is written to

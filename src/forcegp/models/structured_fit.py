@@ -16,8 +16,8 @@ from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import CONTACT, JOINT, ForcePrior
-from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states, stack
 from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states, stack
 from forcegp.forces.samples import draw_samples
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
