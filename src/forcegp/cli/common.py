@@ -84,19 +84,6 @@ def data_of_robot(data: Dataset, robot: RobotModel) -> Dataset:
     return data
 
 
-def noise_std_of(option: float | None, scene: Scene, data: Dataset) -> float:
-    """The noise on q̈ that a model is told: the option, else the scene's, else what the data say.
-
-    Raises:
-        DataError: nobody says.
-    """
-    from forcegp.errors import DataError
-
-    for value in (option, scene.noise_std, data.header.noise_std):
-        if value is not None:
-            return value
-    raise DataError(
-        "the noise of the accelerations is not known",
-        expected="a standard deviation [rad/s²]",
-        hint="pass --noise-std, or set noise_std under [model] in the scene",
-    )
+def noise_std_of(option: float | None, scene: Scene) -> float | None:
+    """The noise of accelerations that a model is told: the option, else the scene's, else what the log states."""
+    return option if option is not None else scene.noise_std

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,19 +20,32 @@ from forcegp.cli.common import (
     show,
 )
 
+if TYPE_CHECKING:
+    from forcegp.models.base import Model
+
 
 def fit(
     scene: SceneName,
     data: DataFile,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fitted model.")],
     model: Annotated[
-        str, typer.Option("--model", "-m", help="analytical, nn, gp, sgp-zero or sgp-mean.")
+        str,
+        typer.Option(
+            "--model",
+            "-m",
+            help="analytical, nn, gp, sgp-zero, sgp-mean, sgp-contact or sgp-real; with the paper's kernel "
+            "sgp-zero-se, sgp-mean-se or sgp-contact-se.",
+        ),
     ] = "sgp-mean",
     noise_std: Annotated[
         float | None,
         typer.Option(help="Noise on accelerations in rad/s²; default: the scene's or the data's."),
     ] = None,
     differentiate: Differentiate = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(help="File that records a long fit; a fit that finds it resumes there."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of random initial values.")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -44,20 +57,46 @@ def fit(
 
     forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model/ --json
     """
+    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.models.registry import create
     from forcegp.scene import load_scene
+    from forcegp.storage.folder import HEADER_FILE
 
+    check_destination(out, folder=True, own_files=[HEADER_FILE])
     read = load_scene(scene)
     system = read.system()
     training = data_of_robot(read_data(data, differentiate), system.robot)
-    from forcegp.models.registry import create
-
-    regression = create(model, system, noise_std=noise_std_of(noise_std, read, training), seed=seed)
+    regression = create(model, system, noise_std=noise_std_of(noise_std, read), seed=seed)
+    settings: dict[str, Any] = {} if checkpoint is None else _resumable(regression, checkpoint)
     with progress_bar(f"fitting {model}", 1) as progress:
-        result = regression.fit(
-            training, progress=lambda done, most, value: progress(done, most, f"objective {value:.4g}")
+        fitted = regression.fit(
+            training,
+            progress=lambda done, most, value: progress(done, most, f"objective {value:.4g}"),
+            **settings,
         )
-    regression.save(out)
-    if not result.converged:
-        typer.secho(f"warning: the fit did not converge: {result.message}", fg="yellow", err=True)
-    figures = {name: value for name, value in asdict(result.result).items() if name != "history"}
+    write_or_keep(fitted.save, out)
+    if checkpoint is not None:
+        checkpoint.unlink(missing_ok=True)
+    if not fitted.converged:
+        typer.secho(f"warning: the fit did not converge: {fitted.message}", fg="yellow", err=True)
+    for doubt in fitted.result.warnings:
+        typer.secho(f"warning: {doubt}", fg="yellow", err=True)
+    figures = {name: value for name, value in asdict(fitted.result).items() if name != "history"}
     show({"model": model, "training_points": len(training), **figures, "folder": str(out)}, as_json)
+
+
+def _resumable(regression: Model, checkpoint: Path) -> dict[str, Any]:
+    """What makes the fit of a structured GP record itself.
+
+    Raises:
+        ModelError: the model has no checkpoints.
+    """
+    from forcegp.errors import ModelError
+    from forcegp.models.structured_gp import StructuredGP
+
+    if not isinstance(regression, StructuredGP):
+        raise ModelError(
+            f"a {regression.kind!r} model cannot be resumed",
+            hint="leave out --checkpoint, or use a structured GP",
+        )
+    return {"checkpoint": checkpoint, "keep_checkpoint": True}

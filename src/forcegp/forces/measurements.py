@@ -83,6 +83,21 @@ class Measurement:
         return Measurement(self.quantity, *(part[rows] for part in (*self.tensors, self.segment)))
 
 
+def is_simulated(data: Dataset | Sequence[Observation]) -> bool:
+    """Whether a simulator made the data: only simulators state a seed or know noise-free accelerations."""
+    logs = [data] if isinstance(data, Dataset) else [observation.data for observation in data]
+    return any(log.header.seed is not None or "qdd_clean" in log.extras for log in logs)
+
+
+def states_noise(data: Dataset | Sequence[Observation]) -> bool:
+    """Whether the data state the noise of their accelerations."""
+    pairs = [(data, None)] if isinstance(data, Dataset) else [(o.data, o.noise_std) for o in data]
+    return all(
+        noise is not None or log.header.noise_std is not None or "qdd_std" in log.extras
+        for log, noise in pairs
+    )
+
+
 def _by_contact(name: str) -> Callable[[Dataset, ConstrainedSystem], Tensor]:
     def values(data: Dataset, system: ConstrainedSystem) -> Tensor:
         logged = data.contact_extras.get(name, {})

@@ -9,7 +9,7 @@ from typing import Any
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
 from forcegp.forces.measurements import NoiseStd
-from forcegp.forces.priors.default import PAPER, contact_priors, default_priors
+from forcegp.forces.priors.default import PAPER, contact_priors, default_priors, measured_priors
 from forcegp.gp.kernels import Kernel
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import Model
@@ -31,29 +31,35 @@ class Entry:
     make: Callable[..., Model]
 
 
-def _analytical(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+def _analytical(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
     return AnalyticalModel(system, seed=seed, **options)
 
 
-def _network(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+def _network(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
     return NeuralNetwork(system, seed=seed, **options)
 
 
-def _independent(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+def _independent(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
     return IndependentGP(system, noise_std=noise_std, **options)
 
 
 def _structured(mean: str, kernel: Kernel | None = None) -> Callable[..., Model]:
-    def make(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+    def make(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
         options = {"mean": mean} | options
-        options.setdefault("force_priors", default_priors(system, options["mean"], kernel))
+        if kernel is not None:
+            options.setdefault("force_priors", default_priors(system, options["mean"], kernel))
         return StructuredGP(system, noise_std=noise_std, **options)
 
     return make
 
 
+def _measured(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
+    options = {"mean": "analytical", "force_priors": measured_priors(system)} | options
+    return StructuredGP(system, noise_std=noise_std, **options)
+
+
 def _contact(kernel: Kernel | None = None) -> Callable[..., Model]:
-    def make(system: ConstrainedSystem, noise_std: NoiseStd, seed: int, **options: Any) -> Model:
+    def make(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
         options = {"mean": "analytical", "force_priors": contact_priors(system, kernel)} | options
         return StructuredGP(system, noise_std=noise_std, **options)
 
@@ -69,20 +75,23 @@ MODELS: dict[str, Entry] = {
     "sgp-zero-se": Entry("sgp-zero with the paper's kernel alone", _structured("zero", PAPER)),
     "sgp-mean-se": Entry("sgp-mean with the paper's kernel alone", _structured("analytical", PAPER)),
     "sgp-contact": Entry("structured GP with mean and a prior on the contact's friction alone", _contact()),
+    "sgp-real": Entry(
+        "structured GP for measured robots: joint and contact friction, torque noise", _measured
+    ),
     "sgp-contact-se": Entry("the same with any tangential force and the paper's kernel", _contact(PAPER)),
 }
 """The models, simplest first."""
 
 
 def create(
-    name: str, system: ConstrainedSystem, *, noise_std: NoiseStd = 0.1, seed: int = 0, **options: Any
+    name: str, system: ConstrainedSystem, *, noise_std: NoiseStd | None = None, seed: int = 0, **options: Any
 ) -> Model:
     """An unfitted model by its short name.
 
     Args:
         name: a key of `MODELS`.
         system: robot and contacts.
-        noise_std: of measured accelerations [rad/s², m/s²], for models that have one.
+        noise_std: of measured accelerations [rad/s², m/s²], for models that have one; default what the log states.
         seed: of random initial values, for models that have any.
         options: further arguments of the model's class.
 

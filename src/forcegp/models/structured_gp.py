@@ -39,9 +39,10 @@ class StructuredGP(Model[StructuredFit]):
     Args:
         system: robot and contacts.
         mean: `"zero"`, `"analytical"`, or an `AnalyticalMean` with some terms left out.
-        force_priors: priors on the unknown forces; by default `default_priors`: a `JointForcePrior`, and in
-            contact its `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of
-            multipliers honest.
+        force_priors: priors on the unknown forces. The default depends on the mean and on the data: around the
+            analytical forces of a measured robot, `measured_priors` (friction of each joint and contact, noise
+            of the torque); else `default_priors`: a `JointForcePrior`, and in contact its `NormalForcePrior`,
+            which changes no acceleration but keeps the uncertainty of multipliers honest.
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states (`qdd_std` by sample, else its header), else 0.1.
         learn_noise: whether the noise is a hyperparameter too, starting from `noise_std`.
@@ -79,6 +80,7 @@ class StructuredGP(Model[StructuredFit]):
             analytical_parameters,
             torque_noise_of(torque_noise, priors),
             check_method(inference),
+            force_priors is None and torque_noise == "auto" and "actuation" in form.terms,
         )
 
     @classmethod
@@ -138,6 +140,8 @@ class StructuredGP(Model[StructuredFit]):
             ModelError, DataError, UnknownNameError: the data, or the checkpoint, do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
+        if self._fitted is None:
+            self.specification = self.specification.for_data(data)
         spec = self.specification
         options = options or (LearningOptions() if spec.parameters is None else WITH_PARAMETERS)
         chosen = self._chosen(learn)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -11,13 +12,15 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.learn import Problem, analytical_parameters
 from forcegp.forces.mean import AnalyticalMean
-from forcegp.forces.measurements import NoiseStd, Training
+from forcegp.forces.measurements import NoiseStd, Observation, Training, is_simulated, states_noise
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.default import measured_priors
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
@@ -66,6 +69,7 @@ class Specification:
         parameters: module whose `forward()` gives the robot at θ_A, or `None`.
         torque_noise: standard deviation of the motor torque's white noise, `"learn"`, or `None` for none.
         inference: `"auto"`, `"exact"` or `"sparse"`.
+        automatic: whether the priors depend on whether the data are simulated or measured.
     """
 
     system: ConstrainedSystem
@@ -76,6 +80,21 @@ class Specification:
     parameters: nn.Module | None = None
     torque_noise: NoiseStd | str | None = None
     inference: str = "auto"
+
+    automatic: bool = False
+
+    def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
+        """The specification with what was left to the data filled in.
+
+        Around the analytical forces of a measured robot the default priors are `measured_priors`. The noise of
+        accelerations is learned with that of the torque where nobody states it.
+        """
+        spec = self
+        if spec.automatic and not is_simulated(data):
+            spec = dataclasses.replace(spec, priors=measured_priors(spec.system), torque_noise="learn")
+        if spec.learns_torque_noise and spec.noise_std is None and not states_noise(data):
+            spec = dataclasses.replace(spec, learn_noise=True)
+        return dataclasses.replace(spec, automatic=False)
 
     @property
     def learns_torque_noise(self) -> bool:

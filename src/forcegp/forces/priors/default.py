@@ -7,6 +7,7 @@ from forcegp.forces.mean import AnalyticalMean, mean_of
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.gp.kernels import Kernel, Linear
@@ -36,6 +37,18 @@ def default_priors(
     """
     joint = JointForcePrior(kernel or (REMAINING if "actuation" in mean_of(mean).terms else WHOLE))
     return (joint, NormalForcePrior(joint)) if system.m else (joint,)
+
+
+def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
+    """Priors for a robot that is measured: friction of each joint, and of each contact with a surface.
+
+    None of them reads the motor torque. The torque noise that goes with them is learned.
+
+    Args:
+        system: robot and contacts.
+    """
+    surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
+    return (JointFrictionPrior(), *(SlidingFrictionPrior(name) for name in surfaces))
 
 
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
