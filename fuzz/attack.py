@@ -1,7 +1,7 @@
 """Feed every reader mutated files, and report each that does not end in an answer.
 
-    python fuzz/attack.py --inputs 20000                    every target, coverage-guided where atheris is installed
-    python fuzz/attack.py --inputs 20000 --engine mutate    by random mutation alone
+    python fuzz/attack.py --inputs 20000                  every target, by coverage where atheris is installed
+    python fuzz/attack.py --inputs 20000 --engine mutate  by random mutation alone
     python fuzz/attack.py --target csv --input FILE         one input, with its traceback
 
 A finding is a raw exception, a crash, more than 5 s, or more than 1 GiB; it is written to
@@ -103,7 +103,9 @@ def one_target(target: str, engine: str, inputs: int, seed: int) -> bool:
     if current.exists():
         data = current.read_bytes()
         current.rename(current.with_name(f"finding-{hashlib.sha256(data).hexdigest()[:12]}"))
-    print(f"[attack] {target}: FINDING after {took}\n{done.stderr[:1500]} … {done.stderr[-1500:]}", flush=True)
+    print(
+        f"[attack] {target}: FINDING after {took}\n{done.stderr[:1500]} … {done.stderr[-1500:]}", flush=True
+    )
     return False
 
 

@@ -102,7 +102,11 @@ TARGETS: dict[str, Callable[[bytes, Path], None]] = {
 
 def seeds(name: str) -> list[bytes]:
     """The kept inputs of a target: valid files, and what was once a finding."""
-    return [path.read_bytes() for path in sorted((CORPORA / name).iterdir()) if path.is_file()]
+    return [
+        path.read_bytes()
+        for path in sorted((CORPORA / name).iterdir())
+        if path.is_file() and path.name != ".current"
+    ]
 
 
 def run_one(name: str, data: bytes) -> str:
