@@ -138,9 +138,10 @@ class SurfaceContact(Constraint):
         ParameterError: the radius is negative, or the surface is not a signed distance.
 
     Example:
-        >>> tip = SurfaceContact("table", "tool0", (0.0, 0.0, 0.08), Plane(offset=0.05), radius=0.015)
-        >>> tip.center_surface
-        Plane(normal=(0.0, 0.0, 1.0), offset=0.065)
+        >>> from forcegp import Plane
+        >>> tip = SurfaceContact("table", "tool0", (0.0, 0.0, 0.08), Plane(offset=0.05), radius=0.01)
+        >>> round(tip.center_surface.offset, 3)
+        0.06
     """
 
     name: str
