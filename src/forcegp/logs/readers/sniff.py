@@ -105,7 +105,7 @@ def _decode(path: Path, head: bytes) -> tuple[str, str]:
 
 
 def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, str, int]:
-    """How well a separator and a decimal mark explain the lines: fields that are numbers, over lines."""
+    """How well a separator and a decimal mark explain the lines: fields with a value, times their share."""
     kept = [(i, split(line, separator)) for i, line in enumerate(lines) if line.strip()]
     rows = [(i, fields) for i, fields in kept if _numeric(fields, decimal)]
     if not rows:
