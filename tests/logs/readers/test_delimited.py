@@ -66,6 +66,12 @@ def test_text_flags_dates_and_gaps(tmp_path: Path) -> None:
     assert np.isnan(columns["gap"][3]) and np.isfinite(columns["gap"]).sum() == 9
 
 
+def test_decimal_commas_are_not_separators(tmp_path: Path) -> None:
+    """Two columns, where splitting at commas gives more fields that are numbers."""
+    path = written(tmp_path, "t;q\n0,0;1,5\n0,1;1,75\n")
+    assert read(path).streams[0].columns["q"].tolist() == [1.5, 1.75]
+
+
 def test_only_the_columns_and_rows_that_are_wanted(tmp_path: Path) -> None:
     path = written(tmp_path, "\n".join(["t,a,b", *lines(",")]))
     table = read(path, wanted=lambda name: name != "a", rows=7)

@@ -105,7 +105,7 @@ def _decode(path: Path, head: bytes) -> tuple[str, str]:
 
 
 def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, str, int]:
-    """How well a separator and a decimal mark explain the lines: fields that are numbers, over lines."""
+    """How well a separator and a decimal mark explain the lines: fields with a value, times their share."""
     kept = [(i, split(line, separator)) for i, line in enumerate(lines) if line.strip()]
     rows = [(i, fields) for i, fields in kept if _numeric(fields, decimal)]
     if not rows:
@@ -114,12 +114,15 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, st
     after = [fields for i, fields in kept if i >= first][:SAMPLE_LINES]
     width = len(after[0])
     same = sum(len(fields) == width for fields in after) / len(after)
-    numbers = sum(is_number(f, decimal) and f != "" for fields in after for f in fields) / len(after)
-    # A comma inside a number must not be taken for a separator, nor a separator for a decimal mark.
+    values = sum(_is_value(f, decimal) for fields in after for f in fields) / len(after)
+    # A comma inside numbers, taken for a separator, leaves fields such as "5;2" that are no values.
     preferred = 0.01 if decimal == "." else 0.0
-    # Two decimal commas split two columns into three fields, of which "1;1" is no number.
-    left_over = min(0.1 * (width - numbers), 0.5 * numbers)
-    return (numbers + preferred - left_over if same == 1.0 else 0.0), separator, decimal, first
+    return (values**2 / width + preferred if same == 1.0 else 0.0), separator, decimal, first
+
+
+def _is_value(field: str, decimal: str) -> bool:
+    known = bool(_DATE.match(field)) or field.lower() in ("true", "false")
+    return field != "" and (known or is_number(field, decimal))
 
 
 def _numeric(fields: list[str], decimal: str) -> bool:
