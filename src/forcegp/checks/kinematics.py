@@ -24,6 +24,10 @@ TOLERANCE = 0.05
 """A slope within this of 1 is right: filters and uneven clocks cost a few percent."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
+EXCHANGED = 0.9
+"""Correlation with another joint's rate from which columns are exchanged."""
+CLEARLY = 5.0
+"""Factor of unexplained variance by which that order must be better."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
 """Seconds over the unit of a clock in ns, µs, ms or ks."""
 UNIT_TOLERANCE = 0.1
@@ -197,7 +201,10 @@ def _permutation(level: Match) -> np.ndarray | None:
         return None
     fits = alike[np.arange(len(order)), order][moved & level.moving]
     own = level.correlation[moved & level.moving]
-    return order if len(fits) and fits.min() > 0.95 and own.max() < RELATED else None
+    if not len(fits) or fits.min() < EXCHANGED:
+        return None
+    # Joints that move together are alike in any order; the right one leaves far less unexplained.
+    return order if ((1.0 - own**2) > CLEARLY * (1.0 - fits**2)).all() else None
 
 
 def _follow(log: Log, permutation: np.ndarray) -> Array:

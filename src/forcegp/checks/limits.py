@@ -98,8 +98,8 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
             at = (tau == extreme) & log.usable
             near = np.abs(usable - extreme) <= 0.01 * np.ptp(usable)
             runs = [(a, b) for a, b in intervals(at) if b - a >= CLIPPED_RUN]
-            levels = len(np.unique(usable[near]))
-            if runs and at.sum() > OFTENER * near.sum() / levels and extreme != 0.0:
+            others = (near.sum() - at.sum()) / max(len(np.unique(usable[near])) - 1, 1)
+            if runs and at.sum() > OFTENER * max(others, 1.0) and extreme != 0.0:
                 for a, b in runs:
                     clipped[a:b, j] = True
     if not clipped.any():
