@@ -1,4 +1,5 @@
-"""Friction of joints, inertial parameters and torque noise, learned from logs of a robot that is not its file."""
+"""Friction of joints, inertial parameters and torque noise, learned from logs of a robot that is not its
+file."""
 
 from __future__ import annotations
 

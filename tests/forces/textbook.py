@@ -25,6 +25,12 @@ def covariance(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict) ->
         right = covariance(kernel.right, sub(params, "right"), x1, x2)
         return left * right if isinstance(kernel, Product) else left + right
     a, b = (torch.cat([x[name] for name in kernel.inputs or tuple(x)], dim=-1) for x in (x1, x2))
+    if a.ndim == 3:  # Each component has inputs of its own.
+        one = [
+            covariance(kernel, {n: v[k : k + 1] for n, v in params.items()}, {"x": a[:, k]}, {"x": b[:, k]})
+            for k in range(a.shape[1])
+        ]
+        return torch.cat(one)
     if isinstance(kernel, Linear):
         slopes, bias = params["log_slope_std"].exp() ** 2, params["log_bias_std"].exp() ** 2
         if kernel.shared:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError
-from forcegp.forces.learn import kernel_parameters
+from forcegp.forces.inference import force_posterior
+from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
@@ -83,7 +84,10 @@ def _check_types(tensors: Mapping[str, Tensor]) -> None:
     """Raise `ValueError` where a tensor is not of real numbers, or contacts are not flags."""
     for name, value in tensors.items():
         is_flag = name.startswith("data.") and name.endswith(".active")
-        fits = value.dtype == torch.bool if is_flag else value.is_floating_point()
+        is_count = name.startswith(("sparse.", "central.")) and name.endswith((".components", ".dropped"))
+        fits = value.is_floating_point()
+        if is_flag or is_count:
+            fits = value.dtype == (torch.bool if is_flag else torch.int64)
         if not fits:
             raise ValueError(f"tensor {name!r} has type {value.dtype}")
 
@@ -139,17 +143,9 @@ def _restored(
         power=settings.power,
         offsets=_below(tensors, "offset."),
         torque_std=tensors.get("torque_std"),
+        pinned=settings.pinned,
     )
-    params = kernel_parameters(hyper)
-    if "alpha" in tensors:
-        blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
-        rows = sum(block.rows for block in blocks)
-        if alpha.shape != (rows,):
-            raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
-        latent = ExactPosterior(problem.priors, params, blocks, alpha)
-    else:
-        latent = posterior_of_tensors(problem.priors, params, _below(tensors, "sparse."))
-    posterior = ForcePosterior(problem.priors, training.scales, problem.mean, latent, problem.offsets)
+    posterior = _posterior(problem, hyper, tensors)
     constant = tuple(
         f"{p.name}.{name}"
         for p, scale in zip(spec.priors, training.scales, strict=True)
@@ -157,3 +153,21 @@ def _restored(
     )
     result = FitResult(**settings.result.model_dump(), constant_inputs=constant)
     return StructuredFit(spec, problem, hyper, posterior, result, system)
+
+
+def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str, Tensor]) -> ForcePosterior:
+    """The posterior with its weights or sums as they were."""
+    scales, params = problem.training.scales, kernel_parameters(hyper)
+    if "alpha" not in tensors:
+        kept = {name: _below(tensors, name + ".") for name in ("sparse", "central")}
+        latent = posterior_of_tensors(problem.priors, params, kept["sparse"])
+        central = posterior_of_tensors(problem.priors, params, kept["central"]) if kept["central"] else None
+        return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central)
+    blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
+    rows = sum(block.rows for block in blocks)
+    if alpha.shape != (rows,):
+        raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
+    if problem.pinned:
+        return force_posterior(problem, hyper)
+    latent = ExactPosterior(problem.priors, params, blocks, alpha)
+    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets)

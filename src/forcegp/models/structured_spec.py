@@ -154,6 +154,7 @@ class StructuredSettings(Settings):
     inference: Literal["auto", "exact", "sparse"]
     power: float = Field(gt=0.0, le=1.0)
     priors: tuple[dict[str, Any], ...]
+    pinned: tuple[str, ...]
     measured: tuple[str, ...]
     constant: tuple[tuple[str, ...], ...]
     analytical: dict[str, tuple[str, ...]] | None
@@ -189,7 +190,8 @@ def pack(
         torque_noise=_plain(spec.torque_noise),
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
         power=problem.power,
-        priors=tuple(encode(prior, CLASSES) for prior in spec.priors),
+        priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
+        pinned=problem.pinned,
         measured=training.quantities if exact else (),
         constant=tuple(scale.constant for scale in training.scales),
         analytical=None if own is None else own.joints,
@@ -204,6 +206,9 @@ def pack(
     else:
         assert isinstance(latent, SparsePosterior)
         tensors |= {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
+        if isinstance(posterior.central, SparsePosterior):
+            own_means = tensors_of_posterior(posterior.central)
+            tensors |= {f"central.{name}": value for name, value in own_means.items()}
     start = own.start if own is not None else spec.system.robot
     tensors |= {f"start.{name}": getattr(start, name) for name in robot_tensors(start)}
     for prior, scale in zip(spec.priors, training.scales, strict=True):

@@ -120,7 +120,7 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
         or kinds.is_fixed_size_list(values.type)
     ):
         return {name: pc.cast(values, pa.float64(), safe=False).to_numpy(zero_copy_only=False)}
-    lengths = pc.list_value_length(values).to_numpy(zero_copy_only=False)
+    lengths = pc.call_function("list_value_length", [values]).to_numpy(zero_copy_only=False)
     width = int(lengths[0]) if len(lengths) and lengths[0] == lengths[0] else 0
     if len(lengths) and not (lengths == width).all():
         row = int(np.flatnonzero(lengths != width)[0])
