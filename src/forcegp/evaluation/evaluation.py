@@ -160,7 +160,7 @@ def evaluate(
         uncertainty=spread,
         residual=float(residual.mean()) if len(residual) else None,
         residual_max=float(residual.max()) if len(residual) else None,
-        noise_std=None if noise_std is None else tuple(noise_std.tolist()),
+        noise_std=None if noise_std is None else tuple(noise_std.square().mean(0).sqrt().tolist()),
         seconds_per_state=predicted.seconds / len(data),
         predictors=scores,
         verdicts=verdicts(scores, data.joint_names) if scores else (),

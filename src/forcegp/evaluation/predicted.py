@@ -25,7 +25,7 @@ class Predicted:
 
     Attributes:
         mean, variance: `(n, nq)`; no variance for a model without a covariance.
-        noise_std: `(nq,)` assumed for measured accelerations, if known.
+        noise_std: `(n, nq)` assumed for measured accelerations, if known; noise of the torque included.
         residual: `(k,)` |A q̈ − b| of all rows of closed contacts.
         seconds: time taken.
     """
@@ -74,9 +74,12 @@ def _residual(system: ConstrainedSystem, data: Dataset, rows: slice, qdd: Tensor
 
 
 def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
-    """The noise that the model assumes for measured accelerations, or the data's, `(nq,)`."""
+    """The noise that the model assumes for measured accelerations, or the data's, `(n, nq)`."""
     if isinstance(model, StructuredGP):
-        return model.fitted.problem.noise_at(model.hyperparameters, 0)
+        active = data.active(model.system.contact_names)
+        return model.fitted.noise_variance(data.q, data.qd, data.tau, active=active).sqrt()
     noise = getattr(model, "noise_std", None)
     noise = data.header.noise_std if noise is None else noise
-    return None if noise is None else torch.as_tensor(noise, dtype=data.dtype).expand(data.nq).to(data.device)
+    if noise is None:
+        return None
+    return torch.as_tensor(noise, dtype=data.dtype, device=data.device).expand(len(data), data.nq)

@@ -42,7 +42,8 @@ class StructuredFit(FittedModel):
         hyperparameters: all learned tensors, by name.
         posterior: over latent forces.
         result: how the fit went.
-        system: robot and contacts, with learned θ_A.
+        system: robot and contacts, with learned parameters.
+        noise: standard deviation of a measurement of each measured quantity, `(d,)`.
     """
 
     specification: Specification
@@ -51,6 +52,7 @@ class StructuredFit(FittedModel):
     posterior: ForcePosterior
     result: FitResult
     system: ConstrainedSystem
+    noise: Mapping[str, Tensor]
 
     kind = KIND
     has_function_samples = True
@@ -120,7 +122,10 @@ class StructuredFit(FittedModel):
         return draw_samples(self.posterior, samples, generator, FEATURES).total_force
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
-        return pack(self.specification, self.problem, self.hyperparameters, self.posterior, self.result)
+        settings, tensors = pack(
+            self.specification, self.problem, self.hyperparameters, self.posterior, self.result
+        )
+        return settings, tensors | {f"noise_std.{name}": std for name, std in self.noise.items()}
 
     @property
     def torque_std(self) -> Tensor | None:
@@ -135,14 +140,29 @@ class StructuredFit(FittedModel):
         noise = z.o.new_zeros(*z.o.shape, z.o.shape[-1])
         if self.torque_std is not None:
             noise = noise + (z.B_Q * self.torque_std**2) @ z.B_Q.mT
-        for i, quantity in enumerate(self.training.quantities):
-            if quantity in parts:
-                std = self.problem.noise_at(self.hyperparameters, i)
-                std = std if std.ndim == 1 else std.square().mean(0).sqrt()
+        for quantity, rows in parts.items():
+            if quantity in self.noise:
                 own = torch.zeros_like(z.o[0])
-                own[parts[quantity]] = std**2
+                own[rows] = self.noise[quantity] ** 2
                 noise = noise + torch.diag(own)
         return noise
+
+    @torch.no_grad()
+    def noise_variance(
+        self, q: Tensor, qd: Tensor, tau: Tensor, quantity: str = "qdd", active: Tensor | None = None
+    ) -> Tensor:
+        """Variance that a measurement of a quantity adds to its prediction, `(*batch, d)`.
+
+        Args:
+            q, qd, tau: `(*batch, nq)` states.
+            quantity: what is measured; the noise of the torque reaches every quantity, that of the sensor is
+                known for quantities that the model was fitted to.
+            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+        """
+        flat = flat_states(self.system, q, qd, tau, active)
+        z, parts = stack(affine_maps(self.system, flat.at(self.system), quantity))
+        noise = self._noise_covariance(z, parts).diagonal(dim1=-2, dim2=-1)
+        return noise.reshape(*flat.batch, z.o.shape[-1])
 
 
 def learned_system(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> ConstrainedSystem:
@@ -186,7 +206,18 @@ def conditioned(
         force_correlation=_mean_correlation(posterior, system, problem.training),
         warnings=(*warnings, *_warnings(jitter)),
     )
-    return StructuredFit(specification, problem, hyperparameters, posterior, result, system)
+    noise = typical_noise(problem, hyperparameters)
+    return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)
+
+
+def typical_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Standard deviation of a measurement of each measured quantity, `(d,)`; the last one where two measure
+    it."""
+    found = {}
+    for i, quantity in enumerate(problem.training.quantities):
+        std = problem.noise_at(hyperparameters, i)
+        found[quantity] = std if std.ndim == 1 else std.square().mean(0).sqrt()
+    return found
 
 
 def _constant_inputs(priors: Sequence[ForcePrior], training: Training) -> tuple[str, ...]:

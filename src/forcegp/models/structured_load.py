@@ -152,7 +152,8 @@ def _restored(
         for name in scale.constant
     )
     result = FitResult(**settings.result.model_dump(), constant_inputs=constant)
-    return StructuredFit(spec, problem, hyper, posterior, result, system)
+    noise = _below(tensors, "noise_std.")
+    return StructuredFit(spec, problem, hyper, posterior, result, system, noise)
 
 
 def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str, Tensor]) -> ForcePosterior:
