@@ -16,7 +16,7 @@ SLACK = 1e-3
 """Share of a limit by which it may be exceeded: rounding, and encoders that read a little beyond a stop."""
 CLIPPED_RUN = 3
 """Rows in a row at the same extreme value that make a plateau."""
-OFTENER = 10.0
+OFTENER = 5.0
 """Factor by which a clipped value occurs more often than its neighbours."""
 OFTEN = 0.05
 """Share of rows beyond the limits from which a wrong unit is considered."""
