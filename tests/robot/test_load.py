@@ -27,7 +27,9 @@ from forcegp.errors import (
 )
 from forcegp.robot.load import BUNDLED
 from forcegp.robot.safety import MAX_BYTES, MAX_ELEMENTS
-from robots import ARMS, example_data
+from robots import ARMS, example_data, random_states
+
+PUBLISHED_IIWA = Path(__file__).resolve().parents[3] / "shared/real/kuka_iiwa14/iiwa14.urdf"
 
 SECONDS = 2.0  # what the requirements allow for any file; processor time, as other programs may run
 LINK = '<link name="{0}"><inertial><mass value="1"/>{1}</inertial></link>'
@@ -61,6 +63,8 @@ def test_bundled_robots_load_without_remarks() -> None:
         "double_pendulum": 2,
         "franka_panda": 7,
         "kuka_iiwa": 7,
+        "kuka_iiwa14": 7,
+        "ur5": 6,
     }
     assert all(robot.name == name for name, robot in robots.items())
 
@@ -76,6 +80,29 @@ def test_bundled_panda_equals_the_published_figures() -> None:
         torch.testing.assert_close(
             getattr(ours, field)[:6], getattr(published, field)[:6], rtol=1e-12, atol=0
         )
+
+
+@pytest.mark.skipif(not PUBLISHED_IIWA.exists(), reason="the published robot file is not here")
+def test_bundled_iiwa14_equals_the_published_parameters() -> None:
+    published, ours = forcegp.load_robot(PUBLISHED_IIWA), forcegp.load_robot("kuka_iiwa14")
+    assert ours.joint_names == published.joint_names
+    assert ours.frame_names == published.frame_names
+    fields = ("placement_rotation", "placement_position", "axis", "lower", "upper", "effort_limit")
+    for field in (*fields, "velocity_limit", "damping", "friction", "mass", "com", "inertia"):
+        torch.testing.assert_close(getattr(ours, field), getattr(published, field), rtol=0, atol=1e-15)
+    q = random_states(ours, 4)[0]
+    for frame in ours.frame_names:
+        pose = kinematics.frame_pose(ours, q, frame), kinematics.frame_pose(published, q, frame)
+        torch.testing.assert_close(*pose, rtol=0, atol=1e-12)
+
+
+def test_bundled_iiwa14_has_the_published_total_mass_and_reach() -> None:
+    """Masses and link lengths of Drake's iiwa14, summed by hand."""
+    robot = forcegp.load_robot("kuka_iiwa14")
+    assert float(robot.mass.sum()) == pytest.approx(5.76 + 6.35 + 3 * 3.5 + 1.8 + 1.2)
+    flange = kinematics.frame_pose(robot, torch.zeros(7, dtype=robot.dtype), "iiwa_link_ee")[1]
+    height = 0.1575 + 0.2025 + 0.2045 + 0.2155 + 0.1845 + 0.2155 + 0.081 + 0.045
+    np.testing.assert_allclose(flange, [0.0, 0.0, height], atol=1e-9)
 
 
 def test_bundled_double_pendulum_equals_the_textbook() -> None:

@@ -18,7 +18,7 @@ from forcegp.robot.safety import parse_xml, read_bytes
 from forcegp.robot.tree import Tree, lock_joints
 from forcegp.robot.urdf import read_urdf
 
-BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa", "ur5")
+BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa", "kuka_iiwa14", "ur5")
 
 
 def load_robot(
@@ -36,7 +36,8 @@ def load_robot(
     A file that is usable but doubtful gives a `RobotFileWarning`, whose text is also in `robot.remarks`.
 
     Args:
-        source: `"kuka_iiwa"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or the path of a file.
+        source: `"kuka_iiwa"`, `"kuka_iiwa14"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or the path
+            of a file.
         base_position: position of the root link in the world [m].
         base_rpy: its roll, pitch and yaw about the world's axes [rad].
         gravity: gravitational acceleration in the world [m/s²]; that of an MJCF file is ignored.
