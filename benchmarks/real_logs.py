@@ -23,6 +23,7 @@ from pathlib import Path
 import torch
 from real_cases import CASES, Case, evenly, moving
 from real_models import LEAST_SQUARES, Predicted, Predictor, models
+from real_plots import draw_errors
 from results_page import table, write_section
 
 import forcegp
@@ -35,7 +36,7 @@ COLUMNS = [
     "torque RMSE by joint [N m]",
     "geometric mean / least squares",
     "/ least squares in motion",
-    "squared acceleration error by joint / least squares in motion",
+    "squared acceleration error by joint / least squares",
     "±2σ coverage of torque by joint",
     "response to torque by joint",
 ]
@@ -133,7 +134,7 @@ def markdown(result: dict) -> str:
                     numbers(row["torque_rmse"]),
                     f"{row[baseline]['torque_geometric_mean']:.2f}",
                     f"{row[in_motion]['torque_geometric_mean']:.2f}",
-                    " ".join(f"{value:.2g}" for value in row[in_motion]["acceleration_mse"]),
+                    " ".join(f"{value:.3g}" for value in row[baseline]["acceleration_mse"]),
                     numbers(row.get("torque_coverage")),
                     numbers(row["torque_response"], 1),
                 ]
@@ -152,6 +153,7 @@ def main() -> None:
     )
     parser.add_argument("--case", choices=sorted(CASES), nargs="*", default=list(CASES))
     parser.add_argument("--json", type=Path, help="write all results to this file")
+    parser.add_argument("--plots", type=Path, help="folder for one picture per test, a panel per joint")
     parser.add_argument("--docs", type=Path, help="write the tables into this Markdown file")
     options = parser.parse_args()
     torch.manual_seed(0)
@@ -170,6 +172,9 @@ def main() -> None:
     print(markdown(result))
     if options.json is not None:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    if options.plots is not None:
+        for case, found in result["cases"].items():
+            draw_errors(options.plots, case, found["tests"])
     if options.docs is not None:
         write_section(options.docs, "real_logs", markdown(result))
 

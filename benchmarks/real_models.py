@@ -68,7 +68,7 @@ def structured(case: Case, with_inertia: bool) -> Fitted:
             fit.predict(part.q, part.qd, part.tau, noise=True)
             for part in (data[i : i + CHUNK] for i in range(0, len(data), CHUNK))
         ]
-        covariance = torch.cat([part.covariance for part in parts])
+        covariance = torch.cat([part.covariance for part in parts if part.covariance is not None])
         return Predicted(torch.cat([part.mean for part in parts]), covariance, fit.system)
 
     result = fit.result
@@ -83,12 +83,14 @@ def structured(case: Case, with_inertia: bool) -> Fitted:
 
 def independent_gp(case: Case) -> Fitted:
     """One Gaussian process per joint acceleration."""
-    fit = forcegp.IndependentGP(case.system).fit(evenly(moving(case.train), GP_SAMPLES))
-    noise = fit.training.noise_std
+    train = evenly(moving(case.train), GP_SAMPLES)
+    fit = forcegp.IndependentGP(case.system).fit(train)
+    noise = fit.training.noise_std.expand_as(train.qdd).square().mean(0).sqrt()
 
     def predict(data: forcegp.Dataset) -> Predicted:
         found = fit.predict(data.q, data.qd, data.tau)
-        known = data.extras.get("qdd_std", noise.square().mean(0).sqrt().expand_as(data.qdd))
+        assert found.covariance is not None
+        known = data.extras.get("qdd_std", noise.expand_as(data.qdd))
         return Predicted(found.mean, found.covariance + torch.diag_embed(known**2), case.system)
 
     return Fitted(predict, fit.result.seconds, {"samples": GP_SAMPLES})
