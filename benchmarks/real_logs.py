@@ -122,7 +122,8 @@ def numbers(values: list[float] | None, digits: int = 2) -> str:
 def markdown(result: dict) -> str:
     """The tables of the page."""
     parts = [
-        f"Measured on {result['machine']} with {result['threads']} thread(s) in {result['seconds']:.0f} s."
+        f"Measured on {result['machine']} with {result['cores']} cores, in {result['threads']} thread(s) "
+        f"and {result['seconds']:.0f} s."
     ]
     baseline = f"ratio_to_{LEAST_SQUARES[0]}"
     in_motion = f"ratio_to_{LEAST_SQUARES[1]}"

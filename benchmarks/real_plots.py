@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import matplotlib
@@ -28,6 +29,6 @@ def draw_errors(folder: Path, case: str, tests: dict[str, dict[str, dict]]) -> N
         axes[0].invert_yaxis()
         figure.supxlabel("root-mean-square torque error [N m]", fontsize=9)
         figure.suptitle(f"{case}: {test}", fontsize=10)
-        name = "".join(c if c.isalnum() else "_" for c in f"{case}_{test}").lower()
+        name = "_".join(re.findall(r"\w+", f"{case} {test}".lower()))
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
         plt.close(figure)
