@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ModelError
 from forcegp.forces.identifiability import force_correlation
 from forcegp.forces.inference import force_posterior, jitter_of, log_likelihood
 from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
@@ -21,6 +22,7 @@ from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps
 from forcegp.forces.samples import draw_samples
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
+from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
@@ -28,6 +30,8 @@ from forcegp.storage.folder import Settings
 KIND = "structured_gp"
 CORRELATION_STATES = 50
 """Training states at which the correlation of Q and Q_z is evaluated after a fit."""
+UNDETERMINED = 10.0
+"""Standard deviations of the multiplier per its size from which a fit warns."""
 LARGE_JITTER = 0.01
 """Jitter, relative to unit noise, from which a fit warns: the noise grows by half of it."""
 
@@ -121,6 +125,35 @@ class StructuredFit(FittedModel):
         """Force functions drawn from the posterior."""
         return draw_samples(self.posterior, samples, generator, FEATURES).total_force
 
+    def updated(self, measurements: Training) -> StructuredFit:
+        """The fit with more samples, at a cost that does not depend on how many it has seen.
+
+        Raises:
+            ModelError: inference is exact.
+        """
+        problem = dataclasses.replace(self.problem, training=measurements)
+        rows = problem.rows(self.hyperparameters).blocks
+        latent, central = _sparse(self.posterior), self.posterior.central
+        if isinstance(central, SparsePosterior):
+            known = problem.of_means().rows(self.hyperparameters).blocks
+            central = central.updated(problem.silenced(known))
+        posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows), central=central)
+        return dataclasses.replace(self, posterior=posterior)
+
+    def forgetting(self, factor: float) -> StructuredFit:
+        """The fit with the weight of all samples so far multiplied by a factor between 0 and 1.
+
+        Raises:
+            ModelError: inference is exact, or the factor is out of range.
+        """
+        if not 0.0 < factor <= 1.0:
+            raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)
+        latent, central = _sparse(self.posterior), self.posterior.central
+        if isinstance(central, SparsePosterior):
+            central = central.forgetting(factor)
+        posterior = dataclasses.replace(self.posterior, latent=latent.forgetting(factor), central=central)
+        return dataclasses.replace(self, posterior=posterior)
+
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         settings, tensors = pack(
             self.specification, self.problem, self.hyperparameters, self.posterior, self.result
@@ -165,6 +198,15 @@ class StructuredFit(FittedModel):
         return noise.reshape(*flat.batch, z.o.shape[-1])
 
 
+def _sparse(posterior: ForcePosterior) -> SparsePosterior:
+    if not isinstance(posterior.latent, SparsePosterior):
+        raise ModelError(
+            "a fit with exact inference cannot be updated",
+            hint='make the model with inference="sparse", or condition it on all data',
+        )
+    return posterior.latent
+
+
 def learned_system(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> ConstrainedSystem:
     """The system with the learned robot, detached."""
     if not analytical_parameters(hyperparameters):
@@ -204,7 +246,7 @@ def conditioned(
         jitter=jitter,
         constant_inputs=_constant_inputs(problem.priors, problem.training),
         force_correlation=_mean_correlation(posterior, system, problem.training),
-        warnings=(*warnings, *_warnings(jitter)),
+        warnings=(*warnings, *_warnings(jitter), *_doubts_on_multiplier(posterior, system, problem.training)),
     )
     noise = typical_noise(problem, hyperparameters)
     return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)
@@ -231,6 +273,31 @@ def _warnings(jitter: float) -> tuple[str, ...]:
     return (
         f"the covariance was factorised with a jitter of {jitter:.2g} times the noise variance: "
         "drop duplicated rows, or state a larger noise",
+    )
+
+
+def _doubts_on_multiplier(
+    posterior: ForcePosterior, system: ConstrainedSystem, training: Training
+) -> tuple[str, ...]:
+    """A warning where the multiplier is so uncertain that it is not determined by the data."""
+    few = training.thinned(min(CORRELATION_STATES, training.samples)).measurements if training.samples else ()
+    means, spreads = [], []
+    for m in _in_contact(few):
+        at = m.at(system)
+        z = affine_map(system, at, "multiplier")
+        rows = system.active_rows(m.active, m.active.shape[:-1])
+        means.append(posterior.read_mean(system, at, z)[rows])
+        spreads.append(
+            posterior.read_covariance(system, at, z).diagonal(dim1=-2, dim2=-1).clamp(min=0.0)[rows]
+        )
+    if not means:
+        return ()
+    size, spread = (float(torch.cat(x).sqrt().median()) for x in ([m**2 for m in means], spreads))
+    if spread <= UNDETERMINED * max(size, 1e-12):
+        return ()
+    return (
+        f"the multiplier is not determined by these data: its standard deviation is {spread:.3g} N at a median of "
+        f"{size:.3g} N; use the analytical mean, measure a force, or leave out priors that act along the normal",
     )
 
 
