@@ -11,12 +11,10 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.identifiability import force_correlation
 from forcegp.forces.inference import force_posterior, jitter_of, log_likelihood
 from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
-from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import CONTACT, JOINT, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states, stack
 from forcegp.forces.samples import draw_samples
@@ -24,16 +22,11 @@ from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
+from forcegp.models.doubts import constant_inputs, doubts, mean_correlation
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
 
 KIND = "structured_gp"
-CORRELATION_STATES = 50
-"""Training states at which the correlation of Q and Q_z is evaluated after a fit."""
-UNDETERMINED = 10.0
-"""Standard deviations of the multiplier per its size from which a fit warns."""
-LARGE_JITTER = 0.01
-"""Jitter, relative to unit noise, from which a fit warns: the noise grows by half of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,9 +237,9 @@ def conditioned(
         learned,
         log_marginal_likelihood=likelihood,
         jitter=jitter,
-        constant_inputs=_constant_inputs(problem.priors, problem.training),
-        force_correlation=_mean_correlation(posterior, system, problem.training),
-        warnings=(*warnings, *_warnings(jitter), *_doubts_on_multiplier(posterior, system, problem.training)),
+        constant_inputs=constant_inputs(problem.priors, problem.training),
+        force_correlation=mean_correlation(posterior, system, problem.training),
+        warnings=(*warnings, *doubts(posterior, system, problem.training, jitter)),
     )
     noise = typical_noise(problem, hyperparameters)
     return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)
@@ -260,60 +253,3 @@ def typical_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> di
         std = problem.noise_at(hyperparameters, i)
         found[quantity] = std if std.ndim == 1 else std.square().mean(0).sqrt()
     return found
-
-
-def _constant_inputs(priors: Sequence[ForcePrior], training: Training) -> tuple[str, ...]:
-    pairs = zip(priors, training.scales, strict=True)
-    return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
-
-
-def _warnings(jitter: float) -> tuple[str, ...]:
-    if jitter < LARGE_JITTER:
-        return ()
-    return (
-        f"the covariance was factorised with a jitter of {jitter:.2g} times the noise variance: "
-        "drop duplicated rows, or state a larger noise",
-    )
-
-
-def _doubts_on_multiplier(
-    posterior: ForcePosterior, system: ConstrainedSystem, training: Training
-) -> tuple[str, ...]:
-    """A warning where the multiplier is so uncertain that it is not determined by the data."""
-    few = training.thinned(min(CORRELATION_STATES, training.samples)).measurements if training.samples else ()
-    means, spreads = [], []
-    for m in _in_contact(few):
-        at = m.at(system)
-        z = affine_map(system, at, "multiplier")
-        rows = system.active_rows(m.active, m.active.shape[:-1])
-        means.append(posterior.read_mean(system, at, z)[rows])
-        spreads.append(
-            posterior.read_covariance(system, at, z).diagonal(dim1=-2, dim2=-1).clamp(min=0.0)[rows]
-        )
-    if not means:
-        return ()
-    size, spread = (float(torch.cat(x).sqrt().median()) for x in ([m**2 for m in means], spreads))
-    if spread <= UNDETERMINED * max(size, 1e-12):
-        return ()
-    return (
-        f"the multiplier is not determined by these data: its standard deviation is {spread:.3g} N at a median of "
-        f"{size:.3g} N; use the analytical mean, measure a force, or leave out priors that act along the normal",
-    )
-
-
-def _mean_correlation(
-    posterior: ForcePosterior, system: ConstrainedSystem, training: Training
-) -> float | None:
-    """Mean correlation of Q and Q_z over some of the training states, where both have priors."""
-    targets = {prior.target for prior in posterior.priors}
-    if not {JOINT, CONTACT} <= targets:
-        return None
-    few = training.thinned(min(CORRELATION_STATES, training.samples)).measurements
-    parts = [force_correlation(posterior, system, m.at(system)) for m in _in_contact(few)]
-    return float(torch.cat(parts).mean()) if parts else None
-
-
-def _in_contact(measurements: Sequence[Measurement]) -> list[Measurement]:
-    """The samples in which a contact is closed; elsewhere Q_z is zero."""
-    closed = [m[m.active.any(-1).nonzero()[:, 0]] for m in measurements]
-    return [m for m in closed if len(m.q)]
