@@ -45,8 +45,8 @@ def rollout(
     """Simulate forward with a model, from a logged state and under the logged torques.
 
     The folder gets rollout.parquet: the predicted motion, the logged one as q_logged, and, with samples,
-    the spread of the sampled motions as q_std; and rollout.html with figures and an animation of the arm,
-    the figures as SVG and their data as rollout.json.
+    the spread of the sampled motions as q_std; and rollout.html with plots and an animation of the arm,
+    the plots as SVG and their data as rollout.json.
 
     [bold]Examples[/bold]
 

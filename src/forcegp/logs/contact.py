@@ -76,7 +76,7 @@ def detect(signals: Signals, system: ConstrainedSystem, mapping: Mapping, report
         The evidence for each contact that was detected.
 
     Raises:
-        DataError: the evidence does not tell two states apart.
+        DataError: the evidence does not separate two states.
         MappingError: the mapping does not say how a contact is known, or names one that the scene lacks.
     """
     sections = mapping.sections.contact
