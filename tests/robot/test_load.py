@@ -61,6 +61,7 @@ def test_bundled_robots_load_without_remarks() -> None:
         "double_pendulum": 2,
         "franka_panda": 7,
         "kuka_iiwa": 7,
+        "ur5": 6,
     }
     assert all(robot.name == name for name, robot in robots.items())
 

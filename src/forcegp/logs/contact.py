@@ -200,6 +200,7 @@ def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -
 
 
 def level_and_spread(values: Array) -> tuple[float, float]:
+    """Median, and the standard deviation of a normal distribution with the same median absolute deviation."""
     if not len(values):
         return float("nan"), float("nan")
     middle = float(np.median(values))
