@@ -48,5 +48,5 @@ def random_data(
         joint_names=robot.joint_names,
         contact={"table": active[:, 0]},
         extras={"qdd_clean": qdd},
-        header=DataHeader(noise_std=NOISE_STD),
+        header=DataHeader(noise_std=NOISE_STD, seed=seed),
     )

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from forcegp.forces.mean import AnalyticalMean
     from forcegp.forces.measurements import Observation
     from forcegp.forces.priors.contact import ContactForcePrior
+    from forcegp.forces.priors.inertial import InertialPrior
     from forcegp.forces.priors.joint import JointForcePrior
+    from forcegp.forces.priors.joint_friction import JointFrictionPrior
     from forcegp.forces.priors.normal_force import NormalForcePrior
     from forcegp.forces.priors.operator import OperatorForcePrior
     from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
@@ -52,7 +54,9 @@ _HOME = {
     "Evaluation": "evaluation",
     "ImplicitSurface": "constraints",
     "IndependentGP": "models.independent_gp",
+    "InertialPrior": "forces.priors.inertial",
     "JointForcePrior": "forces.priors.joint",
+    "JointFrictionPrior": "forces.priors.joint_friction",
     "LearningOptions": "gp.optimise",
     "NeuralNetwork": "models.neural",
     "NormalForcePrior": "forces.priors.normal_force",
@@ -97,7 +101,9 @@ __all__ = [
     "Evaluation",
     "ImplicitSurface",
     "IndependentGP",
+    "InertialPrior",
     "JointForcePrior",
+    "JointFrictionPrior",
     "LearningOptions",
     "NeuralNetwork",
     "NormalForcePrior",

@@ -186,7 +186,7 @@ def identify(
     joint weighted by the noise that the first pass leaves. The accelerations are taken as exact.
 
     Args:
-        robot: its kinematics, gravity, drive inertia and v_0 are used, its inertial figures are not.
+        robot: its kinematics, gravity, drive inertia and v_0 are used, its inertial parameters are not.
         q, qd, qdd: `(n, nq)` the motion.
         tau: `(n, nq)` measured joint force; without `friction`, less the dissipative part [N m, N].
         friction: identify viscous and Coulomb friction with the inertial parameters.

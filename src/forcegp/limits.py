@@ -59,7 +59,7 @@ TENSORS = 10_000
 CHECKPOINT_BYTES = GIB
 """A checkpoint: the tensors that are learned, without the data."""
 CHECKPOINT_VALUE = 1e12
-"""A value in a checkpoint: hyperparameters are logarithms, and analytical parameters are SI figures."""
+"""A value in a checkpoint: hyperparameters are logarithms, and analytical parameters are in SI units."""
 
 LOGGED_VALUE = 1e100
 """A number in a log or a state: its square, and the square of that, are finite."""

@@ -188,16 +188,18 @@ def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
     assert 0.05 < figures["noisy_mae"] < 0.3
     assert json.loads(Path(figures["file"]).read_text())["samples"] == 220
 
+    motion = tmp_path / "motion"
     path = json.loads(
-        run("rollout", "-m", model, "-d", log, "-o", tmp_path, "--start", 24, "--duration", 0.25, "--json")
+        run("rollout", "-m", model, "-d", log, "-o", motion, "--start", 24, "--duration", 0.25, "--json")
     )
+    assert "holds other files" in fail("rollout", "-m", model, "-d", log, "-o", tmp_path)
     # Open loop for a quarter of a second, with a model that knows all but the friction at the contact.
     assert path["duration_s"] == pytest.approx(0.25) and path["largest_joint_error"] < 0.01
     assert path["largest_constraint_error_m"] < 1e-3
     rolled = Dataset.read(path["file"])
     assert torch.equal(rolled.q_logged, data.q[24:85]) and torch.equal(rolled.q[0], data.q[24])
-    assert "in order of time" in fail("rollout", "-m", model, "-d", train, "-o", tmp_path)
-    assert "even sampling period" in fail("rollout", "-m", model, "-d", test, "-o", tmp_path)
+    assert "in order of time" in fail("rollout", "-m", model, "-d", train, "-o", motion)
+    assert "even sampling period" in fail("rollout", "-m", model, "-d", test, "-o", motion)
 
     assert "did you mean 'multiplier'?" in fail(
         "predict", "-m", model, "-d", test, "-q", "multiplyer", "-o", log

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 import forcegp
+from forcegp.data.header import DataHeader
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.default import REMAINING
@@ -65,6 +66,7 @@ def logged(
         tau=tau,
         qdd=eom.acceleration(Q + Q_z) + noise,
         joint_names=system.robot.joint_names,
+        header=DataHeader(seed=seed),
         contact={name: active[:, i] for i, name in enumerate(CONTACTS)},
         extras={"Q": Q, "Q_z": Q_z, "Q_I": eom.constraint_force(Q + Q_z)},
         contact_extras={

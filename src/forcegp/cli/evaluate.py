@@ -39,10 +39,13 @@ def evaluate(
 
     forcegp evaluate --model model/ --data test.parquet --train train.parquet --out evaluation/
     """
+    from forcegp.destination import check_destination
     from forcegp.evaluation import evaluate as run
-    from forcegp.files import write_json
+    from forcegp.files import atomic_directory, write_json
     from forcegp.models.load import load_model
 
+    if out is not None:
+        check_destination(out, folder=True, own_files=["evaluation.json"])
     regression = load_model(model)
     robot = regression.system.robot
     test = data_of_robot(read_data(data), robot)
@@ -54,9 +57,10 @@ def evaluate(
         from forcegp.report.evaluation import write_evaluation
         from forcegp.report.window import opening, predicted_window
 
-        write_json(out / "evaluation.json", found.to_dict())
         window = predicted_window(regression, opening(test, WINDOW_SECONDS), regression.kind)
         fitted_to = None if train is None else str(train)
-        page = write_evaluation(out, str(model), str(data), found, window, fitted_to)
-        result |= {"file": str(out / "evaluation.json"), "page": str(page)}
+        with atomic_directory(out) as temporary:
+            write_json(temporary / "evaluation.json", found.to_dict())
+            page = write_evaluation(temporary, str(model), str(data), found, window, fitted_to)
+        result |= {"file": str(out / "evaluation.json"), "page": str(out / page.name)}
     show(result, as_json)

@@ -45,8 +45,8 @@ def rollout(
     """Simulate forward with a model, from a logged state and under the logged torques.
 
     The folder gets rollout.parquet: the predicted motion, the logged one as q_logged, and, with samples,
-    the spread of the sampled motions as q_std; and rollout.html with figures and an animation of the arm,
-    the figures as SVG and their data as rollout.json.
+    the spread of the sampled motions as q_std; and rollout.html with plots and an animation of the arm,
+    the plots as SVG and their data as rollout.json.
 
     [bold]Examples[/bold]
 
@@ -54,19 +54,32 @@ def rollout(
 
     forcegp rollout -m model/ -d run.parquet --start 2400 --samples 50 -o rollout/
     """
+    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.files import atomic_directory
     from forcegp.models.load import load_model
     from forcegp.rollout import RolloutOptions
     from forcegp.rollout.inputs import sampling_period
 
+    check_destination(out, folder=True, own_files=["rollout.parquet"])
     regression = load_model(model)
     log = _stretch(data_of_robot(read_data(data), regression.system.robot), start, duration)
     dt = sampling_period(log)
     options = RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
     path = _roll(regression, log, options, samples, seed)
-    rolled, file = _as_data(path, log, dt), out / "rollout.parquet"
-    rolled.with_step(f"rolled out by the model in {model} from row {start}").write(file)
-    page = _write_page(out, f"Model {model} rolled out on {data}", regression.kind, path, log, dt)
-    show({**_figures(path, rolled, dt), "page": str(page), "file": str(file)}, as_json)
+    rolled = _as_data(path, log, dt)
+    title, step = (
+        f"{regression.kind} rolled out on {data}",
+        f"rolled out by the model in {model} from row {start}",
+    )
+
+    def write(folder: Path) -> None:
+        with atomic_directory(folder) as temporary:
+            rolled.with_step(step).write(temporary / "rollout.parquet")
+            _write_page(temporary, title, regression.kind, path, log, dt)
+
+    write_or_keep(write, out)
+    written = {"page": str(out / "rollout.html"), "file": str(out / "rollout.parquet")}
+    show({**_figures(path, rolled, dt), **written}, as_json)
 
 
 def _roll(regression: Model, log: Dataset, options: RolloutOptions, samples: int, seed: int) -> Rollout:
@@ -86,12 +99,12 @@ def _roll(regression: Model, log: Dataset, options: RolloutOptions, samples: int
         )
 
 
-def _write_page(out: Path, title: str, name: str, path: Rollout, log: Dataset, dt: float) -> Path:
+def _write_page(out: Path, title: str, name: str, path: Rollout, log: Dataset, dt: float) -> None:
     from forcegp.report.rollout_data import rollout_data
     from forcegp.report.rollouts import write_rollouts
     from forcegp.rollout import beside_log
 
-    return write_rollouts(out, title, rollout_data(beside_log(name, path, log, dt)))
+    write_rollouts(out, title, rollout_data(beside_log(name, path, log, dt)))
 
 
 def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:

@@ -1,6 +1,6 @@
 """Opt-in compiled dynamics: one fused kernel per robot and quantity, cached on disk.
 
-The robot's figures are folded into the kernel. The eager functions of `forcegp.dynamics` need no
+The robot's parameters are folded into the kernel. The eager functions of `forcegp.dynamics` need no
 compiler and take robots that are being learned; these are for many evaluations of one robot.
 """
 
@@ -138,7 +138,7 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
     the kernel is compiled by NVRTC in each process.
 
     Args:
-        robot: the robot; its figures become constants.
+        robot: the robot; its parameters become constants.
         quantity: `forward_dynamics`, `forward_dynamics_derivatives`, `inverse_dynamics`, `mass_matrix`,
             `bias_force` or `gravity_force`.
 

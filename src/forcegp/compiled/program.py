@@ -1,6 +1,6 @@
 """The dynamics of one robot written out on scalars: the algorithms of `forcegp.dynamics`, link by link.
 
-The robot's figures are numbers, so products with the zeros and ones of joint axes and placements vanish
+The robot's parameters are numbers, so products with the zeros and ones of joint axes and placements vanish
 while the program is built.
 """
 

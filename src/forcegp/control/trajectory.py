@@ -21,7 +21,7 @@ PROJECTION_STEPS = 8
 
 
 class Trapezoid(NamedTuple):
-    """Trapezoidal velocity profiles, one a segment, at rest at both ends.
+    """Trapezoidal velocity profiles, one per segment, at rest at both ends.
 
     Attributes:
         length: `(*batch,)` distance travelled [m].

@@ -53,7 +53,7 @@ def differentiate(
     """The `degree`-th time derivative of x, and the standard deviation of its noise.
 
     The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x becomes σ |w|. σ is
-    estimated, one a column, from the residuals of the fit, whose deviation is σ √(1 − h) with h the
+    estimated, one per column, from the residuals of the fit, whose deviation is σ √(1 − h) with h the
     weight of a sample in its own fit; the median absolute deviation keeps corners of the motion out of it.
     The first and last half window of each segment are read off the outermost fits, with their larger noise.
 

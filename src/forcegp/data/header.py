@@ -19,7 +19,7 @@ class DataHeader(Header):
         robot_fingerprint: `RobotModel.fingerprint` of the robot that moved.
         seed: seed of the random numbers that went into the data.
         ordered: rows follow time within each segment (not so for points in order of selection).
-        provenance: what was done to the data, oldest first, one line a step.
+        provenance: what was done to the data, oldest first, one line per step.
         joint_names, contact_names: in the order of the columns; empty where a log does not say.
     """
 

@@ -2,8 +2,7 @@
 
 Temperature, hysteresis and filters leave residuals that are correlated in time, so a log holds less evidence
 than its samples suggest. The integrated autocorrelation time says how much less. The variance of a new
-motion is
-measured where it counts: on stretches of the training log that the posterior has not seen.
+motion is measured where it counts: on stretches of the training log that the posterior has not seen.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.posterior import ForcePosterior, LatentPosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.gp.bound import bound_of
+from forcegp.gp.capacity import require_exact_fits
 from forcegp.gp.decomposition import split
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.inducing import candidates, select_inducing
@@ -85,6 +86,7 @@ def force_posterior(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> 
 
 def _conditioned(problem: Problem, params: Parameters, blocks: list[Block]) -> LatentPosterior:
     if problem.inducing is None:
+        require_exact_fits(blocks, learning=False)
         return ExactPosterior.of(problem.priors, params, blocks)
     return condition_sparse(problem.priors, params, blocks, problem.inducing)
 

@@ -61,7 +61,7 @@ class Measurement:
 
     def __post_init__(self) -> None:
         if self.segment is None:
-            zero = torch.zeros(len(self.q), dtype=torch.int64, device=self.q.device)
+            zero = torch.zeros(self.q.shape[:1], dtype=torch.int64, device=self.q.device)
             object.__setattr__(self, "segment", zero)
 
     @property

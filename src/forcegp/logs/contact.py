@@ -76,7 +76,7 @@ def detect(signals: Signals, system: ConstrainedSystem, mapping: Mapping, report
         The evidence for each contact that was detected.
 
     Raises:
-        DataError: the evidence does not tell two states apart.
+        DataError: the evidence does not separate two states.
         MappingError: the mapping does not say how a contact is known, or names one that the scene lacks.
     """
     sections = mapping.sections.contact
@@ -200,6 +200,7 @@ def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -
 
 
 def level_and_spread(values: Array) -> tuple[float, float]:
+    """Median, and the standard deviation of a normal distribution with the same median absolute deviation."""
     if not len(values):
         return float("nan"), float("nan")
     middle = float(np.median(values))

@@ -308,9 +308,12 @@ class Model(Predictor, Generic[F]):
         active: Tensor | None = None,
         covariance: bool = True,
         system: ConstrainedSystem | None = None,
+        **settings: Any,
     ) -> Prediction:
         """Predict with the most recent fit; see the `predict` of the fitted model."""
-        return self.fitted.predict(q, qd, tau, quantity, active=active, covariance=covariance, system=system)
+        return self.fitted.predict(
+            q, qd, tau, quantity, active=active, covariance=covariance, system=system, **settings
+        )
 
     def force_field(self) -> ForceField | None:
         return self.fitted.force_field()

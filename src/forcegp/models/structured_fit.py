@@ -10,26 +10,23 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.identifiability import force_correlation
+from forcegp.errors import ModelError
 from forcegp.forces.inference import force_posterior, jitter_of, log_likelihood
 from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
-from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import CONTACT, JOINT, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states, stack
 from forcegp.forces.samples import draw_samples
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
+from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
+from forcegp.models.doubts import constant_inputs, doubts, mean_correlation
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
 
 KIND = "structured_gp"
-CORRELATION_STATES = 50
-"""Training states at which the correlation of Q and Q_z is evaluated after a fit."""
-LARGE_JITTER = 0.01
-"""Jitter, relative to unit noise, from which a fit warns: the noise grows by half of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +118,35 @@ class StructuredFit(FittedModel):
         """Force functions drawn from the posterior."""
         return draw_samples(self.posterior, samples, generator, FEATURES).total_force
 
+    def updated(self, measurements: Training) -> StructuredFit:
+        """The fit with more samples, at a cost that does not depend on how many it has seen.
+
+        Raises:
+            ModelError: inference is exact.
+        """
+        problem = dataclasses.replace(self.problem, training=measurements)
+        rows = problem.rows(self.hyperparameters).blocks
+        latent, central = _sparse(self.posterior), self.posterior.central
+        if isinstance(central, SparsePosterior):
+            known = problem.of_means().rows(self.hyperparameters).blocks
+            central = central.updated(problem.silenced(known))
+        posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows), central=central)
+        return dataclasses.replace(self, posterior=posterior)
+
+    def forgetting(self, factor: float) -> StructuredFit:
+        """The fit with the weight of all samples so far multiplied by a factor between 0 and 1.
+
+        Raises:
+            ModelError: inference is exact, or the factor is out of range.
+        """
+        if not 0.0 < factor <= 1.0:
+            raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)
+        latent, central = _sparse(self.posterior), self.posterior.central
+        if isinstance(central, SparsePosterior):
+            central = central.forgetting(factor)
+        posterior = dataclasses.replace(self.posterior, latent=latent.forgetting(factor), central=central)
+        return dataclasses.replace(self, posterior=posterior)
+
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         settings, tensors = pack(
             self.specification, self.problem, self.hyperparameters, self.posterior, self.result
@@ -165,6 +191,15 @@ class StructuredFit(FittedModel):
         return noise.reshape(*flat.batch, z.o.shape[-1])
 
 
+def _sparse(posterior: ForcePosterior) -> SparsePosterior:
+    if not isinstance(posterior.latent, SparsePosterior):
+        raise ModelError(
+            "a fit with exact inference cannot be updated",
+            hint='make the model with inference="sparse", or condition it on all data',
+        )
+    return posterior.latent
+
+
 def learned_system(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> ConstrainedSystem:
     """The system with the learned robot, detached."""
     if not analytical_parameters(hyperparameters):
@@ -202,9 +237,9 @@ def conditioned(
         learned,
         log_marginal_likelihood=likelihood,
         jitter=jitter,
-        constant_inputs=_constant_inputs(problem.priors, problem.training),
-        force_correlation=_mean_correlation(posterior, system, problem.training),
-        warnings=(*warnings, *_warnings(jitter)),
+        constant_inputs=constant_inputs(problem.priors, problem.training),
+        force_correlation=mean_correlation(posterior, system, problem.training),
+        warnings=(*warnings, *doubts(posterior, system, problem.training, jitter)),
     )
     noise = typical_noise(problem, hyperparameters)
     return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)
@@ -218,35 +253,3 @@ def typical_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> di
         std = problem.noise_at(hyperparameters, i)
         found[quantity] = std if std.ndim == 1 else std.square().mean(0).sqrt()
     return found
-
-
-def _constant_inputs(priors: Sequence[ForcePrior], training: Training) -> tuple[str, ...]:
-    pairs = zip(priors, training.scales, strict=True)
-    return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
-
-
-def _warnings(jitter: float) -> tuple[str, ...]:
-    if jitter < LARGE_JITTER:
-        return ()
-    return (
-        f"the covariance was factorised with a jitter of {jitter:.2g} times the noise variance: "
-        "drop duplicated rows, or state a larger noise",
-    )
-
-
-def _mean_correlation(
-    posterior: ForcePosterior, system: ConstrainedSystem, training: Training
-) -> float | None:
-    """Mean correlation of Q and Q_z over some of the training states, where both have priors."""
-    targets = {prior.target for prior in posterior.priors}
-    if not {JOINT, CONTACT} <= targets:
-        return None
-    few = training.thinned(min(CORRELATION_STATES, training.samples)).measurements
-    parts = [force_correlation(posterior, system, m.at(system)) for m in _in_contact(few)]
-    return float(torch.cat(parts).mean()) if parts else None
-
-
-def _in_contact(measurements: Sequence[Measurement]) -> list[Measurement]:
-    """The samples in which a contact is closed; elsewhere Q_z is zero."""
-    closed = [m[m.active.any(-1).nonzero()[:, 0]] for m in measurements]
-    return [m for m in closed if len(m.q)]

@@ -201,6 +201,40 @@ class StructuredGP(Model[StructuredFit]):
         problem = prepared(spec, dataclasses.replace(fitted.problem, training=moving), values)
         return self.adopt(conditioned(spec, problem, values, warnings=doubts))
 
+    def update(self, data: Dataset | Sequence[Observation]) -> StructuredFit:
+        """Add samples to the most recent fit, as in a control loop; needs sparse inference.
+
+        The cost does not depend on the number of samples seen before. Hyperparameters, input scales and
+        inducing points stay as they are.
+
+        Args:
+            data: further measurements of the same quantities.
+
+        Raises:
+            ModelError: the model has not been fitted, its inference is exact, or the data measure something
+                else.
+        """
+        fitted = self.fitted
+        training, _ = in_motion(self.specification, self._training(data, learned=()))
+        if training.quantities != tuple(fitted.noise):
+            raise ModelError(
+                "an update measures other quantities than the fit",
+                expected=", ".join(fitted.noise),
+                got=", ".join(training.quantities),
+            )
+        return self.adopt(fitted.updated(training))
+
+    def forget(self, factor: float) -> StructuredFit:
+        """Multiply the weight of all samples so far by a factor, so that later ones count for more.
+
+        Args:
+            factor: between 0 and 1, such as exp(−Δt/T) for a memory of T seconds.
+
+        Raises:
+            ModelError: the model has not been fitted, its inference is exact, or the factor is out of range.
+        """
+        return self.adopt(self.fitted.forgetting(factor))
+
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""
         names = (*(prior.name for prior in self.force_priors), NOISE, ANALYTICAL)

@@ -29,6 +29,7 @@ from forcegp.forces.learn import TORQUE_NOISE, Problem, Search
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.gp.capacity import require_exact_fits
 from forcegp.gp.optimise import Learned, Progress
 from forcegp.gp.structured_covariance import Block
 from forcegp.models.structured_spec import Specification
@@ -105,6 +106,8 @@ def solve(
         begin: where to begin.
     """
     part = subset(spec, problem)
+    if part.inducing is None:
+        require_exact_fits(part.fixed_rows.blocks)
     correlated = spec.learns_torque_noise and TORQUE_NOISE in search.start
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)

@@ -12,6 +12,8 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.files import Header
 from forcegp.models.base import Predictor
+from forcegp.models.structured_fit import StructuredFit
+from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.style import INK, Picture, colour, draw, label
 from forcegp.report.values import Series, as_tensor, columns, series
 
@@ -74,7 +76,12 @@ def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
         The data of both plots.
     """
     predicted = model.predict(data.q, data.qd, data.tau, active=data.active(model.system.contact_names))
-    clean = data.extras.get("qdd_clean")
+    clean, variance = data.extras.get("qdd_clean"), predicted.variance
+    fitted = model.fitted if isinstance(model, StructuredGP) else model
+    if variance is not None and isinstance(fitted, StructuredFit) and fitted.torque_std is not None:
+        # Where the noise of the torque is known, a measurement scatters by it around what is predicted.
+        active = data.active(fitted.system.contact_names)
+        variance = variance + fitted.noise_variance(data.q, data.qd, data.tau, active=active)
     return WindowData(
         model=name,
         noise_std=data.header.noise_std,
@@ -83,7 +90,7 @@ def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
         measured=columns(data.qdd),
         clean=None if clean is None else columns(clean),
         mean=columns(predicted.mean),
-        std=None if predicted.std is None else columns(predicted.std),
+        std=None if variance is None else columns(variance.sqrt()),
     )
 
 

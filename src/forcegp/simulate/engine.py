@@ -51,7 +51,7 @@ class Engine(Protocol):
         ...
 
     def close(self) -> None:
-        """Give back what the engine holds; it is not used afterwards."""
+        """Release the engine's resources; it is not used afterwards."""
         ...
 
 

@@ -79,7 +79,7 @@ class MuJoCoEngine:
         return self._tensor(data.qfrc_inverse[self._dof])
 
     def close(self) -> None:
-        """Nothing to give back: MuJoCo holds no process."""
+        """Nothing to release: MuJoCo holds no process."""
 
     def _set(self, data: Any, q: JointVector, qd: JointVector) -> None:
         data.qpos[self._dof] = q.numpy()

@@ -42,7 +42,7 @@ def simulate(
         progress: called every few steps, and after the last.
 
     Returns:
-        The data set with the reference, the actual motion of the tool and figures on the run.
+        The data set with the reference, the actual motion of the tool and statistics of the run.
 
     Raises:
         NumericalError: the motion cannot be reached, or the run diverges (names time and state).

@@ -1,4 +1,4 @@
-"""A robot model written as URDF, so that every physics engine is given the very same figures."""
+"""A robot model written as URDF, so that every physics engine is given the same parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ GIMBAL = 1e-12
 
 
 def write_urdf(robot: RobotModel) -> str:
-    """The robot as URDF text: inertial figures and joints only, mounted in the world at its base pose.
+    """The robot as URDF text: inertial parameters and joints only, mounted in the world at its base pose.
 
     Shapes, joint limits, damping and friction are left out on purpose: an engine that reads the file can
     add no force of its own, and every force is one that the caller applies.

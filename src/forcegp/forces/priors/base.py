@@ -73,7 +73,7 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
 
     Raises:
         ModelError: no prior is given, two share a name, or a name is not one word.
-        UnknownNameError: a prior names a contact that the system has not.
+        UnknownNameError: a prior names a contact that the system does not have.
     """
     names = [prior.name for prior in priors]
     if not names or len(set(names)) != len(names):

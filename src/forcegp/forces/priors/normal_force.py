@@ -19,9 +19,8 @@ class NormalForcePrior(ForcePrior):
     """What accelerations in contact never show: a joint force along the constraint, E = Aᵀ Lᵀ = I − P.
 
     H Aᵀ = 0, so a force Aᵀ g(x) changes the multiplier by −g(x) and no acceleration. A joint force prior
-    alone takes its smoothness for knowledge of that part, and gives multipliers that are too sure. This
-    independent process of the same size, with the hyperparameters of the joint force prior, leaves open
-    what is open, until a force sensor or the like says more.
+    alone is overconfident along the normal. This independent process, with the hyperparameters of the joint
+    force prior, keeps the uncertainty of that part until a force sensor or the like reduces it.
 
     Args:
         like: the joint force prior whose kernel, inputs and hyperparameters it shares.

@@ -1,0 +1,63 @@
+"""Sparse fits that are updated and forget."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import forcegp
+from forcegp.errors import ModelError
+from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forces.cases import draw, logged, mixed_contacts, two_contacts
+
+SAME = 1e-8
+"""Of sums in another order, through a factorisation of some dozens of basis functions."""
+data = logged(two_contacts(), 24)
+
+
+def model(inference: str = "sparse") -> forcegp.StructuredGP:
+    return forcegp.StructuredGP(
+        two_contacts(),
+        "analytical",
+        [JointFrictionPrior()],
+        noise_std=0.1,
+        torque_noise=0.2,
+        inference=inference,
+    )
+
+
+def test_an_update_is_a_refit() -> None:
+    reference, grown = model(), model()
+    for one in (reference, grown):
+        one.fit(data[:16], learn=[])
+    reference.condition(data)  # keeps the input scales of the first samples, as an update does
+    grown.update(data[16:])
+    q, qd, tau = draw(5, seed=3)
+    for quantity in ("qdd", "multiplier"):
+        a, b = (m.predict(q, qd, tau, quantity, active=mixed_contacts(5)) for m in (reference, grown))
+        torch.testing.assert_close(a.mean, b.mean, rtol=SAME, atol=SAME)
+        torch.testing.assert_close(a.covariance, b.covariance, rtol=SAME, atol=SAME)
+
+
+def test_forgetting_returns_to_the_prior() -> None:
+    one = model()
+    before = one.fit(data, learn=[])
+    after = one.forget(1e-9)
+    q, qd, tau = draw(5, seed=3)
+    spread = [fit.predict(q, qd, tau, "joint_force").variance for fit in (before, after)]
+    assert bool((spread[1] > spread[0]).all())
+    mean = two_contacts().equations(q, qd, torch.ones(5, 2, dtype=torch.bool)).Q_K + tau
+    torch.testing.assert_close(after.predict(q, qd, tau, "joint_force").mean, mean, rtol=1e-4, atol=1e-4)
+
+
+def test_what_cannot_be_updated() -> None:
+    exact = model("exact")
+    exact.fit(data, learn=[])
+    with pytest.raises(ModelError, match="exact inference cannot be updated"):
+        exact.update(data[:2])
+    sparse = model()
+    sparse.fit(data, learn=[])
+    with pytest.raises(ModelError, match="invalid forgetting factor"):
+        sparse.forget(0.0)
+    with pytest.raises(ModelError, match="measures other quantities"):
+        sparse.update([forcegp.Observation(data[:2], "multiplier", 1.0)])
