@@ -22,6 +22,8 @@ from forcegp.forces.quantities import affine_map
 
 STRETCHES = 8
 """Contiguous stretches that a log of fewer than three segments is divided into."""
+MOST_STRETCHES = 16
+"""Segments beyond this number are left out together with others, since each costs a conditioning."""
 FEWEST = 50
 """Samples in free motion below which nothing is calibrated."""
 NEGLIGIBLE = 0.05
@@ -112,7 +114,7 @@ def _groups(segment: Tensor) -> Tensor:
     """Which stretch each sample belongs to: its segment, or an eighth of the log where segments are few."""
     _, own = segment.unique(return_inverse=True)
     if int(own.max()) + 1 >= 3:
-        return own
+        return own % MOST_STRETCHES
     n = len(segment)
     return torch.arange(n, device=segment.device) * STRETCHES // max(n, 1)
 
