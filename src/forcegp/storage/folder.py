@@ -39,7 +39,7 @@ class ModelHeader(Header):
     """
 
     FORMAT: ClassVar[str] = "forcegp-model"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     kind: str
     settings: dict[str, Any]
