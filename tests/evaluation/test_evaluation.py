@@ -99,7 +99,7 @@ def test_an_honest_uncertainty_is_calibrated() -> None:
     # Half the variance of a squared normal variable over 21000 of them.
     expected = 0.5 * math.log(2.0 * math.pi * total) + 0.5
     assert found.nlpd == pytest.approx(expected, abs=3.0 * math.sqrt(0.5 / 21000))
-    assert found.noise_std == (NOISE_STD,) * 7
+    assert found.noise_std == pytest.approx((NOISE_STD,) * 7, rel=1e-12)  # a root of a mean of squares
 
 
 @pytest.mark.parametrize(("claimed", "coverage"), [(0.02, 0.6), (2.0, 1.0)])
@@ -138,7 +138,7 @@ def test_chunks_do_not_matter_and_progress_is_reported(monkeypatch: pytest.Monke
 def test_without_clean_accelerations() -> None:
     found = evaluate(forcegp.AnalyticalModel(system), data[:20].replace(extras={}))
     assert found.clean is None and found.clean_mae is None and found.coverage_clean is None
-    assert found.noise_std == (NOISE_STD,) * 7
+    assert found.noise_std == pytest.approx((NOISE_STD,) * 7, rel=1e-12)  # a root of a mean of squares
 
 
 def test_everything_fits_into_json() -> None:
