@@ -55,7 +55,7 @@ def test_the_first_point_is_the_one_next_to_the_mean_and_selections_are_nested()
 def test_too_many_points_are_refused() -> None:
     x = torch.zeros(10, 2, dtype=torch.float64)
     x[3] = 1.0
-    with pytest.raises(DataError, match="so many distinct points do not exist\n  expected: at most 2"):
+    with pytest.raises(DataError, match="cannot select 3 distinct points\n  expected: at most 2"):
         farthest_points(x, 3)
     with pytest.raises(DataError, match="1 to 10"):
         farthest_points(x, 11)

@@ -21,7 +21,7 @@ from forcegp.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from forcegp.models.base import Model
+    from forcegp.models.base import FitResult, Model
 
 
 def fit(
@@ -77,12 +77,16 @@ def fit(
     write_or_keep(fitted.save, out)
     if checkpoint is not None:
         checkpoint.unlink(missing_ok=True)
-    if not fitted.converged:
-        typer.secho(f"warning: the fit did not converge: {fitted.message}", fg="yellow", err=True)
-    for doubt in fitted.result.warnings:
-        typer.secho(f"warning: {doubt}", fg="yellow", err=True)
+    _warn(fitted.result)
     figures = {name: value for name, value in asdict(fitted.result).items() if name != "history"}
     show({"model": model, "training_points": len(training), **figures, "folder": str(out)}, as_json)
+
+
+def _warn(result: FitResult) -> None:
+    """Print what is doubtful about a fit."""
+    doubts = () if result.converged else (f"the fit did not converge: {result.message}",)
+    for doubt in (*doubts, *result.warnings):
+        typer.secho(f"warning: {doubt}", fg="yellow", err=True)
 
 
 def _resumable(regression: Model, checkpoint: Path) -> dict[str, Any]:

@@ -55,7 +55,7 @@ def farthest_points(
     """
     n = x.shape[0]
     if not 0 < count <= n:
-        raise DataError("so many points cannot be selected", expected=f"1 to {n}, the samples", got=count)
+        raise DataError(f"cannot select {count} of {n} points", expected=f"1 to {n}", got=count)
     if start is not None and not 0 <= start < n:
         raise DataError("there is no such starting point", expected=f"0 to {n - 1}", got=start)
     x = x.contiguous()
@@ -65,7 +65,7 @@ def farthest_points(
         nearest = torch.minimum(nearest, _distance(x, x[chosen[-1]]), out=nearest)
         farthest = nearest.argmax()
         if nearest[farthest] == 0.0:
-            raise DataError("so many distinct points do not exist", expected=f"at most {number}", got=count)
+            raise DataError(f"cannot select {count} distinct points", expected=f"at most {number}", got=count)
         chosen.append(farthest)
         if progress is not None:
             progress(number + 1)
@@ -98,7 +98,7 @@ def select_points(
 
     Raises:
         UnknownNameError: no such method.
-        DataError: there are not so many distinct points.
+        DataError: there are fewer distinct points.
     """
     rows = torch.arange(len(data), device=data.device) if candidates is None else candidates
     if method == "farthest":
@@ -107,6 +107,8 @@ def select_points(
     if method != "random":
         raise UnknownNameError("method of selection", method, ["farthest", "random"])
     if not 0 < count <= len(rows):
-        raise DataError("so many points cannot be selected", expected=f"1 to {len(rows)}", got=count)
+        raise DataError(
+            f"cannot select {count} of {len(rows)} points", expected=f"1 to {len(rows)}", got=count
+        )
     order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
     return rows[order[:count].to(rows.device)]

@@ -53,7 +53,7 @@ def split_by_selection(
     """The paper's split: training points selected from the whole log, the rest for testing.
 
     Raises:
-        DataError: there are not so many distinct points.
+        DataError: there are fewer distinct points.
     """
     train = select_points(data, count, method=method, seed=seed, progress=progress)
     return Split(train, complement(train, len(data)))
