@@ -11,7 +11,7 @@ import pytest
 
 from forcegp import exchange as module
 from forcegp.errors import DestinationError
-from forcegp.exchange import exchange, recover
+from forcegp.exchange import exchange, is_other_than_folder, recover
 from forcegp.files import atomic_directory, atomic_file, write_text
 from forcegp.temporary import ASIDE, NEW
 
@@ -114,6 +114,24 @@ def test_writers_at_the_same_time_leave_one_whole_folder(tmp_path: Path, way: st
     assert errors == []
     assert content_of(tmp_path / "model")[1:] == "39"
     assert os.listdir(tmp_path) == ["model"]
+
+
+def test_a_folder_that_another_writer_moves_is_never_taken_for_a_file(tmp_path: Path) -> None:
+    """The folder goes right after it was first looked at, as when a second writer moves it aside."""
+    target = folder(tmp_path / "model", "old")
+
+    class Moved(type(target)):
+        def exists(self, **options: object) -> bool:
+            there = super().exists()
+            if there:
+                os.rename(target, tmp_path / "elsewhere")
+            return there
+
+    assert not is_other_than_folder(Moved(target))
+    assert is_other_than_folder(Path(os.devnull))
+    assert not is_other_than_folder(tmp_path / "none")
+    (tmp_path / "file").write_text("")
+    assert is_other_than_folder(tmp_path / "file")
 
 
 def test_a_link_is_written_through(tmp_path: Path) -> None:

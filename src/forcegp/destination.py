@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from forcegp.errors import DestinationError, ForceGPError
+from forcegp.exchange import is_other_than_folder
 
 PROBE_BYTES = 1 << 16
 """Written and removed again to see whether there is room, and whether a quota allows it."""
@@ -41,7 +42,7 @@ def check_destination(
     target = Path(path)
     if target.is_dir() and not folder:
         raise DestinationError(f"{target} is a folder, and a file is to be written there")
-    if target.exists() and not target.is_dir() and folder:
+    if folder and is_other_than_folder(target):
         raise DestinationError(f"{target} is a file, and a folder is to be written there")
     try:
         if target.is_dir():

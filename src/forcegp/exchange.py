@@ -10,6 +10,7 @@ import contextlib
 import ctypes
 import errno
 import os
+import stat
 import sys
 from pathlib import Path
 
@@ -87,6 +88,17 @@ def recover(target: Path) -> None:
         with contextlib.suppress(OSError):
             os.rename(aside, target)
             return
+
+
+def is_other_than_folder(path: Path) -> bool:
+    """Whether a path is taken by something that is not a folder.
+
+    The path is looked at once: between `exists` and `is_dir` another writer can move the folder away.
+    """
+    try:
+        return not stat.S_ISDIR(os.stat(path).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
 
 
 def _remove_asides(target: Path) -> None:

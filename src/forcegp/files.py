@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from forcegp.errors import DestinationError, ForceGPError
-from forcegp.exchange import place, recover
+from forcegp.exchange import is_other_than_folder, place, recover
 from forcegp.limits import HEADER_BYTES, HEADER_DEPTH
 from forcegp.temporary import Temporary, sweep
 
@@ -124,7 +124,7 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
     target = Path(path)
     if target.is_symlink():
         target = target.resolve()
-    if target.exists() and not target.is_dir():
+    if is_other_than_folder(target):
         raise DestinationError(f"{target} is a file, and a folder is to be written there")
     recover(target)
     with _temporary(target, folder=True, mode=0o777) as temporary:
