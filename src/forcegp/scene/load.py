@@ -17,8 +17,17 @@ from forcegp.scene.document import Document
 from forcegp.scene.sections import SceneSections
 from forcegp.simulate.config import SimulationConfig
 
-BUNDLED = ("kuka_plane", "ur5_wiping")
-"""Scenes that come with the library: the paper's task, and a UR5 with undeclared friction."""
+BUNDLED = (
+    "kuka_plane",
+    "kuka_sphere",
+    "kuka_two_points",
+    "panda_sphere",
+    "panda_tilted",
+    "pendulum_wire",
+    "ur5_free",
+    "ur5_wiping",
+)
+"""Scenes that come with the library; `kuka_plane` is the paper's task."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +105,7 @@ def load_scene(source: str | Path) -> Scene:
     """Read a scene file.
 
     Args:
-        source: a path, or the name of a bundled scene (`kuka_plane`, `ur5_wiping`).
+        source: a path, or the name of a bundled scene, one of `BUNDLED`.
 
     Returns:
         The scene; nothing but its file has been read yet.
