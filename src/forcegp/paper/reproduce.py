@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from forcegp.destination import check_destination
 from forcegp.files import write_text
 from forcegp.paper.figures import all_figures
 from forcegp.paper.fits import Fit, fit_model, noise_std_of, score_fit
@@ -77,9 +78,11 @@ def run(
 
     Raises:
         UnknownNameError: no such profile.
+        DestinationError: the folder cannot be written.
     """
     sizes = profile_of(profile) if isinstance(profile, str) else profile
     root = Path(out)
+    check_destination(root, folder=True)
     stages = Stages(root / "stages", progress, say)
     tasks = [make_task(stages, sizes, seed + i) for i in range(sizes.seeds)]
     fits = []
