@@ -72,6 +72,20 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
         typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
 
 
+def check_data_destination(path: Path) -> None:
+    """Check, before long work, that a data set can be written.
+
+    Raises:
+        DataError: the name does not end in `.parquet`.
+        DestinationError: the place cannot be written.
+    """
+    from forcegp.data.table import check_ending
+    from forcegp.destination import check_destination
+
+    check_ending(path)
+    check_destination(path)
+
+
 def read_data(path: Path, differentiate: int | None = None) -> Dataset:
     """Read a data set, computing derivatives that it lacks where a window is given."""
     from forcegp.data import Dataset, SavitzkyGolay
