@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.inference import force_posterior, jitter_of, log_likelihood
+from forcegp.forces.inference import forces_and_constant, jitter_of, log_likelihood
 from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
@@ -228,9 +228,9 @@ def conditioned(
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
-    posterior = force_posterior(problem, hyperparameters)
+    posterior, constant = forces_and_constant(problem, hyperparameters)
     system = learned_system(problem, hyperparameters)
-    likelihood = log_likelihood(posterior) - float(problem.rows(hyperparameters).constant)
+    likelihood = log_likelihood(posterior) - float(constant)
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     jitter = jitter_of(posterior)
     result = FitResult.of(

@@ -79,7 +79,7 @@ def in_motion(spec: Specification, training: Training) -> tuple[Training, tuple[
 def subset(spec: Specification, problem: Problem) -> Problem:
     """The problem on the samples that hyperparameters are learned on."""
     training, finite = problem.training, is_finite(problem.priors)
-    if not is_sparse(spec.inference, problem.priors, training.samples):
+    if not is_sparse(spec.inference, problem.priors, training.all_samples):
         return problem
     most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
     if training.samples > most:
@@ -132,12 +132,12 @@ def _power_of_all(part: Problem, training: Training) -> float:
     """κ of all samples: as much evidence as the part that was learned on, if that was tempered."""
     if part.power == 1.0:
         return 1.0
-    return part.power * part.training.samples / training.samples
+    return part.power * part.training.samples / training.all_samples
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """The problem with the inference that its samples ask for."""
-    if not is_sparse(spec.inference, problem.priors, problem.training.samples):
+    if not is_sparse(spec.inference, problem.priors, problem.training.all_samples):
         return problem
     return without_inducing(problem) if is_finite(problem.priors) else with_inducing(problem, values)
 
