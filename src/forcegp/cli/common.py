@@ -21,6 +21,10 @@ SceneName = Annotated[
 ]
 ModelFolder = Annotated[Path, typer.Option("--model", "-m", help="Folder of a fitted model.")]
 DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
+DataFiles = Annotated[
+    list[Path],
+    typer.Option("--data", "-d", help="Data set, .parquet or .csv; may be given several times."),
+]
 Differentiate = Annotated[
     int | None,
     typer.Option(

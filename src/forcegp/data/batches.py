@@ -5,6 +5,7 @@ A window that reaches beyond a piece sees its neighbours, within the same trajec
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,8 +58,10 @@ def shape_of(path: Path) -> tuple[int, DataHeader]:
             got=file.suffix,
             hint="write the log as Parquet: Dataset.read(path).write('run.parquet')",
         )
-    with opened_parquet(file) as (parquet, _, header):
-        return parquet.metadata.num_rows, header
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Columns that are left out are reported when they are read.
+        with opened_parquet(file) as (parquet, _, header):
+            return parquet.metadata.num_rows, header
 
 
 def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece]:
@@ -95,14 +98,13 @@ def _tables(parquet: pq.ParquetFile, usable: list[str], size: int) -> Iterator[p
     """Tables of `size` rows each, but for the last, whatever the row groups of the file."""
     import pyarrow as pa
 
-    held: pa.Table | None = None
+    held = parquet.schema_arrow.empty_table().select(usable)
     for batch in parquet.iter_batches(batch_size=size, columns=usable, use_threads=False):
-        table = pa.Table.from_batches([batch])
-        held = table if held is None else pa.concat_tables([held, table])
+        held = pa.concat_tables([held, pa.Table.from_batches([batch]).select(usable)])
         while held.num_rows >= size:
             yield held.slice(0, size)
             held = held.slice(size)
-    if held is not None and held.num_rows:
+    if held.num_rows:
         yield held
 
 
@@ -145,7 +147,7 @@ class _Trajectories:
                 got=f"{t[0]:.9g} s",
                 hint="sort the log by time, or number its trajectories in a column 'segment'",
             )
-        starts = raw != np.concatenate([[raw[0] if self.raw is None else self.raw], raw[:-1]])
+        starts = np.append(self.raw is not None and raw[0] != self.raw, raw[1:] != raw[:-1])
         fresh = {float(raw[0])} if self.raw is None else set()
         fresh |= set(raw[starts].astype(float).tolist())
         again = fresh & self.known
@@ -158,13 +160,13 @@ class _Trajectories:
             )
         self.known |= fresh
         columns["segment"] = self._counted(starts)
-        self.raw, self.last_number = raw[-1], int(columns["segment"][-1])
+        self.raw, self.last_number = float(raw[-1]), int(columns["segment"][-1])
         self.time = -np.inf if t is None else float(t[-1])
 
     def peek(self, columns: Columns) -> None:
         """Number rows that come next, without passing on to them."""
         raw = columns["segment"]
-        columns["segment"] = self._counted(raw != np.concatenate([[self.raw], raw[:-1]]))
+        columns["segment"] = self._counted(np.append(raw[0] != self.raw, raw[1:] != raw[:-1]))
 
     def _counted(self, starts: NDArray[np.bool_]) -> NDArray[np.int64]:
         return (self.last_number + np.cumsum(starts)).astype(np.int64)

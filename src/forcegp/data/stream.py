@@ -169,4 +169,3 @@ def _joined(parts: list[Dataset]) -> Dataset:
         raise DataError("there are no samples to read", expected="at least one", got="none")
     segment = torch.cat([part.segment for part in parts])
     return Dataset.concatenate(parts).replace(segment=segment, header=parts[0].header)
-

@@ -18,7 +18,7 @@ from forcegp.gp.bound import bound_of
 from forcegp.gp.capacity import require_exact_fits
 from forcegp.gp.decomposition import split
 from forcegp.gp.exact import ExactPosterior
-from forcegp.gp.inducing import CANDIDATES, select_inducing
+from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
 from forcegp.gp.sparse import SparsePosterior
 
 METHODS = ("auto", "exact", "sparse")
@@ -48,8 +48,14 @@ def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> boo
 
 
 @torch.no_grad()
-def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> Problem:
-    """The problem with inducing points chosen from its data by conditional variance."""
+def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit: int = LIMIT) -> Problem:
+    """The problem with inducing points chosen from its data by conditional variance.
+
+    Args:
+        problem: with the samples that are conditioned on.
+        hyperparameters: of the priors.
+        limit: maximum number of inducing points of one prior.
+    """
     training = problem.training
     few = dataclasses.replace(problem, training=training.evenly(CANDIDATES))
     blocks = few.rows(hyperparameters).blocks
@@ -58,6 +64,7 @@ def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> Pr
         kernel_parameters(hyperparameters),
         blocks,
         rows=round(sum(block.rows for block in blocks) * training.all_samples / few.training.samples),
+        limit=limit,
     )
     return dataclasses.replace(problem, inducing=tuple(selection.points for selection in chosen))
 

@@ -183,7 +183,7 @@ class Training:
         measurements: the values.
         noise_std: of each measurement, `(d,)` or `(n, d)`.
         scales: standardization of the inputs of each prior.
-        part_of: number of samples that these are a part of, where all are conditioned on; 0 where these are all.
+        part_of: number of samples that are conditioned on, of which these are a part; 0 where these are all.
     """
 
     measurements: tuple[Measurement, ...]
@@ -282,7 +282,7 @@ def training_of(
             "there are no samples to learn from", expected="at least one observation", got="none"
         )
     pairs = [measurement_of(o, system, noise_std) for o in observations]
-    at = [m.at(system) for m, _ in pairs]
+    at = [m.at(system) for m, _ in pairs] if any(prior.name not in kept for prior in priors) else []
     scales = []
     for prior in priors:
         if prior.name in kept:

@@ -1,4 +1,4 @@
-"""Sparse conditioning a piece of the log at a time: the sums over samples, and the posterior that they give."""
+"""Sparse conditioning piece by piece: the sums over samples, and the posterior that they give."""
 
 from __future__ import annotations
 

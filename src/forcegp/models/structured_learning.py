@@ -55,12 +55,14 @@ class Lesson:
         problem: all samples, the updated robot, and the noise.
         hyperparameters: learned and held.
         learned: how the optimisation went.
+        learned_on: number of samples that were learned on.
         warnings: doubts that came up.
     """
 
     problem: Problem
     hyperparameters: dict[str, Tensor]
-    learned: Learned | None
+    learned: Learned | None = None
+    learned_on: int | None = None
     warnings: tuple[str, ...] = ()
 
 
@@ -111,7 +113,7 @@ def solve(
     correlated = spec.learns_torque_noise and TORQUE_NOISE in search.start
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)
-    learned = search.solve(part, progress, begin)
+    learned, learned_on = search.solve(part, progress, begin), part.training.samples
     values = {**search.held, **learned.tensors}
     if correlated:
         part = dataclasses.replace(part, power=likelihood_power(part, values))
@@ -125,7 +127,7 @@ def solve(
         power=_power_of_all(part, problem.training),
         inducing=None,
     )
-    return Lesson(prepared(spec, whole, values), values, learned)
+    return Lesson(prepared(spec, whole, values), values, learned, learned_on)
 
 
 def _power_of_all(part: Problem, training: Training) -> float:
@@ -139,7 +141,9 @@ def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]
     """The problem with the inference that its samples ask for."""
     if not is_sparse(spec.inference, problem.priors, problem.training.all_samples):
         return problem
-    return without_inducing(problem) if is_finite(problem.priors) else with_inducing(problem, values)
+    if is_finite(problem.priors):
+        return without_inducing(problem)
+    return with_inducing(problem, values, spec.inducing_points)
 
 
 @torch.no_grad()
