@@ -15,7 +15,7 @@ from forcegp.errors import DataError
 from logs import random_log
 
 SAME_FILTER = 1e-8
-"""Of a derivative: the filter runs over other rows of the same numbers, divided by the square of the period."""
+"""Of a derivative: the filter runs over other rows; rounding is divided by the square of the period."""
 METHOD = SavitzkyGolay(window=11)
 
 
@@ -68,7 +68,9 @@ def test_derivatives_do_not_reach_across_trajectories_nor_stop_at_pieces(tmp_pat
     pieces = list(StreamedDataset((path,), METHOD).pieces())
     for name in ("qd", "qdd"):
         want = getattr(whole, name)
-        torch.testing.assert_close(joined(pieces, name), want, rtol=0.0, atol=SAME_FILTER * float(want.abs().max()))
+        torch.testing.assert_close(
+            joined(pieces, name), want, rtol=0.0, atol=SAME_FILTER * float(want.abs().max())
+        )
 
 
 def test_joints_are_selected_and_kept_in_the_robots_order(tmp_path: Path) -> None:
@@ -97,8 +99,8 @@ def test_what_cannot_be_streamed(tmp_path: Path) -> None:
     log = segmented()
     good, bad = tmp_path / "good.parquet", tmp_path / "bad.parquet"
     log.write(good)
+    (tmp_path / "a.csv").write_text("t,q.a\n")
     with pytest.raises(DataError, match=r"only Parquet files[\s\S]*\.csv"):
-        (tmp_path / "a.csv").write_text("t,q.a\n")
         StreamedDataset((tmp_path / "a.csv",))
     with pytest.raises(DataError, match="no such file"):
         StreamedDataset((tmp_path / "gone.parquet",))

@@ -82,7 +82,9 @@ def fit(
     with progress_bar(f"fitting {model}", 1) as progress:
         fitted = regression.fit(
             training,  # pyright: ignore[reportArgumentType]  # a stream for a structured GP only
-            progress=lambda done, most, value: progress(done, most, "" if math.isnan(value) else f"objective {value:.4g}"),
+            progress=lambda done, most, value: progress(
+                done, most, "" if math.isnan(value) else f"objective {value:.4g}"
+            ),
             **settings,
         )
     write_or_keep(fitted.save, out)
