@@ -29,7 +29,7 @@ from forcegp.storage.folder import Settings
 KIND = "structured_gp"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StructuredFit(FittedModel):
     """Priors on forces conditioned on data, with learned hyperparameters.
 
@@ -53,6 +53,14 @@ class StructuredFit(FittedModel):
 
     kind = KIND
     has_function_samples = True
+
+    def described(self) -> list[tuple[str, object]]:
+        return [
+            ("training samples", sum(len(part.q) for part in self.training.measurements)),
+            *((f"prior {prior.name}", type(prior).__name__) for prior in self.posterior.priors),
+            *((f"noise of {name}", std) for name, std in self.noise.items()),
+            *([] if self.torque_std is None else [("noise of the torque", self.torque_std)]),
+        ]
 
     @property
     def training(self) -> Training:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -114,6 +115,19 @@ class StructuredGP(Model[StructuredFit]):
     def noise_std(self) -> NoiseStd | None:
         """Noise of measured accelerations as given, `None` for what the log states."""
         return self.specification.noise_std
+
+    def get_params(self) -> dict[str, Any]:
+        spec = self.specification
+        return {
+            "system": spec.system,
+            "mean": spec.mean,
+            "force_priors": None if spec.automatic else spec.priors,
+            "noise_std": spec.noise_std,
+            "learn_noise": spec.learn_noise,
+            "analytical_parameters": spec.parameters,
+            "torque_noise": "auto" if spec.automatic else spec.torque_noise,
+            "inference": spec.inference,
+        }
 
     # -- learning ---------------------------------------------------------------------------------
 
