@@ -11,10 +11,11 @@ import torch
 import forcegp
 from forcegp.errors import ModelError
 from forcegp.forces.inference import force_posterior, log_likelihood, without_inducing
-from forcegp.forces.learn import TORQUE_NOISE, kernel_parameters
+from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.quantities import affine_map
+from forcegp.forces.torque_noise import TORQUE_NOISE
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
 

@@ -77,11 +77,12 @@ def force_posterior(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> 
     """
     scales, params = problem.training.scales, kernel_parameters(hyperparameters)
     latent = _conditioned(problem, params, problem.rows(hyperparameters).blocks)
+    coulomb = problem.coulomb(hyperparameters)
     if not problem.pinned:
-        return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets)
+        return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, coulomb=coulomb)
     known = problem.of_means().rows(hyperparameters).blocks
     central = _conditioned(problem, params, problem.silenced(known))
-    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central)
+    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central, coulomb)
 
 
 def _conditioned(problem: Problem, params: Parameters, blocks: list[Block]) -> LatentPosterior:

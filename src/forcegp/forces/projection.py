@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.coulomb import CoulombFriction, coupled
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, ForcePrior
 from forcegp.forces.quantities import AffineMap, States, affine_map
@@ -128,6 +129,7 @@ def whiten(
     noise_std: Tensor,
     force_noise: ForceNoise | None = None,
     offsets: Mapping[str, Tensor] | None = None,
+    coulomb: Sequence[CoulombFriction] = (),
 ) -> WhitenedRows:
     """Rows of one measurement with unit white noise, without noise-free directions.
 
@@ -139,9 +141,10 @@ def whiten(
         noise_std: `(d,)` or `(n, d)` standard deviation of each component.
         force_noise: variance of the white noise on the joint force.
         offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
+        coulomb: friction of contacts that is proportional to the multiplier.
     """
     at = measurement.at(system)
-    z = affine_map(system, at, measurement.quantity)
+    z = coupled(system, at, affine_map(system, at, measurement.quantity), coulomb)
     std = noise_std.expand_as(measurement.values)
     operators = prior_operators(priors, system, at, z)
     expected = prior_mean(system, at, z, mean)

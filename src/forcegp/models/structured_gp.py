@@ -19,7 +19,7 @@ from forcegp.forces.learn import Problem, Search
 from forcegp.forces.mean import AnalyticalMean, mean_of
 from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ANALYTICAL, NOISE, ForcePrior, check_priors
+from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
@@ -237,7 +237,7 @@ class StructuredGP(Model[StructuredFit]):
 
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""
-        names = (*(prior.name for prior in self.force_priors), NOISE, ANALYTICAL)
+        names = (*(prior.name for prior in self.force_priors), NOISE, ANALYTICAL, COULOMB)
         chosen = names if learn is None else tuple(learn)
         for name in chosen:
             if name not in names:

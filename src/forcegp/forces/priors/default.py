@@ -48,7 +48,7 @@ def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
         system: robot and contacts.
     """
     surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
-    return (JointFrictionPrior(), *(SlidingFrictionPrior(name) for name in surfaces))
+    return (JointFrictionPrior(), *(SlidingFrictionPrior(name, coupled=True) for name in surfaces))
 
 
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
