@@ -41,8 +41,9 @@ class StructuredGP(Model[StructuredFit]):
         mean: `"zero"`, `"analytical"`, or an `AnalyticalMean` with some terms left out.
         force_priors: priors on the unknown forces. The default depends on the mean and on the data: around
             the analytical forces of a measured robot, `measured_priors` (friction of each joint and contact,
-            noise of the torque); else `default_priors`: a `JointForcePrior`, and in contact its
-            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest.
+            noise of the torque); else `default_priors`: a `JointForcePrior`, in contact its
+            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest,
+            and around the analytical forces a `SlidingFrictionPrior` for each surface.
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states (`qdd_std` by sample, else its header), else 0.1.
         learn_noise: whether the noise is a hyperparameter too, starting from `noise_std`.
