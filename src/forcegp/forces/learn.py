@@ -66,6 +66,7 @@ class Problem:
         pinned: priors whose force has mean zero from here on, since the robot contains it; the others are
             conditioned on that, and only the uncertainty of the pinned ones remains.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
+        state_std: standard deviation of the noise of q and q̇, `(2 nq,)`, or `None` for none.
     """
 
     system: ConstrainedSystem
@@ -78,6 +79,7 @@ class Problem:
     offsets: Mapping[str, Tensor] = field(default_factory=dict)
     inducing: tuple[Features, ...] | None = None
     pinned: tuple[str, ...] = ()
+    state_std: Tensor | None = None
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """The system with the robot at the analytical parameters among the tensors."""
@@ -120,6 +122,7 @@ class Problem:
                     force_noise,
                     self.offsets,
                     friction,
+                    self.state_std,
                 )
                 for i, m in enumerate(self.training.measurements)
             ]

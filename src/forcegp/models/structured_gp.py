@@ -21,6 +21,7 @@ from forcegp.forces.measurements import NoiseStd, Observation, Training, trainin
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
+from forcegp.forces.state_noise import state_std_of
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
@@ -49,6 +50,11 @@ class StructuredGP(Model[StructuredFit]):
         learn_noise: whether the noise is a hyperparameter too, starting from `noise_std`.
         analytical_parameters: a module whose `forward()` gives the robot with its analytical parameters θ_A
             as learned tensors; `None` keeps the robot as it is.
+        torque_noise: standard deviation of the motor torque's white noise [N m, N], `"learn"`, `None` for
+            none, or `"auto"`: learned with priors for measured robots.
+        inference: `"exact"`, `"sparse"` or `"auto"`.
+        state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
+            or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
 
     Raises:
         ModelError, UnknownNameError: the priors do not fit the system.
@@ -67,10 +73,12 @@ class StructuredGP(Model[StructuredFit]):
         analytical_parameters: nn.Module | None = None,
         torque_noise: NoiseStd | str | None = "auto",
         inference: str = "auto",
+        state_noise: tuple[NoiseStd, NoiseStd] | None = None,
     ) -> None:
         form = mean_of(mean)
         priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
         check_priors(priors, system)
+        state_std_of(state_noise, system.robot)
         self.specified = system
         self.specification = Specification(
             system,
@@ -82,6 +90,7 @@ class StructuredGP(Model[StructuredFit]):
             torque_noise_of(torque_noise, priors),
             check_method(inference),
             force_priors is None and torque_noise == "auto" and "actuation" in form.terms,
+            state_noise,
         )
 
     @classmethod

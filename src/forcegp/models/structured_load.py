@@ -77,6 +77,7 @@ def _specification(
         parameters,
         settings.torque_noise,
         settings.inference,
+        state_noise=settings.state_noise,
     )
 
 
