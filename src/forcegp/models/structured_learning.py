@@ -120,20 +120,11 @@ def solve(
         values = {**search.held, **learned.tensors}
         part = with_updated_robot(part, values)
         values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
-    whole = dataclasses.replace(
-        part,
-        training=problem.training,
-        power=_power_of_all(part, problem.training),
-        inducing=None,
-    )
+    if correlated and part.training is not problem.training:
+        # Neighbours in the whole log are closer in time than in the part that was learned on.
+        part = dataclasses.replace(part, power=likelihood_power(part, values, problem.training))
+    whole = dataclasses.replace(part, training=problem.training, inducing=None)
     return Lesson(prepared(spec, whole, values), values, learned)
-
-
-def _power_of_all(part: Problem, training: Training) -> float:
-    """κ of all samples: as much evidence as the part that was learned on, if that was tempered."""
-    if part.power == 1.0:
-        return 1.0
-    return part.power * part.training.samples / training.samples
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
