@@ -106,9 +106,8 @@ def forces_and_constant(
     if problem.pinned:
         known = problem.silenced(problem.of_means().rows(hyperparameters).blocks)
         central = ExactPosterior.of(problem.priors, params, known)
-    posterior = ForcePosterior(
-        problem.priors, scales, problem.mean, latent, problem.offsets, central, coulomb
-    )
+    coulomb, offsets = problem.coulomb(hyperparameters), problem.offsets
+    posterior = ForcePosterior(problem.priors, scales, problem.mean, latent, offsets, central, coulomb)
     return posterior, rows.constant
 
 
