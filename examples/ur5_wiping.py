@@ -6,7 +6,7 @@ MuJoCo's own solver makes contact and friction, so that the truth is not made of
 joints have Coulomb and viscous friction that the robot file does not declare.
 """
 
-# %% Six seconds of wiping, with lifts
+# %% Eight seconds of wiping, with lifts
 import dataclasses
 import sys
 
@@ -17,15 +17,15 @@ from forcegp.simulate import simulate
 figure = next((x for x in sys.argv[1:] if x.endswith(".png")), "ur5_wiping.png")
 scene = forcegp.load_scene("ur5_wiping")
 system = scene.system()
-data = simulate(system, dataclasses.replace(scene.simulation, duration=6.0)).data
-train, test = data[:1000:10], data[1000:]
+data = simulate(system, dataclasses.replace(scene.simulation, duration=8.0)).data
+train, test = data[:1250:10], data[1250:]
 print(data)
 
 # %% Priors on the friction of each joint and of the contact; the noise is learned
 fit = forcegp.StructuredGP(system, "analytical", measured_priors(system)).fit(train)
 print(fit)
 
-# %% The normal force of the last two seconds beside MuJoCo's, which the model has never seen
+# %% The normal force of the last three seconds beside MuJoCo's, which the model has never seen
 closed = test.contact["table"]
 force = fit.predict(test.q, test.qd, test.tau, "multiplier", active=closed[:, None])
 error = (force.mean[:, 0] - test.multiplier["table"])[closed]
