@@ -30,11 +30,12 @@ class Predicts(Protocol):
 
 def predicted(model: Predicts, data: Dataset, quantity: str, **settings: Any) -> Prediction:
     """Predict a quantity at the states of a data set; contacts are closed where the log says so."""
-    active = data.active(model.system.contact_names)
+    system = settings.get("system") or model.system
+    active = data.active(system.contact_names)
     return model.predict(data.q, data.qd, data.tau, quantity, active=active, **settings)
 
 
-def measured(model: Predicts, data: Dataset, quantity: str) -> Tensor:
+def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:
     """Logged values `(n, d)` of a quantity.
 
     Raises:
@@ -43,13 +44,13 @@ def measured(model: Predicts, data: Dataset, quantity: str) -> Tensor:
     """
     if quantity not in COLUMNS:
         raise UnknownNameError("measured quantity", quantity, COLUMNS)
-    return COLUMNS[quantity](data, model.system)
+    return COLUMNS[quantity](data, system)
 
 
-def measured_if_logged(model: Predicts, data: Dataset, quantity: str) -> Tensor | None:
+def measured_if_logged(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor | None:
     """Logged values `(n, d)` of a quantity, or `None`."""
     try:
-        return measured(model, data, quantity)
+        return measured(system, data, quantity)
     except ForceGPError:
         return None
 
@@ -59,7 +60,7 @@ def score(model: Predicts, data: Dataset, quantity: str) -> float:
     data.check_robot(model.system.robot)
     if len(data) < 2:
         raise DataError("a score needs two samples or more", got=len(data))
-    true = measured(model, data, quantity)
+    true = measured(model.system, data, quantity)
     means = [
         predicted(model, data[first : first + CHUNK], quantity, covariance=False).mean
         for first in range(0, len(data), CHUNK)
