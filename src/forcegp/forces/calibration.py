@@ -135,7 +135,7 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
     residuals, variances = [], []
     for i in _motions(training):
         m = training.measurements[i]
-        group = _groups(m.segment)
+        group = stretches(m.segment)
         for g in group.unique().tolist():
             own = (group == g).nonzero()[:, 0]
             rest = dataclasses.replace(problem, training=training.without(i, own))
@@ -148,7 +148,7 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
     return torch.stack([_unit_scale(r2[:, j], V[:, j], least[j]) for j in range(len(least))])
 
 
-def _groups(segment: Tensor) -> Tensor:
+def stretches(segment: Tensor) -> Tensor:
     """Which stretch each sample belongs to: its segment, or an eighth of the log where segments are few."""
     _, own = segment.unique(return_inverse=True)
     if int(own.max()) + 1 >= 3:

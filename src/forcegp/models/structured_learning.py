@@ -11,12 +11,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from forcegp.dynamics import mass_matrix
 from forcegp.forces.calibration import held_out_torque_std, likelihood_power
 from forcegp.forces.inference import (
     force_posterior,
@@ -44,6 +45,8 @@ REST_SPEED = 0.01
 """A sample is at rest where no joint moves faster [rad/s, m/s]."""
 FEWEST_MOVING = 20
 """With fewer samples in motion, samples at rest are kept."""
+VOLUME_STATES = 100
+"""States that the volume of the noise is averaged over."""
 FIRST_POWER = 0.25
 """Power of the likelihood before the correlation of its residuals is known."""
 
@@ -155,9 +158,9 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
             posterior = force_posterior(problem, values)
             features = _one_row(posterior, problem)
             mean = posterior.latent.latent_mean(p, features[p])[0]
-            robot, moved = prior.updated(
-                problem.system.robot, mean, _precision(posterior, features, p, problem.system.robot)
-            )
+            precision = _precision(posterior, features, p, problem.system.robot)
+            volume = _log_volume(problem, values)
+            robot, moved = prior.updated(problem.system.robot, mean, precision, volume)
             # The prior keeps the scale of the file's parameters, not that of the updated ones.
             return dataclasses.replace(
                 problem,
@@ -167,6 +170,39 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
                 pinned=(prior.name,),
             )
     return problem
+
+
+def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor]:
+    """κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| at the samples in free motion, as a function of the robot.
+
+    With it, the density of the torque's error is that of the acceleration's. Without it, a robot that has
+    next to no inertia explains small torques best, whatever it does to the accelerations.
+    """
+    terms = []
+    std = problem.system.robot.mass.new_zeros(problem.system.robot.nq)
+    if TORQUE_NOISE in values:
+        std = values[TORQUE_NOISE].exp()
+    elif problem.torque_std is not None:
+        std = problem.torque_std
+    for i in (i for i, quantity in enumerate(problem.training.quantities) if quantity == "qdd"):
+        m = problem.training.measurements[i]
+        free = (~m.active.any(-1)).nonzero()[:, 0]
+        if not len(free):
+            continue
+        q = m.q[free[torch.linspace(0, len(free) - 1, min(VOLUME_STATES, len(free))).round().long()]]
+        noise = problem.noise_at(values, i)
+        spread = (noise if noise.ndim == 1 else noise.square().mean(0).sqrt()).detach() ** 2
+        terms.append((q, problem.power * len(free) / len(q), spread))
+
+    def volume(robot: RobotModel) -> Tensor:
+        total = robot.mass.new_zeros(())
+        for q, weight, spread in terms:
+            M = mass_matrix(robot, q)
+            C = torch.diag(std**2) + (M * spread) @ M.mT
+            total = total + weight * (torch.logdet(M) - 0.5 * torch.logdet(C)).sum()
+        return total
+
+    return volume
 
 
 def _one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
