@@ -83,7 +83,9 @@ def evaluate(
         def write(folder: Path) -> None:
             with atomic_directory(folder) as temporary:
                 write_json(temporary / "evaluation.json", found.to_dict())
-                write_evaluation(temporary, str(model or config or scene), str(data), found, window, fitted_to)
+                write_evaluation(
+                    temporary, str(model or config or scene), str(data), found, window, fitted_to
+                )
 
         write_or_keep(write, out)
         result |= {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}
