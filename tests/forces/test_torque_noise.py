@@ -116,7 +116,7 @@ def test_torque_noise_that_is_not_valid(given: object) -> None:
 
 
 def test_a_joint_that_sticks_has_a_spread_of_its_own() -> None:
-    """Friction of some 2 N m of a joint that hardly moves is learned as a spread, and read where it sticks."""
+    """Friction within ±2 N m of a joint that hardly moves is learned as a spread, read where it sticks."""
     generator = torch.Generator().manual_seed(3)
     robot = forcegp.load_robot("double_pendulum")
     robot = robot.replace(damping=torch.zeros_like(robot.damping), friction=torch.zeros_like(robot.friction))

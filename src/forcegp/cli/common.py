@@ -25,6 +25,10 @@ Config = Annotated[
     Path | None,
     typer.Option(help="TOML file with a table \\[model], in place of the scene's: priors, learning."),
 ]
+DataFiles = Annotated[
+    list[Path],
+    typer.Option("--data", "-d", help="Data set, .parquet or .csv; may be given several times."),
+]
 Differentiate = Annotated[
     int | None,
     typer.Option(

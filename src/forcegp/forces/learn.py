@@ -32,6 +32,8 @@ from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, m
 from forcegp.gp.structured_covariance import Block
 
 Tensors = dict[str, Tensor]
+START_SAMPLES = 5000
+"""Evenly spaced samples that the start of learning is computed from, where there are more."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -151,10 +153,13 @@ class Problem:
 
     def initial(self, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
         """Default start of everything that can be learned."""
-        start = initial_hyperparameters(self.priors, self.fixed_rows.blocks)
+        few = self
+        if self.training.samples > START_SAMPLES:
+            few = dataclasses.replace(self, training=self.training.evenly(START_SAMPLES))
+        start = initial_hyperparameters(self.priors, few.fixed_rows.blocks)
         start |= initial_coulomb(self.priors, self.system.robot.mass)
         if learn_torque_noise:
-            start |= initial_torque_noise(self.torque_residual())
+            start |= initial_torque_noise(few.torque_residual())
         if learn_noise:
             noise = self.training.noise_std
             start |= {noise_key(i): _typical(std).double().log() for i, std in enumerate(noise)}

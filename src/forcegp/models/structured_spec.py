@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
@@ -29,6 +29,7 @@ from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.state_noise import state_std_of
 from forcegp.gp import kernels, stationary
 from forcegp.gp.exact import ExactPosterior
+from forcegp.gp.inducing import LIMIT
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sparse_tensors import tensors_of_posterior
 from forcegp.models.base import FitResult
@@ -72,6 +73,7 @@ class Specification:
         parameters: module whose `forward()` gives the robot at θ_A, or `None`.
         torque_noise: standard deviation of the motor torque's white noise, `"learn"`, or `None` for none.
         inference: `"auto"`, `"exact"` or `"sparse"`.
+        inducing_points: maximum number of inducing points of one prior.
         automatic: whether the priors depend on whether the data are simulated or measured.
         state_noise: standard deviations of the noise of q and of q̇, or `None` for none.
     """
@@ -84,7 +86,7 @@ class Specification:
     parameters: nn.Module | None = None
     torque_noise: NoiseStd | str | None = None
     inference: str = "auto"
-
+    inducing_points: int = LIMIT
     automatic: bool = False
     state_noise: tuple[NoiseStd, NoiseStd] | None = None
 
@@ -150,6 +152,13 @@ class ResultSettings(Settings):
     message: str
     force_correlation: float | None
     warnings: tuple[str, ...]
+    inference: str = ""
+    samples: NonNegativeInt | None = None
+    learned_on: NonNegativeInt | None = None
+    basis_functions: NonNegativeInt | None = None
+    determined: float | None = None
+    missed: float | None = None
+    more_points_would_help: bool | None = None
 
 
 class StructuredSettings(Settings):
@@ -161,6 +170,7 @@ class StructuredSettings(Settings):
     torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["learn"] | None
     state_noise: tuple[Stated, Stated] | None
     inference: Literal["auto", "exact", "sparse"]
+    inducing_points: PositiveInt = LIMIT
     power: float = Field(gt=0.0, le=1.0)
     priors: tuple[dict[str, Any], ...]
     pinned: tuple[str, ...]
@@ -199,6 +209,7 @@ def pack(
         torque_noise=_plain(spec.torque_noise),
         state_noise=None if spec.state_noise is None else tuple(map(_plain, spec.state_noise)),  # pyright: ignore[reportArgumentType]
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
+        inducing_points=spec.inducing_points,
         power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
