@@ -364,7 +364,8 @@ def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[s
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
     record, robot = pack_system(problem.system)
     named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
+    state = () if problem.state_std is None else (problem.state_std,)
     return Checkpoint.key_of(
         problem.mean, priors, spec.inference, search.options, training.quantities, *data, *training.noise_std,
-        record, *robot.values(), *(part for pair in named for part in pair),
+        record, *robot.values(), *(part for pair in named for part in pair), *state,
     )  # fmt: skip

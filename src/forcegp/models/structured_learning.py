@@ -1,6 +1,7 @@
 """How a structured Gaussian process is learned: on which samples, with which inference, in which steps.
 
-1. Samples at rest say nothing but that friction is below a limit; robots that are measured learn from motion.
+1. Samples at rest say nothing but that friction is below a limit, and impacts break the equations of motion;
+   robots that are measured learn from motion without impacts.
 2. Hyperparameters are learned on a part of a long log, or on all of a short one.
 3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more.
 4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from forcegp.dynamics import mass_matrix
 from forcegp.forces.calibration import held_out_torque_std, likelihood_power
+from forcegp.forces.impacts import without_impacts
 from forcegp.forces.inference import (
     force_posterior,
     is_finite,
@@ -71,7 +73,7 @@ class Lesson:
 
 
 def in_motion(spec: Specification, training: Training) -> tuple[Training, tuple[str, ...]]:
-    """The samples in motion, for models that learn the torque noise of a measured robot."""
+    """The samples in motion, without impacts, for models that learn the torque noise of a measured robot."""
     if not spec.learns_torque_noise:
         return training, ()
     moving = training.moving(REST_SPEED)
@@ -79,7 +81,12 @@ def in_motion(spec: Specification, training: Training) -> tuple[Training, tuple[
         return training, (
             f"only {moving.samples} samples are in motion: friction cannot be told from noise at rest",
         )
-    return moving, ()
+    moving, impacts = without_impacts(moving, spec.system)
+    if not impacts:
+        return moving, ()
+    return moving, (
+        f"{impacts} samples in contact were left out as impacts: they accelerate off the surface or into it",
+    )
 
 
 def subset(spec: Specification, problem: Problem) -> Problem:

@@ -54,7 +54,7 @@ def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
     Args:
         system: robot and contacts.
     """
-    sliding = (SlidingFrictionPrior(name, coupled=True) for name in _surfaces(system))
+    sliding = (SlidingFrictionPrior(name, Linear(), coupled=True) for name in _surfaces(system))
     return (JointFrictionPrior(), *sliding)
 
 
