@@ -124,6 +124,9 @@ def test_a_mesh_outside_of_the_folder_is_not_read(tmp_path: Path, name: str) -> 
     assert all(shape.kind != "mesh" for shape in shapes_of(robot, path)), "rods instead"
 
 
+NOT_SIZES = ('<box size="1 2"/>', '<sphere radius="nan"/>', '<cylinder radius="1"/>')
+
+
 @pytest.mark.parametrize("geometry", NOT_SIZES)
 def test_wrong_numbers_are_named(tmp_path: Path, geometry: str) -> None:
     robot, path = write(tmp_path, '<sphere radius="1"/>')
