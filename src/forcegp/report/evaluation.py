@@ -56,7 +56,7 @@ def write_evaluation(
     write_text(folder / WINDOW, window.to_json())
     page = render(
         "evaluation.html.j2",
-        title=f"{label(found.kind)} on {Path(data).name}",
+        title=f"{Path(model).name} ({label(found.kind)}) on {Path(data).name}",
         model=model,
         data=data,
         found=found,
