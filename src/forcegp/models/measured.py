@@ -12,7 +12,6 @@ from forcegp.data import Dataset
 from forcegp.data.fields import AXES
 from forcegp.errors import DataError, ForceGPError, UnknownNameError
 from forcegp.forces.measurements import COLUMNS
-from forcegp.models.prediction import Prediction
 
 CHUNK = 2000
 """States that are predicted at once, to bound the memory."""
@@ -28,8 +27,8 @@ class Predicts(Protocol):
     def predict(self) -> Any: ...
 
 
-def predicted(model: Predicts, data: Dataset, quantity: str, **settings: Any) -> Prediction:
-    """Predict a quantity at the states of a data set; contacts are closed where the log says so."""
+def predicted(model: Predicts, data: Dataset, quantity: str, **settings: Any) -> Any:
+    """The `Prediction` of a quantity at logged states; contacts are closed where the log says so."""
     system = settings.get("system") or model.system
     active = data.active(system.contact_names)
     return model.predict(data.q, data.qd, data.tau, quantity, active=active, **settings)
