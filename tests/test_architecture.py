@@ -46,6 +46,7 @@ LAYERS = (
     ("rollout",),
     ("models",),
     ("evaluation",),
+    ("view",),
     ("report",),
     ("paper",),
     ("cli",),

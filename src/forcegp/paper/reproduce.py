@@ -15,6 +15,7 @@ from forcegp.files import write_text
 from forcegp.paper.figures import all_figures
 from forcegp.paper.fits import Fit, noise_std_of, score_fit
 from forcegp.paper.jobs import fits_of, models_of, run_ahead, splits_of
+from forcegp.paper.motion import write_motion
 from forcegp.paper.page import render_markdown, render_page
 from forcegp.paper.profiles import Profile, profile_of
 from forcegp.paper.results import Results, Score
@@ -96,7 +97,7 @@ def run(
     results = _results(sizes, tasks, scores, stages)
     write_text(root / RESULTS, results.to_json())
     write_text(root / MARKDOWN, render_markdown(results, figures))
-    write_text(root / PAGE, render_page(results, figures))
+    write_text(root / PAGE, render_page(results, figures, write_motion(root, tasks[0], fits)))
     done = stages.done.values()
     return Reproduction(root / PAGE, results, sum(stage.reused for stage in done), len(done))
 
