@@ -27,7 +27,7 @@ from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Lesson, in_motion, prepared, solve
 from forcegp.models.structured_spec import Specification, torque_noise_of
-from forcegp.models.structured_stream import Pass, sample_of
+from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
@@ -155,7 +155,7 @@ class StructuredGP(Model[StructuredFit]):
             ModelError, DataError, UnknownNameError: the data, or the checkpoint, do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
-        sample, known = None, data
+        sample, neighbours, known = None, None, data
         if isinstance(known, StreamedDataset):
             sample = sample_of(self.specification, known)
             known = sample.data
@@ -169,6 +169,7 @@ class StructuredGP(Model[StructuredFit]):
         if sample is not None:
             training = dataclasses.replace(training, part_of=sample.count)
             log = Pass(spec, sample, file, progress, distributed)
+            neighbours = neighbours_of(spec, sample, training)
         problem = spec.problem(training)
         search, saved = self._search(problem, chosen, options), None
         if search.start:
@@ -176,7 +177,7 @@ class StructuredGP(Model[StructuredFit]):
                 saved = Checkpoint(file, _key(spec, problem, search, begin))
                 saved.read(search.start)
                 search = dataclasses.replace(search, recorded=saved.recorded)
-            lesson = solve(spec, problem, search, _reported(progress, options), begin)
+            lesson = solve(spec, problem, search, _reported(progress, options), begin, neighbours)
             if saved is not None:
                 saved.write()
         else:

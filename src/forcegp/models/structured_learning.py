@@ -97,6 +97,7 @@ def solve(
     search: Search,
     progress: Progress | None = None,
     begin: Mapping[str, Tensor] | None = None,
+    neighbours: Training | None = None,
 ) -> Lesson:
     """Learn what is free in a search, then prepare the problem that is conditioned on.
 
@@ -106,6 +107,7 @@ def solve(
         search: what is learned and what is held.
         progress: called after each evaluation.
         begin: where to begin.
+        neighbours: samples as close in time as those of the log, where those of the problem are a part of it.
     """
     part = subset(spec, problem)
     if part.inducing is None:
@@ -121,20 +123,12 @@ def solve(
         values = {**search.held, **learned.tensors}
         part = with_updated_robot(part, values)
         values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
-    whole = dataclasses.replace(
-        part,
-        training=problem.training,
-        power=_power_of_all(part, problem.training),
-        inducing=None,
-    )
+    if correlated and part.training is not problem.training:
+        # Neighbours in the whole log are closer in time than in the part that was learned on.
+        power = likelihood_power(part, values, neighbours or problem.training)
+        part = dataclasses.replace(part, power=power)
+    whole = dataclasses.replace(part, training=problem.training, inducing=None)
     return Lesson(prepared(spec, whole, values), values, learned, learned_on)
-
-
-def _power_of_all(part: Problem, training: Training) -> float:
-    """κ of all samples: as much evidence as the part that was learned on, if that was tempered."""
-    if part.power == 1.0:
-        return 1.0
-    return part.power * part.training.samples / training.all_samples
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:

@@ -26,7 +26,7 @@ class RolloutOptions:
         stabilization: `none`, `baumgarte` (the system's own terms, or the default ones), other
             `Baumgarte` terms, or `projection` of q and q̇ onto the manifold after each step.
         unilateral: whether contacts with a surface open where they would pull, and close again.
-        interpolation: `hold` each torque of an array for its period, or interpolate `linear`ly.
+        interpolation: of a torque array between its samples, `hold` or `linear`.
         speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
         on_divergence: `raise` a `DivergedError` that holds the trajectories, or `keep` them.
 
