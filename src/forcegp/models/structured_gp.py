@@ -255,16 +255,26 @@ class StructuredGP(Model[StructuredFit]):
             )
         return self.adopt(fitted.updated(training))
 
-    def forget(self, factor: float) -> StructuredFit:
-        """Multiply the weight of all samples so far by a factor, so that later ones count for more.
+    def forget(
+        self, what: float | Dataset | Sequence[Observation], priors: Sequence[str] | None = None
+    ) -> StructuredFit:
+        """Forget samples, so that later ones count for more.
 
         Args:
-            factor: between 0 and 1, such as exp(−Δt/T) for a memory of T seconds.
+            what: a factor between 0 and 1, such as exp(−Δt/T) for a memory of T seconds, which the weight of
+                all samples so far is multiplied by; or samples of the fit, which are removed.
+            priors: forget only what the samples say about the forces of these priors, such as a payload: they
+                drift towards their prior, and the factor is the correlation with what they were.
 
         Raises:
             ModelError: the model has not been fitted, its inference is exact, or the factor is out of range.
+            UnknownNameError: no such prior.
+            NumericalError: the samples to remove were not among those of the fit.
         """
-        return self.adopt(self.fitted.forgetting(factor))
+        if isinstance(what, int | float):
+            return self.adopt(self.fitted.forgetting(float(what), priors))
+        training, _ = in_motion(self.specification, self._training(what, learned=()))
+        return self.adopt(self.fitted.without(training))
 
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""
