@@ -70,9 +70,9 @@ def fit(
 
     forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model/ --json
 
-    forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model/
-
     forcegp fit -s my_scene.toml -d train.parquet --config model.toml -o model/
+
+    forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model/
     """
     from forcegp.destination import check_destination, write_or_keep
     from forcegp.models.configured import configured

@@ -39,6 +39,12 @@ class IgnoredColumnsWarning(UserWarning):
     """Columns of a log that are not of a name this library knows were left out."""
 
 
+def check_ending(path: str | Path) -> None:
+    """Raise `DataError` unless the name of a file to write ends in `.parquet`."""
+    if Path(path).suffix.lower() != ".parquet":
+        raise DataError(f"{path}: data sets are written as Parquet", hint="end the name in .parquet")
+
+
 def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> None:
     """Write columns and header to a Parquet file, whole or not at all.
 

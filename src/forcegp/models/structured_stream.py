@@ -165,7 +165,7 @@ class Pass:
         total = total_over(problem, hyperparameters, basis, pieces, begin, after)
         if self.distributed:
             total = total.over_processes()
-        return posterior_of(problem, basis, total), total.constant
+        return posterior_of(problem, hyperparameters, basis, total), total.constant
 
     def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
         """The samples of this process, a piece at a time; a piece of another process has none."""

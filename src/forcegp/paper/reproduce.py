@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from forcegp.destination import check_destination
 from forcegp.files import write_text
 from forcegp.paper.figures import all_figures
 from forcegp.paper.fits import Fit, noise_std_of, score_fit
@@ -78,9 +79,11 @@ def run(
 
     Raises:
         UnknownNameError: no such profile.
+        DestinationError: the folder cannot be written.
     """
     sizes = profile_of(profile) if isinstance(profile, str) else profile
     root = Path(out)
+    check_destination(root, folder=True)
     folder = root / "stages"
     made = run_ahead(folder, sizes, seed, processes, progress, say) if processes > 1 else set()
     stages = Stages(folder, progress, say, made)

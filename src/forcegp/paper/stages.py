@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import ClassVar, Protocol, TypeVar, runtime_checkable
 
 from forcegp.errors import DataError, ForceGPError
+from forcegp.exchange import recover
 from forcegp.files import Header, atomic_directory, write_text
 
 STAGE_FILE, DATA = "stage.json", "data.json"
@@ -225,6 +226,7 @@ def _version(library: str) -> str | None:
 
 
 def _found(folder: Path, key: str, reused: bool) -> Stage | None:
+    recover(folder)
     try:
         header = StageHeader.from_json((folder / STAGE_FILE).read_bytes(), str(folder), DataError)
     except (OSError, DataError):
