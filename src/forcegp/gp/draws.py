@@ -21,8 +21,8 @@ class FunctionDraw(ABC):
         """φ(x) `(k, n, features)` with E[φ φ′ᵀ] = k(x, x′)."""
 
     def common(self) -> tuple[FunctionDraw, Tensor] | None:
-        """The same features as one set for all components, `(1, n, features)`, and a factor for each component
-        and feature `(k, features)`; `None` where components differ by more than factors."""
+        """One set of features for all components, `(1, n, features)`, and a factor for each component and
+        feature `(k, features)`; `None` where components differ by more than factors."""
         return None
 
 
