@@ -46,7 +46,7 @@ LAYERS = (
     ("rollout",),
     ("models",),
     ("evaluation",),
-    ("report",),
+    ("report", "sweep"),
     ("paper",),
     ("cli",),
 )
