@@ -19,7 +19,7 @@ from forcegp.data import split_by_stretches
 from forcegp.data.split import complement
 from forcegp.evaluation import evaluate
 from forcegp.files import atomic_directory, write_json
-from forcegp.models.registry import create
+from forcegp.models.configured import configured
 from forcegp.optional import optional_module
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
@@ -81,9 +81,8 @@ def run_fit(fit: Fit, out: str) -> dict[str, Any]:
         config = replace(config, duration=fit.duration)
     data = simulate(system, config).data
     split = split_by_stretches(data, 1, seed=fit.seed)
-    fitted = create(fit.model, system, noise_std=scene.noise_std, seed=fit.seed).fit(
-        data[complement(split.test, len(data))]
-    )
+    model = configured(scene.model, system, name=fit.model, seed=fit.seed)
+    fitted = model.fit(data[complement(split.test, len(data))])
     found = evaluate(fitted, data[split.test], compare=False)
     score = {
         **asdict(fit),

@@ -11,13 +11,9 @@ from forcegp.cli.common import AsJson, progress_bar, show
 
 
 def sweep(
+    scene: Annotated[list[str], typer.Option("--scene", "-s", help="Scene; may be given several times.")],
+    model: Annotated[list[str], typer.Option("--model", "-m", help="Model; may be given several times.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fits.")],
-    scene: Annotated[list[str], typer.Option("--scene", "-s", help="Scene; may be given several times.")] = [
-        "kuka_plane"
-    ],
-    model: Annotated[list[str], typer.Option("--model", "-m", help="Model; may be given several times.")] = [
-        "sgp-mean"
-    ],
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0 on.")] = 1,
     duration: Annotated[
         float | None, typer.Option(help="Simulated time in seconds; default: the scene's.")
@@ -34,7 +30,7 @@ def sweep(
 
     [bold]Examples[/bold]
 
-    forcegp sweep --model sgp-zero --model sgp-mean --seeds 3 --duration 30 --out sweep/
+    forcegp sweep --scene kuka_plane --model sgp-zero --model sgp-mean --seeds 3 --out sweep/
 
     forcegp sweep -s kuka_plane -s ur5_wiping -m sgp-mean --address tcp://host:8786 --out /shared/sweep
     """
