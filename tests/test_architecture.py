@@ -47,7 +47,7 @@ LAYERS = (
     ("models",),
     ("evaluation",),
     ("view",),
-    ("report",),
+    ("report", "sweep"),
     ("paper",),
     ("cli",),
 )

@@ -41,6 +41,7 @@ KEYS: dict[str, tuple[str, ...]] = {
         "torque_noise",
         "state_noise",
         "inference",
+        "inducing_points",
         "analytical",
     ),
 }
@@ -112,7 +113,7 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
     given = {key: value for key, value in table.section.given().items() if key not in COMMON}
     for key in given:
         _check_key(table, ("model", key), (*COMMON, *KEYS[kind]), f"the model {name!r}")
-    plain = ("learn_noise", "state_noise", "inference", "hidden")
+    plain = ("learn_noise", "state_noise", "inference", "inducing_points", "hidden")
     arguments = {key: given[key] for key in plain if key in given}
     at = table.document.at
     if isinstance(mean := given.get("mean"), str):

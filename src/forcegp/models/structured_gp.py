@@ -30,7 +30,7 @@ from forcegp.models.structured_choice import chosen_priors
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Lesson, in_motion, prepared, solve
 from forcegp.models.structured_spec import Specification, torque_noise_of
-from forcegp.models.structured_stream import Pass, sample_of
+from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
@@ -176,7 +176,7 @@ class StructuredGP(Model[StructuredFit]):
             ModelError, DataError, UnknownNameError: the data, or the checkpoint, do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
-        sample, known = None, data
+        sample, neighbours, known = None, None, data
         if isinstance(known, StreamedDataset):
             sample = sample_of(self.specification, known)
             known = sample.data
@@ -190,6 +190,7 @@ class StructuredGP(Model[StructuredFit]):
         if sample is not None:
             training = dataclasses.replace(training, part_of=sample.count)
             log = Pass(spec, sample, file, progress, distributed)
+            neighbours = neighbours_of(spec, sample, training)
         problem = spec.problem(training)
         search, saved = self._search(problem, chosen, options), None
         if search.start:
@@ -197,7 +198,7 @@ class StructuredGP(Model[StructuredFit]):
                 saved = Checkpoint(file, _key(spec, problem, search, begin))
                 saved.read(search.start)
                 search = dataclasses.replace(search, recorded=saved.recorded)
-            lesson = solve(spec, problem, search, _reported(progress, options), begin)
+            lesson = solve(spec, problem, search, _reported(progress, options), begin, neighbours)
             if saved is not None:
                 saved.write()
         else:
@@ -284,16 +285,26 @@ class StructuredGP(Model[StructuredFit]):
             )
         return self.adopt(fitted.updated(training))
 
-    def forget(self, factor: float) -> StructuredFit:
-        """Multiply the weight of all samples so far by a factor, so that later ones count for more.
+    def forget(
+        self, what: float | Dataset | Sequence[Observation], priors: Sequence[str] | None = None
+    ) -> StructuredFit:
+        """Forget samples, so that later ones count for more.
 
         Args:
-            factor: between 0 and 1, such as exp(−Δt/T) for a memory of T seconds.
+            what: a factor between 0 and 1, such as exp(−Δt/T) for a memory of T seconds, which the weight of
+                all samples so far is multiplied by; or samples of the fit, which are removed.
+            priors: forget only what the samples say about the forces of these priors, such as a payload: they
+                drift towards their prior, and the factor is the correlation with what they were.
 
         Raises:
             ModelError: the model has not been fitted, its inference is exact, or the factor is out of range.
+            UnknownNameError: no such prior.
+            NumericalError: the samples to remove were not among those of the fit.
         """
-        return self.adopt(self.fitted.forgetting(factor))
+        if isinstance(what, int | float):
+            return self.adopt(self.fitted.forgetting(float(what), priors))
+        training, _ = in_motion(self.specification, self._training(what, learned=()))
+        return self.adopt(self.fitted.without(training))
 
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""

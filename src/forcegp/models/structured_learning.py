@@ -108,6 +108,7 @@ def solve(
     search: Search,
     progress: Progress | None = None,
     begin: Mapping[str, Tensor] | None = None,
+    neighbours: Training | None = None,
 ) -> Lesson:
     """Learn what is free in a search, then prepare the problem that is conditioned on.
 
@@ -117,6 +118,7 @@ def solve(
         search: what is learned and what is held.
         progress: called after each evaluation.
         begin: where to begin.
+        neighbours: samples as close in time as those of the log, where those of the problem are a part of it.
     """
     part = subset(spec, problem)
     if part.inducing is None:
@@ -132,7 +134,7 @@ def solve(
         values = {**search.held, **learned.tensors}
         part = with_updated_robot(part, values)
         values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
-        part = _at_the_rate_of_the_log(part, values, problem.training)
+        part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
     whole = dataclasses.replace(part, training=problem.training, inducing=None)
     return Lesson(prepared(spec, whole, values), values, learned, learned_on)
 
@@ -141,7 +143,7 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
     """The problem with the correlation of its residuals among all samples.
 
     Neighbours in the whole log are closer in time than in the part that was learned on. Of a log that is read
-    piece by piece, only the samples in memory are looked at, whose evidence is that of all samples.
+    piece by piece, a few contiguous stretches are looked at.
     """
     power = part.power if part.training is training else likelihood_power(part, values, training)
     share = training.samples / training.all_samples

@@ -62,6 +62,7 @@ class ModelSection(Section):
     torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["auto", "learn", "none"] = "auto"
     state_noise: tuple[State, State] | None = None
     inference: Literal["auto", "exact", "sparse"] = "auto"
+    inducing_points: PositiveInt = 100
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: tuple[dict[str, Any], ...] = ()
     analytical: dict[str, Literal["all"] | tuple[str, ...]] = {}
