@@ -247,6 +247,5 @@ class Dataset:
             DataError: the name does not end in `.parquet`.
             OSError: the place cannot be written.
         """
-        if Path(path).suffix.lower() != ".parquet":
-            raise DataError(f"{path}: data sets are written as Parquet", hint="end the name in .parquet")
+        table.check_ending(path)
         table.write_parquet(path, *columns.unparse(self))

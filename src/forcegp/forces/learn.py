@@ -32,6 +32,8 @@ from forcegp.gp.structured_covariance import Block
 Tensors = dict[str, Tensor]
 TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
 """Name of the learned noise of the motor torque."""
+START_SAMPLES = 5000
+"""Evenly spaced samples that the start of learning is computed from, where there are more."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -142,9 +144,12 @@ class Problem:
 
     def initial(self, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
         """Default start of everything that can be learned."""
-        start = initial_hyperparameters(self.priors, self.fixed_rows.blocks)
+        few = self
+        if self.training.samples > START_SAMPLES:
+            few = dataclasses.replace(self, training=self.training.evenly(START_SAMPLES))
+        start = initial_hyperparameters(self.priors, few.fixed_rows.blocks)
         if learn_torque_noise:
-            start[TORQUE_NOISE] = (0.5 * self.torque_residual()).clamp(min=1e-4).log().double()
+            start[TORQUE_NOISE] = (0.5 * few.torque_residual()).clamp(min=1e-4).log().double()
         if learn_noise:
             noise = self.training.noise_std
             start |= {noise_key(i): _typical(std).double().log() for i, std in enumerate(noise)}

@@ -86,6 +86,14 @@ class FitResult:
             training
             states: near −1 only their sum is identifiable, near 0 both are. `None` without priors on both.
         warnings: doubts about the fit, each with a remedy.
+        inference: `"exact"` or `"sparse"`, for models that have both.
+        samples: number of samples that the model is conditioned on.
+        learned_on: number of samples that hyperparameters were learned on.
+        basis_functions: size of a sparse posterior.
+        determined: how many basis functions the data determine.
+        missed: prior variance that the inducing points miss in all rows together, in units of the noise
+            variance; what noise leaves of all rows is `determined` in the same units.
+        more_points_would_help: whether `missed` is a tenth of `determined` or more.
     """
 
     converged: bool
@@ -99,6 +107,13 @@ class FitResult:
     history: tuple[float, ...] = ()
     force_correlation: float | None = None
     warnings: tuple[str, ...] = ()
+    inference: str = ""
+    samples: int | None = None
+    learned_on: int | None = None
+    basis_functions: int | None = None
+    determined: float | None = None
+    missed: float | None = None
+    more_points_would_help: bool | None = None
 
     @classmethod
     def of(cls, learned: Learned, **more: Any) -> FitResult:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.inference import force_posterior, jitter_of, log_likelihood
+from forcegp.forces.inference import forces_and_constant, jitter_of, log_likelihood
 from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
@@ -22,7 +22,7 @@ from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
-from forcegp.models.doubts import constant_inputs, doubts, mean_correlation
+from forcegp.models.doubts import constant_inputs, doubts, inference_of, mean_correlation
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
 
@@ -215,6 +215,8 @@ def conditioned(
     hyperparameters: Mapping[str, Tensor],
     learned: Learned | None = None,
     warnings: Sequence[str] = (),
+    learned_on: int | None = None,
+    forces: tuple[ForcePosterior, Tensor] | None = None,
 ) -> StructuredFit:
     """Condition forces on the data of a problem at given hyperparameters.
 
@@ -224,13 +226,15 @@ def conditioned(
         hyperparameters: of priors, noise and robot.
         learned: how they were learned.
         warnings: doubts that have come up.
+        learned_on: number of samples that they were learned on.
+        forces: result of conditioning, where the data of the problem are only a part of the log.
 
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
-    posterior = force_posterior(problem, hyperparameters)
+    posterior, constant = forces or forces_and_constant(problem, hyperparameters)
     system = learned_system(problem, hyperparameters)
-    likelihood = log_likelihood(posterior) - float(problem.rows(hyperparameters).constant)
+    likelihood = log_likelihood(posterior) - float(constant)
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     jitter = jitter_of(posterior)
     result = FitResult.of(
@@ -240,6 +244,9 @@ def conditioned(
         constant_inputs=constant_inputs(problem.priors, problem.training),
         force_correlation=mean_correlation(posterior, system, problem.training),
         warnings=(*warnings, *doubts(posterior, system, problem.training, jitter)),
+        samples=problem.training.all_samples,
+        learned_on=learned_on,
+        **inference_of(posterior),
     )
     noise = typical_noise(problem, hyperparameters)
     return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)

@@ -77,6 +77,7 @@ def _specification(
         parameters,
         settings.torque_noise,
         settings.inference,
+        settings.inducing_points,
     )
 
 

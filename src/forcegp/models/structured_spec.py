@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
@@ -28,6 +28,7 @@ from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.gp import kernels, stationary
 from forcegp.gp.exact import ExactPosterior
+from forcegp.gp.inducing import LIMIT
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sparse_tensors import tensors_of_posterior
 from forcegp.models.base import FitResult
@@ -69,6 +70,7 @@ class Specification:
         parameters: module whose `forward()` gives the robot at θ_A, or `None`.
         torque_noise: standard deviation of the motor torque's white noise, `"learn"`, or `None` for none.
         inference: `"auto"`, `"exact"` or `"sparse"`.
+        inducing_points: maximum number of inducing points of one prior.
         automatic: whether the priors depend on whether the data are simulated or measured.
     """
 
@@ -80,7 +82,7 @@ class Specification:
     parameters: nn.Module | None = None
     torque_noise: NoiseStd | str | None = None
     inference: str = "auto"
-
+    inducing_points: int = LIMIT
     automatic: bool = False
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
@@ -142,6 +144,13 @@ class ResultSettings(Settings):
     message: str
     force_correlation: float | None
     warnings: tuple[str, ...]
+    inference: str = ""
+    samples: NonNegativeInt | None = None
+    learned_on: NonNegativeInt | None = None
+    basis_functions: NonNegativeInt | None = None
+    determined: float | None = None
+    missed: float | None = None
+    more_points_would_help: bool | None = None
 
 
 class StructuredSettings(Settings):
@@ -152,6 +161,7 @@ class StructuredSettings(Settings):
     learn_noise: bool
     torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["learn"] | None
     inference: Literal["auto", "exact", "sparse"]
+    inducing_points: PositiveInt = LIMIT
     power: float = Field(gt=0.0, le=1.0)
     priors: tuple[dict[str, Any], ...]
     pinned: tuple[str, ...]
@@ -189,6 +199,7 @@ def pack(
         learn_noise=spec.learn_noise,
         torque_noise=_plain(spec.torque_noise),
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
+        inducing_points=spec.inducing_points,
         power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
