@@ -37,6 +37,20 @@ def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> 
         system: where to take constraints from that only Python code describes (an `ImplicitSurface`);
             robot and other constraints are those in the folder.
 
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> import tempfile
+        >>> fit = forcegp.AnalyticalModel(system).fit(data)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     fit.save(f"{folder}/model")
+        ...     load_model(f"{folder}/model").kind
+        'analytical'
+
     Raises:
         ModelError: no model is there, it is damaged, or a constraint is to be given.
         UnknownNameError: the model is of a kind that this release does not know.

@@ -30,6 +30,10 @@ class RolloutOptions:
         speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
         on_divergence: `raise` a `DivergedError` that holds the trajectories, or `keep` them.
 
+    Example:
+        >>> RolloutOptions(method="rk4", stabilization="projection", dt=0.002).method
+        'rk4'
+
     Raises:
         ForceGPError: a value is out of range.
         UnknownNameError: unknown method, stabilization or `on_divergence`.

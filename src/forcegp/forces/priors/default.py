@@ -34,6 +34,12 @@ def default_priors(
         mean: the model's prior mean, which decides what is left to the prior.
         kernel: covariance of each joint force; by default `REMAINING` where the mean includes the motor
             torque, `WHOLE` elsewhere.
+
+    Example:
+        >>> import torch, forcegp
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> [type(prior).__name__ for prior in default_priors(system, "analytical")]
+        ['JointForcePrior', 'NormalForcePrior']
     """
     joint = JointForcePrior(kernel or (REMAINING if "actuation" in mean_of(mean).terms else WHOLE))
     return (joint, NormalForcePrior(joint)) if system.m else (joint,)
@@ -46,6 +52,12 @@ def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
 
     Args:
         system: robot and contacts.
+
+    Example:
+        >>> import torch, forcegp
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> [type(prior).__name__ for prior in measured_priors(system)]
+        ['JointFrictionPrior', 'SlidingFrictionPrior']
     """
     surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
     return (JointFrictionPrior(), *(SlidingFrictionPrior(name) for name in surfaces))
@@ -58,6 +70,12 @@ def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> t
         system: robot and contacts.
         kernel: covariance of each Cartesian component of any tangential force; by default the force is
             friction that opposes sliding.
+
+    Example:
+        >>> import torch, forcegp
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> [type(prior).__name__ for prior in contact_priors(system)]
+        ['SlidingFrictionPrior']
     """
     surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
     if kernel is None:
