@@ -21,6 +21,7 @@ from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.quantities import affine_map
+from forcegp.forces.torque_noise import stick_variance
 
 STRETCHES = 8
 """Contiguous stretches that a log of fewer than three segments is divided into."""
@@ -168,7 +169,7 @@ def _held_out(
     residual = (at.eom.M @ m.values[..., None])[..., 0] - posterior.read_mean(system, at, z)
     spread = posterior.read_covariance(system, at, z).diagonal(dim1=-2, dim2=-1)
     std = noise_std if noise_std.ndim == 1 else noise_std.square().mean(0).sqrt()
-    return residual, spread + (at.eom.M**2 @ std**2)
+    return residual, spread + (at.eom.M**2 @ std**2) + stick_variance(hyperparameters, at)
 
 
 def _unit_scale(r2: Tensor, V: Tensor, least: Tensor) -> Tensor:

@@ -98,7 +98,7 @@ def forces_and_constant(
     if problem.inducing is not None:
         basis = basis_of(problem, hyperparameters)
         total = total_over(problem, hyperparameters, basis, problem.training.pieces(PIECE_SAMPLES))
-        return posterior_of(problem, basis, total), total.constant
+        return posterior_of(problem, hyperparameters, basis, total), total.constant
     scales, params = problem.training.scales, kernel_parameters(hyperparameters)
     rows = problem.rows(hyperparameters)
     require_exact_fits(rows.blocks, learning=False)
@@ -106,7 +106,8 @@ def forces_and_constant(
     if problem.pinned:
         known = problem.silenced(problem.of_means().rows(hyperparameters).blocks)
         central = ExactPosterior.of(problem.priors, params, known)
-    posterior = ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central)
+    coulomb, offsets = problem.coulomb(hyperparameters), problem.offsets
+    posterior = ForcePosterior(problem.priors, scales, problem.mean, latent, offsets, central, coulomb)
     return posterior, rows.constant
 
 

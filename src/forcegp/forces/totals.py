@@ -103,7 +103,9 @@ def total_over(
     return total
 
 
-def posterior_of(problem: Problem, basis: LatentBasis, total: Totals) -> ForcePosterior:
+def posterior_of(
+    problem: Problem, hyperparameters: Mapping[str, Tensor], basis: LatentBasis, total: Totals
+) -> ForcePosterior:
     """Forces conditioned on the samples of totals.
 
     Raises:
@@ -111,6 +113,5 @@ def posterior_of(problem: Problem, basis: LatentBasis, total: Totals) -> ForcePo
     """
     latent = SparsePosterior.of(basis, total.sums)
     central = None if total.central is None else SparsePosterior.of(basis, total.central)
-    return ForcePosterior(
-        problem.priors, problem.training.scales, problem.mean, latent, problem.offsets, central
-    )
+    scales, coulomb = problem.training.scales, problem.coulomb(hyperparameters)
+    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central, coulomb)

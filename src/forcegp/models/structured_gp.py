@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -19,8 +20,9 @@ from forcegp.forces.learn import Problem, Search
 from forcegp.forces.mean import AnalyticalMean, mean_of
 from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ANALYTICAL, NOISE, ForcePrior, check_priors
+from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
+from forcegp.forces.state_noise import state_std_of
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions, Progress
 from forcegp.models.base import FitProgress, Model
@@ -43,19 +45,21 @@ class StructuredGP(Model[StructuredFit]):
         mean: `"zero"`, `"analytical"`, or an `AnalyticalMean` with some terms left out.
         force_priors: priors on the unknown forces. The default depends on the mean and on the data: around
             the analytical forces of a measured robot, `measured_priors` (friction of each joint and contact,
-            noise of the torque); else `default_priors`: a `JointForcePrior`, and in contact its
-            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest.
+            noise of the torque); else `default_priors`: a `JointForcePrior`, in contact its
+            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest,
+            and around the analytical forces a `SlidingFrictionPrior` for each surface.
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states (`qdd_std` by sample, else its header), else 0.1.
         learn_noise: whether the noise is a hyperparameter too, starting from `noise_std`.
         analytical_parameters: a module whose `forward()` gives the robot with its analytical parameters θ_A
             as learned tensors; `None` keeps the robot as it is.
-        torque_noise: standard deviation of the motor torque's white noise [N m, N], `"learn"`, or `None`; the
-            default learns it where a prior is meant for measured robots.
-        inference: `"exact"`, `"sparse"`, or `"auto"`: sparse where all priors are finite features, or beyond
-            1000 samples.
+        torque_noise: standard deviation of the motor torque's white noise [N m, N], `"learn"`, `None` for
+            none, or `"auto"`: learned with priors for measured robots.
+        inference: `"exact"`, `"sparse"` or `"auto"`.
         inducing_points: maximum number of inducing points of one prior; fewer are taken where they suffice,
             and the result of the fit says where more would help.
+        state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
+            or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
 
     Example:
         >>> import forcegp, torch
@@ -86,10 +90,12 @@ class StructuredGP(Model[StructuredFit]):
         torque_noise: NoiseStd | str | None = "auto",
         inference: str = "auto",
         inducing_points: int = LIMIT,
+        state_noise: tuple[NoiseStd, NoiseStd] | None = None,
     ) -> None:
         form = mean_of(mean)
         priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
         check_priors(priors, system)
+        state_std_of(state_noise, system.robot)
         self.specified = system
         self.specification = Specification(
             system,
@@ -102,6 +108,7 @@ class StructuredGP(Model[StructuredFit]):
             check_method(inference),
             check_limit(inducing_points),
             force_priors is None and torque_noise == "auto" and "actuation" in form.terms,
+            state_noise,
         )
 
     @classmethod
@@ -125,6 +132,19 @@ class StructuredGP(Model[StructuredFit]):
     def noise_std(self) -> NoiseStd | None:
         """Noise of measured accelerations as given, `None` for what the log states."""
         return self.specification.noise_std
+
+    def get_params(self) -> dict[str, Any]:
+        spec = self.specification
+        return {
+            "system": spec.system,
+            "mean": spec.mean,
+            "force_priors": None if spec.automatic else spec.priors,
+            "noise_std": spec.noise_std,
+            "learn_noise": spec.learn_noise,
+            "analytical_parameters": spec.parameters,
+            "torque_noise": "auto" if spec.automatic else spec.torque_noise,
+            "inference": spec.inference,
+        }
 
     # -- learning ---------------------------------------------------------------------------------
 
@@ -278,7 +298,7 @@ class StructuredGP(Model[StructuredFit]):
 
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""
-        names = (*(prior.name for prior in self.force_priors), NOISE, ANALYTICAL)
+        names = (*(prior.name for prior in self.force_priors), NOISE, ANALYTICAL, COULOMB)
         chosen = names if learn is None else tuple(learn)
         for name in chosen:
             if name not in names:

@@ -135,7 +135,7 @@ class Pass:
         total = total_over(problem, hyperparameters, basis, pieces, begin, after)
         if self.distributed:
             total = total.over_processes()
-        return posterior_of(problem, basis, total), total.constant
+        return posterior_of(problem, hyperparameters, basis, total), total.constant
 
     def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
         """The samples of this process, a piece at a time; a piece of another process has none."""
@@ -165,7 +165,7 @@ class Pass:
     def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
         """Identifies the sums over a log, with a basis, a system and a noise."""
         training = problem.training
-        files = [(path.name, path.stat().st_size) for path in self.sample.log.paths]
+        files = [(path.name, path.stat().st_size) for path in self.sample.log.files]
         record, robot = pack_system(problem.system)
         data = [value for m in training.measurements for value in m.tensors]
         points = [x for Z in problem.inducing or () for x in Z.values()]
