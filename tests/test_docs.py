@@ -58,22 +58,6 @@ def test_make_targets_exist() -> None:
         assert re.search(rf"^{target}:", makefile, flags=re.M), target
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_pages_are_in_the_contents(page: Path) -> None:
-    if name(page) == "index.md":
-        return
-    folder = DOCS / "reference" if page.parent.name == "reference" and page.name != "index.md" else DOCS
-    listed = {
-        folder / f"{entry}.md"
-        for kind, body in blocks(folder / "index.md")
-        if kind == "{toctree}"
-        for entry in body.split()
-        if not entry.startswith(":")
-    }
-    listed |= {DOCS / "reference/commands.md"}
-    assert page in listed
-
-
 def test_public_names_are_in_the_reference() -> None:
     import forcegp
 
