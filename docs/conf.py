@@ -50,7 +50,7 @@ def _code_key() -> str:
 nb_execution_mode = os.environ.get("FORCEGP_DOCS_EXECUTE", "cache")
 nb_execution_cache_path = str(HERE.parent / "out" / "executed" / _code_key())
 nb_execution_in_temp = True
-nb_execution_timeout = 120
+nb_execution_timeout = 600  # of one cell; a busy machine is slow
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_merge_streams = True

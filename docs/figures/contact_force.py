@@ -3,7 +3,7 @@
     python docs/figures/contact_force.py
 
 The log is `examples/data/ur5_wiping.csv`, in which MuJoCo's contact solver made the contact. The model is
-trained on the first 15 s and has never seen a force; the last 5 s are drawn. Prints bias, spread and coverage.
+trained on the first 15 s and has never seen a force; the last 5 s are drawn. Prints bias, spread, coverage.
 """
 
 from __future__ import annotations

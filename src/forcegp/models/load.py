@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from forcegp.models.structured_load import load_structured
 from forcegp.storage.folder import HEADER_FILE, ModelHeader, own_tensors, read_model
 from forcegp.storage.system import unpack_system
 
-Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], Model]
+Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], Model[Any]]
 
 LOADERS: dict[str, Loader] = {
     AnalyticalModel.kind: load_analytical,
@@ -29,7 +30,7 @@ LOADERS: dict[str, Loader] = {
 """What reads each kind of models."""
 
 
-def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> Model:
+def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> Model[Any]:
     """Read a model that `Model.save` wrote; it predicts the same, bit for bit.
 
     Args:
