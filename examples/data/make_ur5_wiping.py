@@ -4,7 +4,7 @@
 
 MuJoCo's contact solver makes the contact, with friction in joints and contact that the robot file does not
 declare. Positions, velocities and torques have the resolution and noise of sensors; accelerations are not
-logged. `table_force` is the normal force that the solver applied: what a load cell under the table would show.
+logged. `table_force` is the normal force that the solver applied, as a load cell under the table shows it.
 """
 
 from __future__ import annotations

@@ -194,12 +194,14 @@ class Training:
         noise_std: of each measurement, `(d,)` or `(n, d)`.
         scales: standardization of the inputs of each prior.
         part_of: number of samples that are conditioned on, of which these are a part; 0 where these are all.
+        period: sampling period of the log that these are from [s]; 0 where its rows are not in order.
     """
 
     measurements: tuple[Measurement, ...]
     noise_std: tuple[Tensor, ...]
     scales: tuple[Standardization, ...]
     part_of: int = 0
+    period: float = 0.0
 
     @property
     def samples(self) -> int:
@@ -301,4 +303,13 @@ def training_of(
         features = [prior.features(system, a) for a in at]
         together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
         scales.append(Standardization.of(together, prior.vectors))
-    return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales))
+    period = _period(observations[0].data)
+    return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales), period=period)
+
+
+def _period(data: Dataset) -> float:
+    """Median time step within the trajectories of a log in order; 0 otherwise [s]."""
+    if not data.header.ordered or len(data) < 2:
+        return 0.0
+    steps = data.t.diff()[data.segment[1:] == data.segment[:-1]]
+    return float(steps.median()) if len(steps) else 0.0

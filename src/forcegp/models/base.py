@@ -69,6 +69,12 @@ class Predictor(ABC):
         """The mean impressed force Q̄ `(n, nq)` at states, or `None` for a model of accelerations alone."""
         return None
 
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        """Root of the spectral density of torque noise `(nq,)` [N m √s], where one was learned with its
+        correlation in time."""
+        return None
+
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         """Force functions drawn from the posterior, all evaluated at once.
 
@@ -310,6 +316,10 @@ class Model(Predictor, Generic[F]):
 
     def force_field(self) -> ForceField | None:
         return self.fitted.force_field()
+
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        return self.fitted.torque_disturbance
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         return self.fitted.force_samples(samples, generator)

@@ -12,7 +12,6 @@ from forcegp.data import Dataset
 from forcegp.data.fields import AXES
 from forcegp.errors import DataError, ForceGPError, UnknownNameError
 from forcegp.forces.measurements import COLUMNS
-from forcegp.models.prediction import Prediction
 
 CHUNK = 2000
 """States that are predicted at once, to bound the memory."""
@@ -28,13 +27,14 @@ class Predicts(Protocol):
     def predict(self) -> Any: ...
 
 
-def predicted(model: Predicts, data: Dataset, quantity: str, **settings: Any) -> Prediction:
-    """Predict a quantity at the states of a data set; contacts are closed where the log says so."""
-    active = data.active(model.system.contact_names)
+def predicted(model: Predicts, data: Dataset, quantity: str, **settings: Any) -> Any:
+    """The `Prediction` of a quantity at logged states; contacts are closed where the log says so."""
+    system = settings.get("system") or model.system
+    active = data.active(system.contact_names)
     return model.predict(data.q, data.qd, data.tau, quantity, active=active, **settings)
 
 
-def measured(model: Predicts, data: Dataset, quantity: str) -> Tensor:
+def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:
     """Logged values `(n, d)` of a quantity.
 
     Raises:
@@ -43,13 +43,13 @@ def measured(model: Predicts, data: Dataset, quantity: str) -> Tensor:
     """
     if quantity not in COLUMNS:
         raise UnknownNameError("measured quantity", quantity, COLUMNS)
-    return COLUMNS[quantity](data, model.system)
+    return COLUMNS[quantity](data, system)
 
 
-def measured_if_logged(model: Predicts, data: Dataset, quantity: str) -> Tensor | None:
+def measured_if_logged(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor | None:
     """Logged values `(n, d)` of a quantity, or `None`."""
     try:
-        return measured(model, data, quantity)
+        return measured(system, data, quantity)
     except ForceGPError:
         return None
 
@@ -59,7 +59,7 @@ def score(model: Predicts, data: Dataset, quantity: str) -> float:
     data.check_robot(model.system.robot)
     if len(data) < 2:
         raise DataError("a score needs two samples or more", got=len(data))
-    true = measured(model, data, quantity)
+    true = measured(model.system, data, quantity)
     means = [
         predicted(model, data[first : first + CHUNK], quantity, covariance=False).mean
         for first in range(0, len(data), CHUNK)

@@ -29,12 +29,13 @@ def plot_model(
     settings: Mapping[str, Any],
 ) -> list[Axes]:
     """Draw predictions at logged states; `Predictor.plot` documents the arguments."""
-    data.check_robot(model.system.robot)
+    system = settings.get("system") or model.system
+    data.check_robot(system.robot)
     data = data[:: max(1, -(-len(data) // MOST_SAMPLES))]
     found = predicted(model, data, quantity, **settings)
-    names, kinds = component_names(model.system, quantity), model.system.robot.joint_types
-    true, std = measured_if_logged(model, data, quantity), found.std
-    of_joints = names == list(model.system.robot.joint_names)
+    names, kinds = component_names(system, quantity), system.robot.joint_types
+    true, std = measured_if_logged(system, data, quantity), found.std
+    of_joints = names == list(system.robot.joint_names)
     panels = [
         Panel(
             names[i],
@@ -46,7 +47,7 @@ def plot_model(
         for i in chosen(joints, names, f"component of {quantity}")
     ]
     time = Timeline.of(data.t, data.segment, data.header.ordered)
-    return draw_panels(panels, time, [data.contact[c] for c in model.system.contact_names], ax)
+    return draw_panels(panels, time, [data.contact[c] for c in system.contact_names], ax)
 
 
 def plot_prediction(

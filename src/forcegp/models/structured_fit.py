@@ -174,6 +174,16 @@ class StructuredFit(FittedModel):
             return self.problem.torque_std
         return None if learned is None else learned.exp()
 
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        """s √T of torque noise with standard deviation s that is correlated for a time T, [N m √s].
+
+        Over times longer than T it acts like white noise with this root of a spectral density.
+        """
+        if self.torque_std is None or self.problem.correlation_time == 0.0:
+            return None
+        return self.torque_std * self.problem.correlation_time**0.5
+
     def _noise_covariance(self, z: AffineMap, parts: Mapping[str, slice]) -> Tensor:
         """B Σ_τ Bᵀ + Σ_q̈ of a measurement of the quantities, `(n, d, d)`."""
         noise = z.o.new_zeros(*z.o.shape, z.o.shape[-1])

@@ -122,14 +122,20 @@ def solve(
         values = {**search.held, **learned.tensors}
         part = with_updated_robot(part, values)
         values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
-    if correlated and part.training is not problem.training:
-        # Neighbours in the whole log are closer in time than in the part that was learned on; of a log that
-        # is read piece by piece only the samples in memory are looked at.
-        power = likelihood_power(part, values, problem.training)
-        power *= problem.training.samples / problem.training.all_samples
-        part = dataclasses.replace(part, power=power)
+        part = _at_the_rate_of_the_log(part, values, problem.training)
     whole = dataclasses.replace(part, training=problem.training, inducing=None)
     return Lesson(prepared(spec, whole, values), values, learned, learned_on)
+
+
+def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:
+    """The problem with the correlation of its residuals among all samples.
+
+    Neighbours in the whole log are closer in time than in the part that was learned on. Of a log that is read
+    piece by piece, only the samples in memory are looked at, whose evidence is that of all samples.
+    """
+    power = part.power if part.training is training else likelihood_power(part, values, training)
+    share = training.samples / training.all_samples
+    return dataclasses.replace(part, power=power * share, correlation_time=training.period / power)
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:

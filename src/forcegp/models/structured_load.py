@@ -143,6 +143,7 @@ def _restored(
         spec.problem(training),
         system=spec.system if spec.parameters is not None else system,
         power=settings.power,
+        correlation_time=settings.correlation_time,
         offsets=_below(tensors, "offset."),
         torque_std=tensors.get("torque_std"),
         pinned=settings.pinned,

@@ -172,6 +172,7 @@ class StructuredSettings(Settings):
     inference: Literal["auto", "exact", "sparse"]
     inducing_points: PositiveInt = LIMIT
     power: float = Field(gt=0.0, le=1.0)
+    correlation_time: float = Field(default=0.0, ge=0.0)
     priors: tuple[dict[str, Any], ...]
     pinned: tuple[str, ...]
     measured: tuple[str, ...]
@@ -211,6 +212,7 @@ def pack(
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
         inducing_points=spec.inducing_points,
         power=problem.power,
+        correlation_time=problem.correlation_time,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
         measured=training.quantities if exact else (),

@@ -28,6 +28,8 @@ class RolloutOptions:
         unilateral: whether contacts with a surface open where they would pull, and close again.
         interpolation: of a torque array between its samples, `hold` or `linear`.
         speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
+        torque_noise: whether function samples are driven by torques with noise drawn anew for each of them,
+            where the model has learned the noise of logged torques and its correlation in time.
         on_divergence: `raise` a `DivergedError` that holds the trajectories, or `keep` them.
 
     Example:
@@ -45,6 +47,7 @@ class RolloutOptions:
     unilateral: bool = False
     interpolation: str = "hold"
     speed_limit: float = 100.0
+    torque_noise: bool = True
     on_divergence: str = "raise"
 
     def __post_init__(self) -> None:
