@@ -58,6 +58,7 @@ nb_number_source_lines = False
 
 # What the pages find in their environment: the command, the example files, one thread, sharp plots.
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+os.environ["BASH_ENV"] = str(HERE / "_ext" / "shell_cells.sh")
 os.environ["EXAMPLES"] = str(HERE.parent / "examples")
 os.environ["MATPLOTLIBRC"] = str(HERE / "_static" / "matplotlibrc")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
