@@ -135,6 +135,18 @@ def evaluate(
     Returns:
         Scores over all joints and by joint, and the verdict.
 
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> fit = forcegp.StructuredGP(system, mean="analytical", noise_std=0.1).fit(data[:10])
+        >>> evaluation = evaluate(fit, data[10:])
+        >>> evaluation.samples
+        10
+
     Raises:
         DataError: the data are empty, or their joints are not the robot's.
         ModelError: the model has not been fitted.

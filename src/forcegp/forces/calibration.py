@@ -11,8 +11,8 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 
+import scipy
 import torch
-from scipy.optimize import brentq
 from torch import Tensor
 
 from forcegp.forces.inference import force_posterior
@@ -184,4 +184,4 @@ def _unit_scale(r2: Tensor, V: Tensor, least: Tensor) -> Tensor:
 
     if excess(low) <= 0.0:
         return least
-    return torch.full_like(least, math.exp(0.5 * float(brentq(excess, low, high))))  # pyright: ignore[reportArgumentType]
+    return torch.full_like(least, math.exp(0.5 * float(scipy.optimize.brentq(excess, low, high))))  # pyright: ignore[reportArgumentType]

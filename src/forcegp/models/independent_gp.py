@@ -83,6 +83,17 @@ class IndependentGP(Model["IndependentFit"]):
         system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states, else 0.1.
+
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> fit = IndependentGP(system, noise_std=0.1).fit(data)
+        >>> fit.predict(q, qd, tau).std.shape
+        torch.Size([20, 2])
     """
 
     kind = KIND

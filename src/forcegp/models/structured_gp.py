@@ -62,6 +62,17 @@ class StructuredGP(Model[StructuredFit]):
         state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
             or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
 
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> fit = StructuredGP(system, mean="analytical", noise_std=0.1).fit(data)
+        >>> fit.predict(q, qd, tau).std.shape
+        torch.Size([20, 2])
+
     Raises:
         ModelError, UnknownNameError: the priors do not fit the system.
     """

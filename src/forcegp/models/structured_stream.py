@@ -194,7 +194,7 @@ class Pass:
     def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
         """Identifies the sums over a log, with a basis, a system and a noise."""
         training = problem.training
-        files = [(path.name, path.stat().st_size) for path in self.sample.log.paths]
+        files = [(path.name, path.stat().st_size) for path in self.sample.log.files]
         record, robot = pack_system(problem.system)
         data = [value for m in training.measurements for value in m.tensors]
         points = [x for Z in problem.inducing or () for x in Z.values()]

@@ -44,6 +44,14 @@ def simulate(
     Returns:
         The data set with the reference, the actual motion of the tool and statistics of the run.
 
+    Example:
+        >>> import forcegp
+        >>> from forcegp.simulate import SimulationConfig
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> result = simulate(system, SimulationConfig(duration=0.1, engine="mujoco"))
+        >>> len(result.data)
+        24
+
     Raises:
         NumericalError: the motion cannot be reached, or the run diverges (names time and state).
         MissingDependencyError: the engine is not installed.

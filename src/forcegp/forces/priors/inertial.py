@@ -46,6 +46,12 @@ class InertialPrior(ForcePrior):
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
         masses: of the links, which the scale is relative to; those of the robot by default [kg].
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> InertialPrior().outputs(robot)
+        20
     """
 
     mass: float = 0.3
