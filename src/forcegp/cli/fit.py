@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,7 +21,7 @@ from forcegp.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from forcegp.models.base import FitResult, Model
+    from forcegp.models.base import FitResult
 
 
 def fit(
@@ -63,16 +63,18 @@ def fit(
     from forcegp.storage.folder import HEADER_FILE
 
     check_destination(out, folder=True, own_files=[HEADER_FILE])
+    if checkpoint is not None:
+        check_destination(checkpoint)
     read = load_scene(scene)
     system = read.system()
     training = data_of_robot(read_data(data, differentiate), system.robot)
     regression = create(model, system, noise_std=noise_std_of(noise_std, read), seed=seed)
-    settings: dict[str, Any] = {} if checkpoint is None else _resumable(regression, checkpoint)
     with progress_bar(f"fitting {model}", 1) as progress:
         fitted = regression.fit(
             training,
             progress=lambda done, most, value: progress(done, most, f"objective {value:.4g}"),
-            **settings,
+            checkpoint=checkpoint,
+            keep_checkpoint=True,
         )
     write_or_keep(fitted.save, out)
     if checkpoint is not None:
@@ -87,20 +89,3 @@ def _warn(result: FitResult) -> None:
     doubts = () if result.converged else (f"the fit did not converge: {result.message}",)
     for doubt in (*doubts, *result.warnings):
         typer.secho(f"warning: {doubt}", fg="yellow", err=True)
-
-
-def _resumable(regression: Model, checkpoint: Path) -> dict[str, Any]:
-    """What makes the fit of a structured GP record itself.
-
-    Raises:
-        ModelError: the model has no checkpoints.
-    """
-    from forcegp.errors import ModelError
-    from forcegp.models.structured_gp import StructuredGP
-
-    if not isinstance(regression, StructuredGP):
-        raise ModelError(
-            f"a {regression.kind!r} model cannot be resumed",
-            hint="leave out --checkpoint, or use a structured GP",
-        )
-    return {"checkpoint": checkpoint, "keep_checkpoint": True}

@@ -12,13 +12,16 @@ import torch
 
 from forcegp.destination import check_destination
 from forcegp.files import write_text
+from forcegp.gp.capacity import MATRICES_TO_LEARN
+from forcegp.memory import announce_memory
 from forcegp.paper.figures import all_figures
 from forcegp.paper.fits import Fit, fit_model, noise_std_of, score_fit
 from forcegp.paper.page import render_markdown, render_page
 from forcegp.paper.profiles import Profile, profile_of
 from forcegp.paper.results import GP_MODELS, PAPER_KERNELS, SPLITS, Results, Score
 from forcegp.paper.stages import Progress, Stages, silent
-from forcegp.paper.task import Task, make_task
+from forcegp.paper.task import SCENE, Task, make_task
+from forcegp.scene import load_scene
 
 PAGE, RESULTS, MARKDOWN = "report.html", "results.json", "results.md"
 LARGE = 400
@@ -79,10 +82,12 @@ def run(
     Raises:
         UnknownNameError: no such profile.
         DestinationError: the folder cannot be written.
+        MemoryLimitError: the largest fit needs more memory than is free.
     """
     sizes = profile_of(profile) if isinstance(profile, str) else profile
     root = Path(out)
     check_destination(root, folder=True)
+    _announce(sizes)
     stages = Stages(root / "stages", progress, say)
     tasks = [make_task(stages, sizes, seed + i) for i in range(sizes.seeds)]
     fits = []
@@ -97,6 +102,13 @@ def run(
     write_text(root / PAGE, render_page(results, figures))
     done = stages.done.values()
     return Reproduction(root / PAGE, results, sum(stage.reused for stage in done), len(done))
+
+
+def _announce(sizes: Profile) -> None:
+    """Announce the memory of the largest fit before anything is computed."""
+    system, points = load_scene(SCENE).system(), max(sizes.sizes)
+    needed = int(MATRICES_TO_LEARN * 8 * (points * system.robot.nq) ** 2)
+    announce_memory(needed, f"the largest fit, to {points} samples,")
 
 
 def _fits(stages: Stages, sizes: Profile, task: Task, splits: list[str]) -> list[Fit]:

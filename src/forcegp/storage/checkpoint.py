@@ -68,18 +68,13 @@ class Checkpoint:
         """
         if not self.path.exists():
             return 0
-        tensors, key = self._content()
+        tensors, key = read_record(self.path)
         size = sum(value.numel() for value in start.values())
         n = len(tensors["objectives"]) if tensors.get("objectives", torch.zeros(())).ndim == 1 else -1
         shapes = {"positions": (n, size), "objectives": (n,), "gradients": (n, size)}
         found = {name: tuple(value.shape) for name, value in tensors.items()}
         if key != self.key or found != shapes or any(x.dtype != torch.float64 for x in tensors.values()):
-            raise ModelError(
-                f"{self.path}: the checkpoint belongs to another fit",
-                expected=f"data, settings and system with key {self.key}",
-                got=key,
-                hint="remove it, or name another file",
-            )
+            raise belongs_elsewhere(self.path, self.key, key)
         for name, value in tensors.items():
             most = CHECKPOINT_VALUE if name == "positions" else LOGGED_VALUE
             if not bool((value.abs() <= most).all()):
@@ -91,27 +86,6 @@ class Checkpoint:
         self._record = list(zip(*(tensors[name] for name in NAMES), strict=True))
         self._next = 0
         return n
-
-    def _content(self) -> tuple[dict[str, Tensor], str | None]:
-        if not self.path.is_file():
-            raise ModelError(f"{self.path} is no file", expected="the file of a checkpoint")
-        try:
-            with self.path.open("rb") as file:
-                data = file.read(CHECKPOINT_BYTES + 1)
-            if len(data) > CHECKPOINT_BYTES:
-                raise ModelError(
-                    f"{self.path}: too large for a checkpoint", got=f"> {CHECKPOINT_BYTES} bytes"
-                )
-            # Of one content: a library that opens the file twice may see two versions of it.
-            tensors = safetensors.torch.load(data)
-            header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-            return tensors, header.get("__metadata__", {}).get("key")
-        except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as cause:
-            if isinstance(cause, ModelError):
-                raise
-            raise ModelError(
-                f"{self.path}: the checkpoint is damaged", got=str(cause), hint="remove it to start anew"
-            ) from cause
 
     def recorded(self, objective: Objective) -> Objective:
         """The same objective, with its evaluations read from the record as far as it goes, then recorded."""
@@ -150,14 +124,58 @@ class Checkpoint:
             record.append(entry)
         if record:
             parts = (torch.stack(part) for part in zip(*record, strict=True))
-            data = safetensors.torch.save(dict(zip(NAMES, parts, strict=True)), {"key": self.key})
-            with atomic_file(self.path) as temporary:
-                temporary.write_bytes(data)
+            write_record(self.path, dict(zip(NAMES, parts, strict=True)), self.key)
         self._written = time.monotonic()
 
     def remove(self) -> None:
         """Remove the file of a fit that has ended; call it once the model is saved."""
         self.path.unlink(missing_ok=True)
+
+
+def read_record(path: Path) -> tuple[dict[str, Tensor], str | None]:
+    """Tensors and key of a checkpoint.
+
+    Raises:
+        ModelError: the file is damaged, too large, or no file.
+    """
+    if not path.is_file():
+        raise ModelError(f"{path} is no file", expected="the file of a checkpoint")
+    try:
+        with path.open("rb") as file:
+            data = file.read(CHECKPOINT_BYTES + 1)
+        if len(data) > CHECKPOINT_BYTES:
+            raise ModelError(f"{path}: too large for a checkpoint", got=f"> {CHECKPOINT_BYTES} bytes")
+        # Of one content: a library that opens the file twice may see two versions of it.
+        tensors = safetensors.torch.load(data)
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        return tensors, header.get("__metadata__", {}).get("key")
+    except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as cause:
+        if isinstance(cause, ModelError):
+            raise
+        raise ModelError(
+            f"{path}: the checkpoint is damaged", got=str(cause), hint="remove it to start anew"
+        ) from cause
+
+
+def write_record(path: Path, tensors: Mapping[str, Tensor], key: str) -> None:
+    """Write a checkpoint, whole or not at all.
+
+    Raises:
+        DestinationError: the place cannot be written.
+    """
+    data = safetensors.torch.save({name: x.contiguous() for name, x in tensors.items()}, {"key": key})
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def belongs_elsewhere(path: Path, key: str, found: str | None) -> ModelError:
+    """The error for a checkpoint of another fit."""
+    return ModelError(
+        f"{path}: the checkpoint belongs to another fit",
+        expected=f"data, settings and system with key {key}",
+        got=found,
+        hint="remove it, or name another file",
+    )
 
 
 def _flat(tensors: list[Tensor]) -> Tensor:
