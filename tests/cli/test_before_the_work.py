@@ -130,7 +130,7 @@ WORK = {
     "fit gp": "independent Gaussian processes on 6 samples",
     "predict": "reading .*run.parquet|exact inference on 3 samples",
     "evaluate": "an evaluation on 36 samples|exact inference on 3 samples",
-    "rollout": "1 trajectories of 35 steps|exact inference on 3 samples",
+    "rollout": "1 trajectories of 35 steps",
     "reproduce": "the largest fit, to 200 samples,",
 }
 
