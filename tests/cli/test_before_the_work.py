@@ -80,6 +80,28 @@ def test_a_place_that_cannot_be_written_is_refused_before_anything_is_read(
         run(*arguments(command, made, tmp_path / "file" / "result.parquet"))
 
 
+@pytest.mark.parametrize("command", ["import", "guess", "check", "select", "predict"])
+def test_a_result_is_not_written_over_what_it_is_made_from(command: str, made: Path, tmp_path: Path) -> None:
+    log = made / ("log.csv" if command == "guess" else "run.parquet")
+    inputs = [log if x == made / "log.csv" else x for x in arguments(command, made, log)]
+    before = log.read_bytes()
+    with pytest.raises(DestinationError, match="would be overwritten"):
+        run(*inputs)
+    assert log.read_bytes() == before
+
+
+def test_both_parts_of_a_selection_are_not_one_file(made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "part.parquet"
+    with pytest.raises(DestinationError, match="would be overwritten"):
+        run("select", made / "run.parquet", "-n", 5, "-o", out, "--rest", tmp_path / "." / "part.parquet")
+
+
+def test_a_checkpoint_inside_the_models_folder_is_refused(made: Path, tmp_path: Path) -> None:
+    fit = arguments("fit", made, tmp_path / "model")
+    with pytest.raises(DestinationError, match="would lie in the folder of the model"):
+        run(*fit, "--checkpoint", tmp_path / "model" / "fit.ckpt")
+
+
 @pytest.mark.parametrize("command", ["simulate", "select", "select --rest", "predict"])
 def test_another_ending_than_parquet_is_refused_before_the_work(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

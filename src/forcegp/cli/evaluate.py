@@ -45,7 +45,7 @@ def evaluate(
     from forcegp.models.load import load_model
 
     if out is not None:
-        check_destination(out, folder=True, own_files=["evaluation.json"])
+        check_destination(out, folder=True, own_files=["*.json", "*.html", "*.svg", "*.png"])
     regression = load_model(model)
     robot = regression.system.robot
     test = data_of_robot(read_data(data), robot)

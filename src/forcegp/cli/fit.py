@@ -13,6 +13,7 @@ from forcegp.cli.common import (
     DataFile,
     Differentiate,
     SceneName,
+    check_apart,
     data_of_robot,
     noise_std_of,
     progress_bar,
@@ -58,13 +59,21 @@ def fit(
     forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model/ --json
     """
     from forcegp.destination import check_destination, write_or_keep
+    from forcegp.errors import DestinationError
     from forcegp.models.registry import create
     from forcegp.scene import load_scene
-    from forcegp.storage.folder import HEADER_FILE
+    from forcegp.storage.folder import check_model_destination
 
-    check_destination(out, folder=True, own_files=[HEADER_FILE])
+    check_model_destination(out)
     if checkpoint is not None:
         check_destination(checkpoint)
+        check_apart(checkpoint, data)
+        if out.resolve() in checkpoint.resolve().parents:
+            raise DestinationError(
+                "the checkpoint would lie in the folder of the model, which is written as a whole",
+                got=checkpoint,
+                hint="name a file outside of it",
+            )
     read = load_scene(scene)
     system = read.system()
     training = data_of_robot(read_data(data, differentiate), system.robot)

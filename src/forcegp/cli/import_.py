@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from forcegp.cli.common import AsJson, progress_bar, show
+from forcegp.cli.common import AsJson, check_apart, progress_bar, show
 
 if TYPE_CHECKING:
     from forcegp.constraints import ConstrainedSystem
@@ -57,11 +57,13 @@ def import_(
         raise ForceGPError("nothing says which robot moved", hint="give either --scene or --robot")
     if guess is not None:
         check_destination(guess)
+        check_apart(guess, log)
         show(_guess(log, _system(scene, robot), guess), as_json)
         return
     if out is None or out.suffix.lower() != ".parquet":
         raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
     check_destination(out)
+    check_apart(out, log)
     system = _system(scene, robot)
     with progress_bar(f"reading {log.name}", 1) as advance:
         imported = import_log(log, system, mapping, progress=advance)
