@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation as SciPyRotation
 
 import forcegp
-from forcegp import Baumgarte, ConstrainedSystem, Plane, SurfaceContact, dynamics
+from forcegp import Baumgarte, ConstrainedSystem, Plane, SurfaceContact, dynamics, kinematics
 from forcegp.control.task_space import (
     Gains,
     Target,
@@ -80,7 +80,7 @@ def test_free_motion_under_the_torque_has_the_wanted_task_acceleration() -> None
         torch.zeros(10, dtype=torch.float64),
     )
     gains = Gains()
-    Q_u = control_torque(tool, eom, q, qd, target, torch.zeros_like(tool.position), gains)
+    Q_u = control_torque(tool, eom, q, qd, target, torch.zeros_like(q), gains)
     qdd = dynamics.forward_dynamics(ROBOT, q, qd, Q_u + dynamics.damping_force(ROBOT, qd))
     reached = (tool.jacobian @ qdd[..., None])[..., 0] + tool.bias
     torch.testing.assert_close(reached, task_acceleration(tool, target, gains), atol=1e-7, rtol=1e-9)
@@ -95,11 +95,25 @@ def test_the_push_becomes_the_multiplier_when_the_task_follows_the_surface() -> 
     tool = _tool(q, qd)
     along = torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
     target = Target(tool.position, tool.twist[3:], along, tool.rotation, q, torch.tensor(40.0).double())
-    Q_u = control_torque(tool, eom, q, qd, target, eom.contact_points["table"].normal, Gains())
+    Q_u = control_torque(tool, eom, q, qd, target, eom.A[0], Gains())
     assert float(eom.multiplier(eom.Q_K + Q_u)) == pytest.approx(40.0, abs=SOLVED)
     qdd = eom.acceleration(eom.Q_K + Q_u)
     reached = (tool.jacobian @ qdd[:, None])[:, 0] + tool.bias
     torch.testing.assert_close(reached[3:], along, atol=SOLVED, rtol=0.0)
+
+
+def test_an_arm_with_few_joints_follows_the_position_in_its_plane() -> None:
+    pendulum = forcegp.load_robot("double_pendulum")
+    q, qd = _draw(10, 2), _draw(10, 2, seed=1)
+    q[:, 1] = q[:, 1].abs() + 0.3
+    poses = kinematics.link_poses(pendulum, q)
+    motion = kinematics.link_motion(pendulum, poses, qd)
+    tool = tool_motion(pendulum, poses, motion, qd, "tip", (0.0, 0.0, 0.0))
+    task = _draw(10, 6, seed=2)
+    y = joint_acceleration(tool, task, _draw(10, 2, seed=3))
+    reached = (tool.jacobian @ y[..., None])[..., 0] + tool.bias
+    in_plane = [3, 5]  # x and z; the pendulum cannot leave the plane, nor choose its orientation
+    torch.testing.assert_close(reached[:, in_plane], task[:, in_plane], atol=SOLVED, rtol=SOLVED)
 
 
 def test_a_stretched_arm_is_refused() -> None:

@@ -109,7 +109,7 @@ def test_a_damaged_state_is_refused(name: str, value: float | None, message: str
     make, options = CASES["network"]
     file = tmp_path / "fit.ckpt"
     make().fit(DATA, options=options, checkpoint=file, keep_checkpoint=True)
-    found, key = module.read_record(file)
+    found, key = module.read_keyed(file)
     if value is None:
         del found[name]
     else:

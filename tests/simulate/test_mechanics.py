@@ -69,9 +69,9 @@ def test_contact_mechanics_and_control_agree_in_both_kinds_of_arrays() -> None:
     target = plan.targets._replace(**{k: v[3] for k, v in plan.targets._asdict().items()})
     one = mechanics.equations(q.numpy(), qd.numpy())
     tool = tool_motion(ROBOT, eom.poses, eom.motion, qd, plan.frame, plan.point)
-    ours = control_torque(tool, eom, q, qd, target, plan.normal(eom), config.gains)
+    ours = control_torque(tool, eom, q, qd, target, plan.press(eom), config.gains)
     arrays = type(target)(*(x.numpy() for x in target))
-    theirs = control_torque(one.tool, one, q.numpy(), qd.numpy(), arrays, plan.normal(one), config.gains)
+    theirs = control_torque(one.tool, one, q.numpy(), qd.numpy(), arrays, plan.press(one), config.gains)
     np.testing.assert_allclose(theirs, ours.numpy(), rtol=SOLVED, atol=SOLVED)
     for closed in (True, False):
         flags = torch.tensor([closed])

@@ -177,12 +177,6 @@ def test_a_rectangle_out_of_reach_is_named() -> None:
         simulate(TABLE, SimulationConfig(center=(2.0, 0.0, 0.0)))
 
 
-def test_an_arm_without_enough_joints_is_named() -> None:
-    pendulum = forcegp.load_robot("double_pendulum")
-    with pytest.raises(ForceGPError, match="at least 6 joints"):
-        simulate(ConstrainedSystem(pendulum), SimulationConfig())
-
-
 def test_an_interrupt_ends_the_run_and_closes_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     from forcegp.simulate.mujoco import MuJoCoEngine
 

@@ -13,7 +13,7 @@ import typer
 if TYPE_CHECKING:
     from forcegp.data import Dataset
     from forcegp.robot import RobotModel
-    from forcegp.scene import Scene
+    from forcegp.scene import ModelTable, Scene
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 SceneName = Annotated[
@@ -21,6 +21,14 @@ SceneName = Annotated[
 ]
 ModelFolder = Annotated[Path, typer.Option("--model", "-m", help="Folder of a fitted model.")]
 DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
+Config = Annotated[
+    Path | None,
+    typer.Option(help="TOML file with a table \\[model], in place of the scene's: priors, learning."),
+]
+DataFiles = Annotated[
+    list[Path],
+    typer.Option("--data", "-d", help="Data set, .parquet or .csv; may be given several times."),
+]
 Differentiate = Annotated[
     int | None,
     typer.Option(
@@ -111,7 +119,8 @@ def data_of_robot(data: Dataset, robot: RobotModel) -> Dataset:
     return data
 
 
-def noise_std_of(option: float | None, scene: Scene) -> float | None:
-    """The noise of accelerations that a model is told: the option, else the scene's, else what the log
-    states."""
-    return option if option is not None else scene.noise_std
+def model_table(config: Path | None, scene: Scene) -> ModelTable:
+    """The table [model] of a file of its own where one is given, else that of the scene."""
+    from forcegp.scene import load_model_table
+
+    return scene.model if config is None else load_model_table(config)

@@ -3,26 +3,45 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, progress_bar, read_data, show
+from forcegp.cli.common import (
+    AsJson,
+    Config,
+    DataFile,
+    data_of_robot,
+    model_table,
+    progress_bar,
+    read_data,
+    show,
+)
+
+if TYPE_CHECKING:
+    from forcegp.models.base import Predictor
 
 WINDOW_SECONDS = 3.0
 """Length of the plots over time [s], as in the paper."""
 
 
 def evaluate(
-    model: ModelFolder,
     data: DataFile,
+    model: Annotated[
+        Path | None, typer.Option("--model", "-m", help="Folder of a fitted model; left out, one is fitted.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its data.")] = None,
     train: Annotated[
         Path | None,
         typer.Option(
-            help="Data that the trivial predictors are fitted to; default: the other half of the data."
+            help="Data that the trivial predictors are fitted to; default: the other half of the data. "
+            "Without --model, also what a model is fitted to."
         ),
     ] = None,
+    scene: Annotated[
+        str | None, typer.Option("--scene", "-s", help="Without --model: the scene of the model to fit.")
+    ] = None,
+    config: Config = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a model's predictions with a data set and with trivial predictors.
@@ -38,15 +57,16 @@ def evaluate(
     [bold]Examples[/bold]
 
     forcegp evaluate --model model/ --data test.parquet --train train.parquet --out evaluation/
+
+    forcegp evaluate --scene my_scene.toml --config model.toml --train train.parquet --data test.parquet
     """
     from forcegp.destination import check_destination, write_or_keep
     from forcegp.evaluation import evaluate as run
     from forcegp.files import atomic_directory, write_json
-    from forcegp.models.load import load_model
 
     if out is not None:
         check_destination(out, folder=True, own_files=["*.json", "*.html", "*.svg", "*.png"])
-    regression = load_model(model)
+    regression = _model(model, scene, config, train)
     robot = regression.system.robot
     test = data_of_robot(read_data(data), robot)
     known = None if train is None else data_of_robot(read_data(train), robot)
@@ -63,8 +83,40 @@ def evaluate(
         def write(folder: Path) -> None:
             with atomic_directory(folder) as temporary:
                 write_json(temporary / "evaluation.json", found.to_dict())
-                write_evaluation(temporary, str(model), str(data), found, window, fitted_to)
+                write_evaluation(
+                    temporary, str(model or config or scene), str(data), found, window, fitted_to
+                )
 
         write_or_keep(write, out)
         result |= {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}
     show(result, as_json)
+
+
+def _model(model: Path | None, scene: str | None, config: Path | None, train: Path | None) -> Predictor:
+    """The fitted model in a folder, or one that is fitted to the training data now.
+
+    Raises:
+        ForceGPError: both are asked for, or neither.
+    """
+    from forcegp.errors import ForceGPError
+    from forcegp.models.configured import configured
+    from forcegp.models.load import load_model
+    from forcegp.scene import load_scene
+
+    if model is not None:
+        if scene is not None or config is not None:
+            raise ForceGPError("a fitted model has its scene and settings", hint="give --model alone")
+        return load_model(model)
+    if scene is None or train is None:
+        raise ForceGPError(
+            "nothing says which model to evaluate",
+            expected="--model FOLDER, or --scene and --train to fit one",
+        )
+    read = load_scene(scene)
+    system = read.system()
+    regression = configured(model_table(config, read), system)
+    training = data_of_robot(read_data(train), system.robot)
+    with progress_bar(f"fitting {regression.name}", 1) as progress:
+        return regression.fit(
+            training, progress=lambda done, most, value: progress(done, most, f"objective {value:.4g}")
+        )

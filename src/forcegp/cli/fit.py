@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,64 +11,81 @@ import typer
 
 from forcegp.cli.common import (
     AsJson,
-    DataFile,
+    Config,
+    DataFiles,
     Differentiate,
     SceneName,
     check_apart,
     data_of_robot,
-    noise_std_of,
+    model_table,
     progress_bar,
     read_data,
     show,
 )
 
 if TYPE_CHECKING:
-    from forcegp.models.base import FitResult
+    from forcegp.data import Dataset, StreamedDataset
+    from forcegp.models.base import FitResult, Model
+    from forcegp.robot import RobotModel
+
+STREAM_ROWS = 100_000
+"""Rows of a log from which it is read piece by piece."""
 
 
 def fit(
     scene: SceneName,
-    data: DataFile,
+    data: DataFiles,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fitted model.")],
     model: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--model",
             "-m",
             help="analytical, nn, gp, sgp-zero, sgp-mean, sgp-contact or sgp-real; with the paper's kernel "
-            "sgp-zero-se, sgp-mean-se or sgp-contact-se.",
+            "sgp-zero-se, sgp-mean-se or sgp-contact-se. Default: the file's, else sgp-mean.",
         ),
-    ] = "sgp-mean",
+    ] = None,
+    config: Config = None,
     noise_std: Annotated[
         float | None,
-        typer.Option(help="Noise on accelerations in rad/s²; default: the scene's or the data's."),
+        typer.Option(help="Noise on accelerations in rad/s²; default: the file's or the data's."),
     ] = None,
     differentiate: Differentiate = None,
     checkpoint: Annotated[
         Path | None,
         typer.Option(help="File that records a long fit; a fit that finds it resumes there."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of random initial values.")] = 0,
+    seed: Annotated[int | None, typer.Option(help="Seed of random initial values.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Fit a model of the forward dynamics to logged motion.
+
+    The table \\[model] of the scene, or of --config, chooses priors, kernels, noise, robot parameters and how
+    to learn; the options override it.
+
+    Structured models read Parquet logs of more than 100,000 rows, and several files, piece by piece.
 
     [bold]Examples[/bold]
 
     forcegp fit --scene kuka_plane --data train.parquet --model sgp-mean --out model/
 
     forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model/ --json
+
+    forcegp fit -s my_scene.toml -d train.parquet --config model.toml -o model/
+
+    forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model/
     """
     from forcegp.destination import check_destination, write_or_keep
     from forcegp.errors import DestinationError
-    from forcegp.models.registry import create
+    from forcegp.models.configured import configured
     from forcegp.scene import load_scene
     from forcegp.storage.folder import check_model_destination
+    from forcegp.storage.sums import beside
 
     check_model_destination(out)
     if checkpoint is not None:
         check_destination(checkpoint)
-        check_apart(checkpoint, data)
+        check_apart(checkpoint, *data)
         if out.resolve() in checkpoint.resolve().parents:
             raise DestinationError(
                 "the checkpoint would lie in the folder of the model, which is written as a whole",
@@ -76,21 +94,44 @@ def fit(
             )
     read = load_scene(scene)
     system = read.system()
-    training = data_of_robot(read_data(data, differentiate), system.robot)
-    regression = create(model, system, noise_std=noise_std_of(noise_std, read), seed=seed)
-    with progress_bar(f"fitting {model}", 1) as progress:
+    regression = configured(model_table(config, read), system, name=model, noise_std=noise_std, seed=seed)
+    training = _training(regression.model, data, differentiate, system.robot)
+    with progress_bar(f"fitting {regression.name}", 1) as progress:
         fitted = regression.fit(
-            training,
-            progress=lambda done, most, value: progress(done, most, f"objective {value:.4g}"),
+            training,  # pyright: ignore[reportArgumentType]  # a stream for a structured GP only
+            progress=lambda done, most, value: progress(
+                done, most, "" if math.isnan(value) else f"objective {value:.4g}"
+            ),
             checkpoint=checkpoint,
             keep_checkpoint=True,
         )
     write_or_keep(fitted.save, out)
     if checkpoint is not None:
-        checkpoint.unlink(missing_ok=True)
+        for file in (checkpoint, beside(checkpoint)):
+            file.unlink(missing_ok=True)
     _warn(fitted.result)
     figures = {name: value for name, value in asdict(fitted.result).items() if name != "history"}
-    show({"model": model, "training_points": len(training), **figures, "folder": str(out)}, as_json)
+    show({"model": regression.name, "training_points": len(training), **figures, "folder": str(out)}, as_json)
+
+
+def _training(
+    regression: Model, files: list[Path], differentiate: int | None, robot: RobotModel
+) -> Dataset | StreamedDataset:
+    """The data that a model is fitted to: read piece by piece where they are long and the model can.
+
+    Raises:
+        DataError: a file cannot be read.
+    """
+    from forcegp.data import Dataset, SavitzkyGolay, StreamedDataset
+    from forcegp.models.structured_gp import StructuredGP
+
+    if isinstance(regression, StructuredGP) and all(file.suffix.lower() == ".parquet" for file in files):
+        method = SavitzkyGolay(window=differentiate) if differentiate is not None else None
+        log = StreamedDataset(tuple(files), method, robot.joint_names)
+        if len(files) > 1 or len(log) > STREAM_ROWS:
+            return log
+    parts = [data_of_robot(read_data(file, differentiate), robot) for file in files]
+    return parts[0] if len(parts) == 1 else Dataset.concatenate(parts)
 
 
 def _warn(result: FitResult) -> None:

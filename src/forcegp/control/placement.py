@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from forcegp import kinematics
-from forcegp.control.task_space import orientation_error
+from forcegp.control.task_space import orientation_error, task_rows
 from forcegp.errors import NumericalError
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointVector, Rotation, Vector3
@@ -36,7 +36,8 @@ def inverse_kinematics(
 ) -> JointVector:
     """Joint positions that put a point of a frame at a pose, by damped least squares from many starts.
 
-    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move towards `near` in the null space of J.
+    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move to `near` in the null space of J. An
+    arm with fewer than six joints is asked for the position alone.
 
     Args:
         robot: the robot.
@@ -75,7 +76,7 @@ def inverse_kinematics(
 def _pose_error(
     robot: RobotModel, q: Tensor, index: int, x: Tensor, position: Tensor, rotation: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pose error `(k, 6)`, Jacobian, and whether the axes agree.
+    """Pose error `(k, 6)`, or of the position `(k, 3)`, its Jacobian, and whether the axes agree.
 
     The sine in the orientation error also vanishes half a turn away, where the trace of the relative
     rotation is −1 and not 3.
@@ -84,17 +85,20 @@ def _pose_error(
     reached = kinematics.rotation_of_poses(robot, poses, index)
     shift = position - kinematics.point_of_poses(robot, poses, index, x) - robot.base_position
     error = torch.cat([orientation_error(reached, rotation.expand_as(reached)), shift], dim=-1)
-    aligned = (reached * rotation).sum((-2, -1)) > 1.0
-    return error, kinematics.jacobian_of_poses(robot, poses, index, x), aligned
+    J, rows = kinematics.jacobian_of_poses(robot, poses, index, x), task_rows(robot.nq)
+    asked_for = rows.start > 0 or (reached * rotation).sum((-2, -1)) > 1.0
+    aligned = torch.as_tensor(asked_for).expand(len(q))
+    return error[..., rows], J[..., rows, :], aligned
 
 
 def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
     """Jᵀ(J Jᵀ + μ I)⁻¹(e − J l) + l."""
     damping = DAMPING * (error * error).sum(-1) + torch.finfo(error.dtype).eps
-    eye = torch.eye(J.shape[-2], dtype=J.dtype)
-    missing = error - (J @ leaning[..., None])[..., 0]
-    solved = torch.linalg.solve(J @ J.mT + damping[..., None, None] * eye, missing)
-    return leaning + (J.mT @ solved[..., None])[..., 0]
+    missing = (error - (J @ leaning[..., None])[..., 0])[..., None]
+    damped = damping[..., None, None] * torch.eye(min(J.shape[-2:]), dtype=J.dtype)
+    if J.shape[-1] < J.shape[-2]:
+        return leaning + torch.linalg.solve(J.mT @ J + damped, J.mT @ missing)[..., 0]
+    return leaning + (J.mT @ torch.linalg.solve(J @ J.mT + damped, missing))[..., 0]
 
 
 def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotation:

@@ -15,13 +15,10 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
 from forcegp.control.motion import MotionConfig
 from forcegp.control.placement import inverse_kinematics, tool_rotation
-from forcegp.control.task_space import Target
+from forcegp.control.task_space import Target, task_rows
 from forcegp.control.trajectory import Chart, Reference, draw_waypoints, straight_lines
-from forcegp.errors import ForceGPError
 from forcegp.robot.model import RobotModel
 
-TASK_ROWS = 6
-"""Position and orientation of the tool."""
 STARTS = 64
 """Random joint positions that inverse kinematics starts from; those near zero give the natural postures."""
 
@@ -31,14 +28,14 @@ class Plan:
     """What the controller follows.
 
     Attributes:
-        contact: name of the tool's contact, `None` in free space.
+        contacts: names of the tool's contacts, none in free space.
         frame, point: the tool point.
         reference: the motion of the tool point.
         targets: the controller's targets, `(n, …)`, one per sample.
         start: `(nq,)` joint positions at the first waypoint.
     """
 
-    contact: str | None
+    contacts: tuple[str, ...]
     frame: str
     point: Sequence[float]
     reference: Reference
@@ -49,20 +46,25 @@ class Plan:
         """The targets as NumPy arrays `(n, …)`."""
         return Target(*(values.numpy() for values in self.targets))
 
-    def normal(self, eom: Any) -> Any:
-        """Unit normal of the surface under the tool `(*batch, 3)`; zero in free space.
+    def press(self, eom: Any) -> Any:
+        """Generalized force of a unit normal force on each of the tool's contacts `(*batch, nq)`, Σ Jᵀn/|n|.
 
         Args:
             eom: the equations of motion of a batch of states, or of one state in NumPy.
         """
-        if self.contact is None:
-            return 0.0 * eom.Q_C[..., :3]
-        n = eom.contact_points[self.contact].normal
-        return n / ((n * n).sum(-1) ** 0.5)[..., None]
+        total = 0.0 * eom.Q_C
+        for name in self.contacts:
+            at = eom.contact_points[name]
+            unit = at.normal / ((at.normal * at.normal).sum(-1) ** 0.5)[..., None]
+            total = total + (at.jacobian.swapaxes(-1, -2) @ unit[..., None])[..., 0]
+        return total
 
 
 def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.Generator) -> Plan:
     """Draw a motion of the tool over the surface of the system's first contact, or in free space.
+
+    The tool's axis points from the origin of its frame to the middle of the contacts that the frame carries.
+    An arm with fewer than six joints follows the position alone.
 
     Args:
         system: robot and contacts.
@@ -70,18 +72,19 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
         generator: source of the random numbers.
 
     Raises:
-        ForceGPError: the robot has fewer than six joints.
         NumericalError: the rectangle's centre or the first waypoint is out of reach.
     """
     robot = system.robot
-    _check_joints(robot)
-    contact = next((c for c in system.contacts if isinstance(c, SurfaceContact)), None)
+    touching = [c for c in system.contacts if isinstance(c, SurfaceContact)]
+    contact = touching[0] if touching else None
     frame, point = (contact.frame, contact.point) if contact else (config.frame, config.point)
+    own = [c for c in touching if c.frame == frame]
     frame = robot.frame_names[-1] if frame is None else frame
     center = kinematics.as_point(robot, config.center)
     chart = Chart.about(center, contact.center_surface if contact else None)
     reference = _draw_reference(chart, config, generator)
-    rotation = tool_rotation(chart.axes[2], chart.axes[0], _tool_axis(kinematics.as_point(robot, point)))
+    middle = torch.stack([kinematics.as_point(robot, x) for x in [c.point for c in own] or [point]]).mean(0)
+    rotation = tool_rotation(chart.axes[2], chart.axes[0], _tool_axis(middle))
     draws = 2.0 * torch.rand(STARTS, robot.nq, dtype=torch.float64, generator=generator) - 1.0
     starts = (torch.linspace(0.0, math.pi, STARTS)[:, None] * draws).to(robot.dtype)
     nearest = torch.zeros(robot.nq, dtype=robot.dtype)
@@ -96,16 +99,7 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
         postures[reference.segment],
         _draw_push(reference, config, generator),
     )
-    return Plan(contact.name if contact else None, frame, point, reference, targets, start)
-
-
-def _check_joints(robot: RobotModel) -> None:
-    if robot.nq < TASK_ROWS:
-        raise ForceGPError(
-            f"robot {robot.name!r} cannot follow a tool pose",
-            expected=f"at least {TASK_ROWS} joints for position and orientation",
-            got=f"{robot.nq} joints",
-        )
+    return Plan(tuple(c.name for c in own), frame, point, reference, targets, start)
 
 
 def _tool_axis(point: Tensor) -> Tensor:
@@ -134,8 +128,8 @@ def _draw_postures(
     generator: torch.Generator,
 ) -> Tensor:
     """`(segments, nq)` postures off the home posture along the null space, where the elbow swings."""
-    J = kinematics.frame_jacobian(robot, home, frame, point)
-    free = torch.linalg.svd(J)[2][TASK_ROWS:]
+    J = kinematics.frame_jacobian(robot, home, frame, point)[task_rows(robot.nq)]
+    free = torch.linalg.svd(J)[2][len(J) :]
     swing = 2.0 * torch.rand(segments, len(free), dtype=torch.float64, generator=generator) - 1.0
     return home + config.elbow_swing * swing.to(robot.dtype) @ free
 

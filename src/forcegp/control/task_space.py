@@ -1,6 +1,7 @@
 """Task-space inverse dynamics control with null-space control of the remaining freedom.
 
-The task is the pose of the tool: 3D position and 3D orientation. A redundant arm moves its elbow in the
+The task is the pose of the tool: 3D position and 3D orientation, or its position alone for an arm with fewer
+than six joints. A redundant arm moves its elbow in the
 null space of the task's Jacobian, which leaves the error dynamics of the task untouched
 (Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1).
 
@@ -27,6 +28,7 @@ from forcegp.types import Array, JointVector
 
 POTRF, POTRS = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
 """LAPACK's Cholesky factorisation and solve, without the overhead of wrappers."""
+POSE_ROWS, POSITION_ROWS = 6, 3
 SINGULAR = 1e-3
 """Below this smallest pivot of √(J Jᵀ) the task asks for joint speeds a thousand times its own."""
 
@@ -102,6 +104,11 @@ class Target(NamedTuple):
     push: Array
 
 
+def task_rows(nq: int) -> slice:
+    """The rows of [ω; ṗ] that an arm of nq joints can follow: all of six joints, ṗ of fewer."""
+    return slice(0 if nq >= POSE_ROWS else POSITION_ROWS, POSE_ROWS)
+
+
 def tool_motion(
     robot: RobotModel,
     poses: LinkPoses,
@@ -162,6 +169,9 @@ def task_acceleration(tool: ToolMotion, target: Target, gains: Gains) -> Array:
 def joint_acceleration(tool: ToolMotion, task: Array, posture: Array) -> Array:
     """y = J⁺(a − J̇q̇) + (I − J⁺J) y₀: the task's acceleration, and the posture's in its null space.
 
+    J are the rows of the tool's Jacobian that the arm can follow (`task_rows`). An arm with fewer joints than
+    these, such as a double pendulum, comes as close as it can.
+
     Args:
         tool: the tool at the state.
         task: a `(*batch, 6)` wanted acceleration of the tool.
@@ -173,16 +183,19 @@ def joint_acceleration(tool: ToolMotion, task: Array, posture: Array) -> Array:
     Raises:
         NumericalError: the arm is singular, so that the task cannot be reached.
     """
-    J = tool.jacobian
+    nq = tool.jacobian.shape[-1]
+    rows = task_rows(nq)
+    J = tool.jacobian[..., rows, :]
     Jt = J.swapaxes(-1, -2)
-    missing = task - tool.bias - (J @ posture[..., None])[..., 0]
-    solved, pivot = _solve(J @ Jt, missing[..., None])
+    missing = ((task - tool.bias)[..., rows] - (J @ posture[..., None])[..., 0])[..., None]
+    few = nq < J.shape[-2]
+    solved, pivot = _solve(Jt @ J, Jt @ missing) if few else _solve(J @ Jt, missing)
     if not pivot >= SINGULAR:
         raise NumericalError(
             "the arm is singular: its joints cannot give the tool every velocity",
             hint="a smaller rectangle, or one nearer to the centre of the workspace",
         )
-    return posture + (Jt @ solved)[..., 0]
+    return posture + (solved if few else Jt @ solved)[..., 0]
 
 
 def _solve(G: Array, x: Array) -> tuple[Array, float]:
@@ -207,18 +220,19 @@ def control_torque(
     q: Array,
     qd: Array,
     target: Target,
-    normal: Array,
+    press: Array,
     gains: Gains,
 ) -> Array:
-    """Motor torque Q_u = M y − Q_K − J_Eᵀ n F of task-space inverse dynamics control, before any limit.
+    """Motor torque Q_u = M y − Q_K − Q_n F of task-space inverse dynamics control, before any limit.
 
     Args:
         tool: the tool at the state.
         eom: the equations of motion at the state; M and Q_K = Q_C + Q_G + Q_D are used.
         q, qd: `(*batch, nq)` the state.
         target: what is to be reached; F is its `push`.
-        normal: n `(*batch, 3)` where the tool is; along that of the reference, the push would drive the
-            tool away from it on a convex surface.
+        press: Q_n `(*batch, nq)` generalized force of unit normal forces on the tool where it is, Jᵀn summed
+            over its contacts; along the normal of the reference, the push would drive the tool away from it
+            on a convex surface.
         gains: feedback gains.
 
     Returns:
@@ -229,6 +243,4 @@ def control_torque(
     """
     posture = gains.posture_stiffness * (target.posture - q) - gains.posture_damping * qd
     y = joint_acceleration(tool, task_acceleration(tool, target, gains), posture)
-    force = -target.push[..., None] * normal
-    push = (tool.jacobian[..., 3:, :].swapaxes(-1, -2) @ force[..., None])[..., 0]
-    return (eom.M @ y[..., None])[..., 0] - eom.Q_K + push
+    return (eom.M @ y[..., None])[..., 0] - eom.Q_K - target.push[..., None] * press

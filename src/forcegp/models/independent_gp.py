@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from pydantic import PositiveFloat
@@ -94,6 +95,9 @@ class IndependentGP(Model["IndependentFit"]):
     def __init__(self, system: ConstrainedSystem, noise_std: NoiseStd | None = None) -> None:
         self.specified = system
         self.noise_std = noise_std
+
+    def get_params(self) -> dict[str, Any]:
+        return {"system": self.specified, "noise_std": self.noise_std}
 
     def fit(
         self,
@@ -227,7 +231,7 @@ def fitted(
     return IndependentFit(system, noise_std, training, hyperparameters, posteriors, result)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class IndependentFit(FittedModel):
     """Conditioned processes.
 

@@ -17,16 +17,20 @@ from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.neural import NeuralNetwork
 from forcegp.models.structured_gp import StructuredGP
 
+SGP = StructuredGP.kind
+
 
 @dataclass(frozen=True)
 class Entry:
     """A named model.
 
     Attributes:
+        kind: of the model, as in saved models.
         description: one line for help texts and the report.
         make: builds it from the system, the noise, the seed and options of its own.
     """
 
+    kind: str
     description: str
     make: Callable[..., Model]
 
@@ -67,18 +71,26 @@ def _contact(kernel: Kernel | None = None) -> Callable[..., Model]:
 
 
 MODELS: dict[str, Entry] = {
-    "analytical": Entry("equations of motion with learned inertia and damping, no friction", _analytical),
-    "nn": Entry("neural network with sigmoid layers on (q, qd, tau)", _network),
-    "gp": Entry("one Gaussian process per joint acceleration on (q, qd, tau)", _independent),
-    "sgp-zero": Entry("structured GP, all joint forces unknown", _structured("zero")),
-    "sgp-mean": Entry("structured GP around the analytical forces", _structured("analytical")),
-    "sgp-zero-se": Entry("sgp-zero with the paper's kernel alone", _structured("zero", PAPER)),
-    "sgp-mean-se": Entry("sgp-mean with the paper's kernel alone", _structured("analytical", PAPER)),
-    "sgp-contact": Entry("structured GP with mean and a prior on the contact's friction alone", _contact()),
-    "sgp-real": Entry(
-        "structured GP for measured robots: joint and contact friction, torque noise", _measured
+    "analytical": Entry(
+        AnalyticalModel.kind, "equations of motion with learned inertia and damping, no friction", _analytical
     ),
-    "sgp-contact-se": Entry("the same with any tangential force and the paper's kernel", _contact(PAPER)),
+    "nn": Entry(NeuralNetwork.kind, "neural network with sigmoid layers on (q, qd, tau)", _network),
+    "gp": Entry(
+        IndependentGP.kind, "one Gaussian process per joint acceleration on (q, qd, tau)", _independent
+    ),
+    "sgp-zero": Entry(SGP, "structured GP, all joint forces unknown", _structured("zero")),
+    "sgp-mean": Entry(SGP, "structured GP around the analytical forces", _structured("analytical")),
+    "sgp-zero-se": Entry(SGP, "sgp-zero with the paper's kernel alone", _structured("zero", PAPER)),
+    "sgp-mean-se": Entry(SGP, "sgp-mean with the paper's kernel alone", _structured("analytical", PAPER)),
+    "sgp-contact": Entry(
+        SGP, "structured GP with mean and a prior on the contact's friction alone", _contact()
+    ),
+    "sgp-real": Entry(
+        SGP, "structured GP for measured robots: joint and contact friction, torque noise", _measured
+    ),
+    "sgp-contact-se": Entry(
+        SGP, "the same with any tangential force and the paper's kernel", _contact(PAPER)
+    ),
 }
 """The models, simplest first."""
 

@@ -14,11 +14,34 @@ from forcegp.errors import SceneError
 from forcegp.robot import RobotModel, load_robot
 from forcegp.robot.load import BUNDLED as BUNDLED_ROBOTS
 from forcegp.scene.document import Document
+from forcegp.scene.model_section import ModelFile, ModelSection
 from forcegp.scene.sections import SceneSections
 from forcegp.simulate.config import SimulationConfig
 
-BUNDLED = ("kuka_plane", "ur5_wiping")
-"""Scenes that come with the library: the paper's task, and a UR5 with undeclared friction."""
+BUNDLED = (
+    "kuka_plane",
+    "kuka_sphere",
+    "kuka_two_points",
+    "panda_sphere",
+    "panda_tilted",
+    "pendulum_wire",
+    "ur5_free",
+    "ur5_wiping",
+)
+"""Scenes that come with the library; `kuka_plane` is the paper's task."""
+
+
+@dataclass(frozen=True)
+class ModelTable:
+    """The table `[model]` of a file; `forcegp.models.configured` makes what it describes.
+
+    Attributes:
+        section: its keys.
+        document: the file, for messages.
+    """
+
+    section: ModelSection
+    document: Document
 
 
 @dataclass(frozen=True)
@@ -41,9 +64,9 @@ class Scene:
         return self.sections.simulation
 
     @property
-    def noise_std(self) -> float | None:
-        """Standard deviation of the noise on q̈ that the models assume, or `None` to take it from the data."""
-        return self.sections.model.noise_std
+    def model(self) -> ModelTable:
+        """Which model to fit, and how."""
+        return ModelTable(self.sections.model, self.document)
 
     def robot(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> RobotModel:
         """The robot.
@@ -96,7 +119,7 @@ def load_scene(source: str | Path) -> Scene:
     """Read a scene file.
 
     Args:
-        source: a path, or the name of a bundled scene (`kuka_plane`, `ur5_wiping`).
+        source: a path, or the name of a bundled scene, one of `BUNDLED`.
 
     Returns:
         The scene; nothing but its file has been read yet.
@@ -120,3 +143,18 @@ def load_scene(source: str | Path) -> Scene:
         )
     document = Document(path.read_bytes(), str(path))
     return Scene(document.validated(SceneSections), document, path.parent)
+
+
+def load_model_table(path: str | Path) -> ModelTable:
+    """Read a file with the table `[model]` alone.
+
+    Args:
+        path: a TOML file.
+
+    Raises:
+        SceneError: the file does not exist or is not valid; the message names file, line and key.
+    """
+    if not _is_file(Path(path)):
+        raise SceneError(f"{path}: no such model file", expected="a TOML file with a table [model]")
+    document = Document(Path(path).read_bytes(), str(path))
+    return ModelTable(document.validated(ModelFile).model, document)

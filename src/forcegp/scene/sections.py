@@ -6,18 +6,13 @@ scene file is a parameter of that class; the other tables are described here.
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from forcegp.constraints import Baumgarte, SurfaceSchema
+from forcegp.scene.model_section import ModelSection, Section
 from forcegp.simulate.config import SimulationConfig
 
 Vector = tuple[float, float, float]
-
-
-class Section(BaseModel):
-    """A table of a scene file: unknown keys and numbers that are not finite are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class RobotSection(Section):
@@ -27,7 +22,7 @@ class RobotSection(Section):
     base_position: Vector = (0.0, 0.0, 0.0)
     base_rpy: Vector = (0.0, 0.0, 0.0)
     gravity: Vector = (0.0, 0.0, -9.81)
-    locked_joints: dict[str, float] = {}
+    locked_joints: dict[str, float] = Field(default_factory=dict)
 
 
 class ContactSection(Section):
@@ -48,12 +43,6 @@ class ConnectionSection(Section):
     point: Vector = (0.0, 0.0, 0.0)
     other_frame: str | None = None
     other_point: Vector = (0.0, 0.0, 0.0)
-
-
-class ModelSection(Section):
-    """`[model]`: what the models are told."""
-
-    noise_std: float | None = Field(default=None, ge=0.0)
 
 
 class SceneSections(Section):

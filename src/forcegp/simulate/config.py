@@ -21,7 +21,8 @@ class ContactSolver:
 
     Args:
         friction: Coulomb friction coefficient μ of tool and surface.
-        tip_radius: radius of the tip, a sphere that touches a surface at the scene's contact point [m].
+        tip_radius: radius of the tip, a sphere that ends at the scene's contact point, where the contact has
+            no radius of its own [m].
         joint_friction: Coulomb friction of each joint, beyond the robot file; empty is none [N m].
         joint_damping: viscous friction of each joint, beyond the robot file; empty is none [N m s/rad].
         stiffness_time: time constant of the contact's restoring force [s]; shorter is stiffer.

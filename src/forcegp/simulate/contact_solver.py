@@ -162,11 +162,11 @@ class ContactSolverEngine:
                     expected="contacts of a point with a surface",
                     hint='use contact = "rigid"',
                 )
-            body, position = _tip(robot, contact, solver.tip_radius)
+            body, position, radius = _tip(robot, contact, solver.tip_radius)
             ghost = {"contype": 0, "conaffinity": 0, "mass": 0.0}
             link = spec.worldbody if body == BASE else spec.body(link_name(robot, body))
             sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-            link.add_geom(name=f"tip_{i}", type=sphere, size=[solver.tip_radius, 0, 0], pos=position, **ghost)
+            link.add_geom(name=f"tip_{i}", type=sphere, size=[radius, 0, 0], pos=position, **ghost)
             spec.worldbody.add_geom(name=f"surface_{i}", **_shape(mujoco, contact), **ghost)
             pair = spec.add_pair(geomname1=f"surface_{i}", geomname2=f"tip_{i}")
             pair.condim = 3
@@ -192,17 +192,21 @@ def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarra
     return np.array(values or [0.0] * robot.nq)
 
 
-def _tip(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int, np.ndarray]:
-    """The link that carries the tip, and the centre of the tip in the link's coordinates.
+def _tip(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int, np.ndarray, float]:
+    """The link that carries the tip, the centre of the tip in the link's coordinates, and its radius.
 
-    The tip is a sphere that ends at the contact point, on the line from the frame's origin to that point.
+    The tip is that of the contact. Where the contact is a point, the tip is a sphere that ends there, on the
+    line from the frame's origin to that point.
     """
     index = robot.frame_index(contact.frame)
-    point = np.array(contact.point, dtype=float)
-    length = float(np.linalg.norm(point))
-    axis = point / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+    center = np.array(contact.point, dtype=float)
+    if contact.radius > 0.0:
+        radius = contact.radius
+    else:
+        length = float(np.linalg.norm(center))
+        center = center - radius * (center / length if length > 0.0 else np.array([0.0, 0.0, 1.0]))
     R, p = robot.frame_rotation[index].numpy(), robot.frame_position[index].numpy()
-    return robot.frame_parents[index], p + R @ (point - radius * axis)
+    return robot.frame_parents[index], p + R @ center, radius
 
 
 def _shape(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:

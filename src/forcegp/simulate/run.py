@@ -49,7 +49,6 @@ def simulate(
         NumericalError: the motion cannot be reached, or the run diverges (names time and state).
         MissingDependencyError: the engine is not installed.
         MemoryLimitError: the log needs more memory than is free.
-        ForceGPError: the robot has fewer than six joints.
     """
     system = system.with_robot(system.robot.to(device="cpu"))
     announce_states(system, config.steps, 1.0, f"a simulation of {config.steps:,} steps")
@@ -85,7 +84,7 @@ def _follow(
             qd = landing.qd
             engine.reset(torch.from_numpy(q), torch.from_numpy(qd))
         eom, target = landing.eom, Target(*(values[k] for values in targets))
-        wanted = control_torque(eom.tool, eom, q, qd, target, plan.normal(eom), config.gains)
+        wanted = control_torque(eom.tool, eom, q, qd, target, plan.press(eom), config.gains)
         Q_u = np.clip(wanted, -limit, limit)
         forces = contact_forces(mechanics, q, qd, landing, Q_u, config.viscous_friction)
         engine.step(torch.from_numpy(Q_u + forces.Q_D + forces.Q_I + forces.Q_z))

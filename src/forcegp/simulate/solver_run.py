@@ -50,7 +50,7 @@ def follow_with_solver(
         q, qd = _measured_state(true_q, true_qd, sensors, generator)
         measured["q"][k], measured["qd"][k] = q, qd
         eom, target = mechanics.equations(q.numpy(), qd.numpy()), Target(*(values[k] for values in targets))
-        wanted = control_torque(eom.tool, eom, q.numpy(), qd.numpy(), target, plan.normal(eom), config.gains)
+        wanted = control_torque(eom.tool, eom, q.numpy(), qd.numpy(), target, plan.press(eom), config.gains)
         Q_u = np.clip(wanted, -limit, limit)
         found = engine.forces(Q_u)
         rows.write(k, q=true_q, qd=true_qd, tau=Q_u, saturated=(Q_u != wanted).any(), qdd=found.qdd)

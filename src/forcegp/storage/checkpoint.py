@@ -68,7 +68,7 @@ class Checkpoint:
         """
         if not self.path.exists():
             return 0
-        tensors, key = read_record(self.path)
+        tensors, key = read_keyed(self.path)
         size = sum(value.numel() for value in start.values())
         n = len(tensors["objectives"]) if tensors.get("objectives", torch.zeros(())).ndim == 1 else -1
         shapes = {"positions": (n, size), "objectives": (n,), "gradients": (n, size)}
@@ -132,31 +132,6 @@ class Checkpoint:
         self.path.unlink(missing_ok=True)
 
 
-def read_record(path: Path) -> tuple[dict[str, Tensor], str | None]:
-    """Tensors and key of a checkpoint.
-
-    Raises:
-        ModelError: the file is damaged, too large, or no file.
-    """
-    if not path.is_file():
-        raise ModelError(f"{path} is no file", expected="the file of a checkpoint")
-    try:
-        with path.open("rb") as file:
-            data = file.read(CHECKPOINT_BYTES + 1)
-        if len(data) > CHECKPOINT_BYTES:
-            raise ModelError(f"{path}: too large for a checkpoint", got=f"> {CHECKPOINT_BYTES} bytes")
-        # Of one content: a library that opens the file twice may see two versions of it.
-        tensors = safetensors.torch.load(data)
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-        return tensors, header.get("__metadata__", {}).get("key")
-    except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as cause:
-        if isinstance(cause, ModelError):
-            raise
-        raise ModelError(
-            f"{path}: the checkpoint is damaged", got=str(cause), hint="remove it to start anew"
-        ) from cause
-
-
 def write_record(path: Path, tensors: Mapping[str, Tensor], key: str) -> None:
     """Write a checkpoint, whole or not at all.
 
@@ -214,3 +189,28 @@ def _bytes_of(value: object) -> bytes:
         return repr(value).encode()
     flat = value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy()
     return f"{value.dtype}{tuple(value.shape)}".encode() + flat.tobytes()
+
+
+def read_keyed(path: Path) -> tuple[dict[str, Tensor], str | None]:
+    """The tensors of a checkpoint, and the key of what it was written for.
+
+    Raises:
+        ModelError: the file is damaged, too large, or is a folder.
+    """
+    if not path.is_file():
+        raise ModelError(f"{path} is no file", expected="the file of a checkpoint")
+    try:
+        with path.open("rb") as file:
+            data = file.read(CHECKPOINT_BYTES + 1)
+        if len(data) > CHECKPOINT_BYTES:
+            raise ModelError(f"{path}: too large for a checkpoint", got=f"> {CHECKPOINT_BYTES} bytes")
+        # Of one content: a library that opens the file twice may see two versions of it.
+        tensors = safetensors.torch.load(data)
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        return tensors, header.get("__metadata__", {}).get("key")
+    except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as cause:
+        if isinstance(cause, ModelError):
+            raise
+        raise ModelError(
+            f"{path}: the checkpoint is damaged", got=str(cause), hint="remove it to start anew"
+        ) from cause

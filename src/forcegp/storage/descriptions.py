@@ -7,12 +7,12 @@ operator, a function) has no JSON form and is refused. Reading checks names and 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from forcegp.errors import ForceGPError, ModelError, UnknownNameError
+from forcegp.errors import ForceGPError, ModelError, UnknownNameError, near_names
 
 Classes = Mapping[str, type]
 """The classes that may be written and read, by the name in the file."""
@@ -41,7 +41,7 @@ def encode(value: Any, classes: Classes) -> Any:
     )
 
 
-def decode(json: Any, classes: Classes, place: str, depth: int = 0) -> Any:
+def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bool = True) -> Any:
     """The description that `encode` wrote.
 
     Args:
@@ -49,6 +49,7 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0) -> Any:
         classes: as given to `encode`.
         place: file and field, for messages.
         depth: level of nesting.
+        whole: whether every field must be there; otherwise fields that are left out have their defaults.
 
     Raises:
         ModelError: a field is missing, unknown or has another type; names the place.
@@ -57,7 +58,9 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0) -> Any:
     if depth > MAX_DEPTH:
         raise ModelError(f"{place}: nested too deeply", expected=f"at most {MAX_DEPTH} levels")
     if isinstance(json, list):
-        return tuple(decode(part, classes, f"{place}.{i}", depth + 1) for i, part in enumerate(json))
+        return tuple(
+            decode(part, classes, f"{place}.{i}", depth + 1, whole=whole) for i, part in enumerate(json)
+        )
     if not isinstance(json, dict):
         return json
     name = str(json.get("type"))
@@ -65,19 +68,36 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0) -> Any:
         raise UnknownNameError(f"type in {place}", name, classes)
     kind = classes[name]
     assert is_dataclass(kind)
-    known = {field.name for field in fields(kind)}
     given = {key: value for key, value in json.items() if key != "type"}
-    if set(given) != known:
-        raise ModelError(f"{place}: wrong fields of {name!r}", expected=sorted(known), got=sorted(given))
+    _check_fields(kind, name, given, place, whole)
     hints = get_type_hints(kind)
     values = {
-        key: _checked(decode(value, classes, f"{place}.{key}", depth + 1), hints[key], f"{place}.{key}")
+        key: _checked(
+            decode(value, classes, f"{place}.{key}", depth + 1, whole=whole), hints[key], f"{place}.{key}"
+        )
         for key, value in given.items()
     }
     try:
         return kind(**values)
     except ForceGPError as cause:
         raise ModelError.at(place, cause) from cause
+
+
+def _check_fields(kind: type, name: str, given: Mapping[str, Any], place: str, whole: bool) -> None:
+    """Raise `ModelError` where a field is unknown or missing."""
+    assert is_dataclass(kind)
+    known = {field.name for field in fields(kind)}
+    without = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
+    needed = known if whole else without
+    if needed <= set(given) <= known:
+        return
+    near = [other for key in given if key not in known for other in near_names(key, known)]
+    raise ModelError(
+        f"{place}: wrong fields of {name!r}",
+        expected=sorted(known),
+        got=sorted(given),
+        hint=f"did you mean {near[0]!r}?" if near else None,
+    )
 
 
 def _checked(value: Any, hint: Any, place: str) -> Any:

@@ -42,7 +42,7 @@ class EpochCheckpoint:
         """
         if not self.path.exists():
             return None
-        tensors, key = checkpoint.read_record(self.path)
+        tensors, key = checkpoint.read_keyed(self.path)
         expected = {name: (value.dtype, value.shape) for name, value in like.items() if name != HISTORY}
         found = {name: (value.dtype, value.shape) for name, value in tensors.items() if name != HISTORY}
         history = tensors.get(HISTORY, torch.zeros(()))

@@ -1,0 +1,67 @@
+"""Every bundled scene: simulate it, fit a model to a part of the log, and test it on the rest.
+
+    python examples/bundled_scenes.py
+    python examples/bundled_scenes.py panda_sphere ur5_wiping --duration 30 --points 200
+
+Scenes whose forces are this library's own train `sgp-mean`; scenes in which MuJoCo's solver makes contact
+and friction train `sgp-real`, the model for measured robots. Printed by scene: the error of the predicted
+acceleration against the noise-free one, with the robot file alone and with the model; the share of measured
+accelerations within ±2σ; and bias and standard deviation of the error of the normal force.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+from forcegp import ConstrainedSystem, Dataset, LearningOptions, StructuredGP
+from forcegp.data import split_by_stretches
+from forcegp.evaluation import Evaluation, evaluate
+from forcegp.models.registry import create
+from forcegp.scene import BUNDLED, load_scene
+from forcegp.simulate import simulate
+
+MODELS = {"rigid": "sgp-mean", "solver": "sgp-real"}
+"""The model by who makes the contact."""
+
+
+def simulated(name: str, duration: float) -> tuple[ConstrainedSystem, Dataset, str]:
+    """The system of a scene, a log of it, and the name of the model that suits it."""
+    scene = load_scene(name)
+    system, config = scene.system(), dataclasses.replace(scene.simulation, duration=duration)
+    return system, simulate(system, config).data, MODELS[config.contact]
+
+
+def report(name: str, before: Evaluation, after: Evaluation) -> str:
+    """One line of results."""
+    assert before.clean is not None and after.clean is not None and after.coverage_noisy is not None
+    line = f"{name:16} {before.clean.rmse:12.4f} {after.clean.rmse:12.4f} {after.coverage_noisy:10.0%}"
+    for force in after.multipliers:
+        line += f"   {force.contact}: {force.bias:+.2f} ± {force.spread:.2f} N"
+    return line
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="*", default=BUNDLED, help="names of bundled scenes; default all")
+    parser.add_argument("--duration", type=float, default=20.0, help="of each log [s]")
+    parser.add_argument("--points", type=int, default=100, help="training points")
+    parser.add_argument("--evaluations", type=int, default=100, help="most evaluations of a fit")
+    arguments = parser.parse_args()
+    print(f"{'scene':16} {'file [rad/s2]':>12} {'model':>11} {'covered':>10}   normal force")
+    for name in arguments.scenes:
+        system, log, kind = simulated(name, arguments.duration)
+        split = split_by_stretches(log, arguments.points)
+        train, test = log[split.train], log[split.test]
+        options = LearningOptions(max_evaluations=arguments.evaluations)
+        model = create(kind, system)
+        assert isinstance(model, StructuredGP)
+        after = evaluate(model.fit(train, options=options), test, compare=False)
+        before = evaluate(create("analytical", system), test, compare=False)
+        print(report(name, before, after), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,179 @@
+"""Models from the table `[model]` of a scene or of a file of its own (docs/formats.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
+from forcegp.errors import SceneError, UnknownNameError, near_names
+from forcegp.forces.mean import AnalyticalMean
+from forcegp.forces.measurements import NoiseStd
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.gp.optimise import LearningOptions
+from forcegp.models.analytical import ADAM, AnalyticalModel, Window
+from forcegp.models.base import FitProgress, FittedModel, Model
+from forcegp.models.independent_gp import IndependentGP
+from forcegp.models.minibatch import BatchOptions
+from forcegp.models.neural import DEEP, SHALLOW, NeuralNetwork
+from forcegp.models.registry import MODELS, create
+from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
+from forcegp.models.structured_spec import CLASSES
+from forcegp.robot.parameters import AnalyticalParameters
+from forcegp.scene import ModelTable
+from forcegp.storage.descriptions import decode
+
+DEFAULT = "sgp-mean"
+"""The model where none is named."""
+COMMON = ("name", "noise_std", "seed", "learning")
+"""Keys of `[model]` that every model takes; one without noise or a random start ignores these."""
+KEYS: dict[str, tuple[str, ...]] = {
+    AnalyticalModel.kind: ("analytical", "window"),
+    NeuralNetwork.kind: ("hidden",),
+    IndependentGP.kind: (),
+    StructuredGP.kind: ("mean", "priors", "learn_noise", "torque_noise", "inference", "analytical"),
+}
+"""Further keys by the kind of model."""
+Options = LearningOptions | BatchOptions
+
+
+@dataclass(frozen=True, eq=False)
+class Configured:
+    """An unfitted model, and how it learns.
+
+    Attributes:
+        name: of the model.
+        model: the model.
+        options: how it learns; `None` for its default.
+    """
+
+    name: str
+    model: Model[Any]
+    options: Options | None
+
+    def fit(self, data: Dataset, *, progress: FitProgress | None = None, **settings: Any) -> FittedModel:
+        """Fit the model to data with its options."""
+        if self.options is not None:
+            settings["options"] = self.options
+        return self.model.fit(data, progress=progress, **settings)
+
+
+def configured(
+    table: ModelTable,
+    system: ConstrainedSystem,
+    *,
+    name: str | None = None,
+    noise_std: NoiseStd | None = None,
+    seed: int | None = None,
+) -> Configured:
+    """The model that a table `[model]` describes.
+
+    Args:
+        table: of a scene, or from `load_model_table`.
+        system: robot and contacts.
+        name, noise_std, seed: in place of those in the table.
+
+    Raises:
+        SceneError: a value does not fit the model or the system; the message names file, line and key.
+        UnknownNameError: `name` is not a model.
+
+    Example:
+        >>> from forcegp.scene import load_scene
+        >>> scene = load_scene("kuka_plane")
+        >>> configured(scene.model, scene.system(), name="gp").model.kind
+        'independent_gp'
+    """
+    section, at = table.section, table.document.at
+    chosen = name or section.name or DEFAULT
+    noise = section.noise_std if noise_std is None else noise_std
+    start = section.seed if seed is None else seed
+    if chosen not in MODELS:
+        unknown = UnknownNameError("model", chosen, MODELS)
+        raise unknown if name else SceneError.at(table.document.place(("model", "name")), unknown)
+    arguments = _arguments(table, system, chosen)
+    model = at(("model",), create, chosen, system, noise_std=noise, seed=start or 0, **arguments)
+    return Configured(chosen, model, _learning(table, model))
+
+
+def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[str, Any]:
+    """Arguments of the model's class from the keys in the file."""
+    kind = MODELS[name].kind
+    given = {key: value for key, value in table.section.given().items() if key not in COMMON}
+    for key in given:
+        _check_key(table, ("model", key), (*COMMON, *KEYS[kind]), f"the model {name!r}")
+    arguments = {key: given[key] for key in ("learn_noise", "inference", "hidden") if key in given}
+    at = table.document.at
+    if isinstance(mean := given.get("mean"), str):
+        arguments["mean"] = mean
+    elif mean is not None:
+        arguments["mean"] = at(("model", "mean"), AnalyticalMean, mean)
+    if "torque_noise" in given:
+        noise = given["torque_noise"]
+        arguments["torque_noise"] = None if noise == "none" else noise
+    if "priors" in given:
+        arguments["force_priors"] = _priors(table)
+    if "window" in given:
+        arguments["window"] = Window(**given["window"].given())
+    if "analytical" in given:
+        theta = at(("model", "analytical"), AnalyticalParameters, system.robot, given["analytical"])
+        structured = kind == StructuredGP.kind
+        arguments |= {"analytical_parameters": theta} if structured else {"learn": given["analytical"]}
+    return arguments
+
+
+def _priors(table: ModelTable) -> tuple[ForcePrior, ...]:
+    """The priors of `[[model.priors]]`."""
+    priors = []
+    for i, described in enumerate(table.section.priors):
+        key = ("model", "priors", i)
+        prior = table.document.at(key, decode, described, CLASSES, "prior", whole=False)
+        if not isinstance(prior, ForcePrior):
+            known = [name for name, part in CLASSES.items() if issubclass(part, ForcePrior)]
+            raise SceneError(
+                f"{table.document.place(key)}: not a force prior",
+                expected=f"type = one of {', '.join(known)}",
+                got=described.get("type"),
+            )
+        priors.append(prior)
+    return tuple(priors)
+
+
+def _learning(table: ModelTable, model: Model[Any]) -> Options | None:
+    """The options of `[model.learning]`, over the defaults of the model."""
+    given: dict[str, Any] = table.section.learning.given()
+    if not given:
+        return None
+    if given.get("warm_start") is False:
+        given["warm_start"] = None
+    default = _default(model, given)
+    known = [field.name for field in dataclasses.fields(default)]
+    for key in given:
+        what = f"learning a {model.kind} model by {type(default).__name__}"
+        _check_key(table, ("model", "learning", key), known, what)
+    return table.document.at(("model", "learning"), type(default), **{**vars(default), **given})
+
+
+def _default(model: Model[Any], given: Mapping[str, Any]) -> Options:
+    """The options of a model where nothing is given; an analytical model takes both classes."""
+    if isinstance(model, NeuralNetwork):
+        return DEEP if len(model.hidden) > 2 else SHALLOW
+    if isinstance(model, AnalyticalModel) and not {"optimizer", "max_evaluations"} & set(given):
+        return ADAM
+    if isinstance(model, StructuredGP) and model.specification.parameters is not None:
+        return WITH_PARAMETERS
+    return LearningOptions()
+
+
+def _check_key(table: ModelTable, key: tuple[str, ...], known: Sequence[str], what: str) -> None:
+    """Raise `SceneError` where a key is not one of those that are known."""
+    if key[-1] in known:
+        return
+    near = near_names(key[-1], known)
+    raise SceneError(
+        f"{table.document.place(key)}: not a setting of {what}",
+        expected=f"one of {', '.join(known)}",
+        hint=f"did you mean {near[0]!r}?" if near else None,
+    )

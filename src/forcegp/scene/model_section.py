@@ -1,0 +1,72 @@
+"""The table `[model]` of a scene file or of a file of its own: which model, and how it learns.
+
+Names and values are those of the arguments in Python and of the fields in saved models; a key that is left
+out has the default of the model. Priors and kernels are described as in saved models (`settings.priors`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+
+class Section(BaseModel):
+    """A table of a TOML file: unknown keys and numbers that are not finite are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    def given(self) -> dict[str, Any]:
+        """The keys that are in the file, with their values."""
+        return {name: getattr(self, name) for name in self.model_fields_set}
+
+
+class LearningSection(Section):
+    """`[model.learning]`: fields of `LearningOptions`, or of `BatchOptions` for what learns on batches.
+
+    `warm_start = false` learns on all samples from the start.
+    """
+
+    optimizer: Literal["lbfgs", "adam"] = "lbfgs"
+    max_evaluations: PositiveInt = 1
+    tolerance: PositiveFloat = 1.0
+    learning_rate: PositiveFloat = 1.0
+    analytical_learning_rate: PositiveFloat = 1.0
+    patience: PositiveInt = 1
+    warm_start: Literal[False] | PositiveInt = False
+    restarts: NonNegativeInt = 0
+    seed: NonNegativeInt = 0
+    epochs: PositiveInt = 1
+    batch: PositiveInt = 1
+    held_out: PositiveFloat = 0.1
+
+
+class WindowSection(Section):
+    """`[model.window]`: how far from the robot file the model `analytical` starts."""
+
+    relative: NonNegativeFloat = 0.0
+    length: NonNegativeFloat = 0.0
+    angle: NonNegativeFloat = 0.0
+
+
+class ModelSection(Section):
+    """`[model]`: see `forcegp.models.configured`."""
+
+    name: str | None = None
+    noise_std: NonNegativeFloat | tuple[NonNegativeFloat, ...] | None = None
+    learn_noise: bool = False
+    torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["auto", "learn", "none"] = "auto"
+    inference: Literal["auto", "exact", "sparse"] = "auto"
+    mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
+    priors: tuple[dict[str, Any], ...] = ()
+    analytical: dict[str, Literal["all"] | tuple[str, ...]] = {}
+    hidden: tuple[PositiveInt, ...] = ()
+    window: WindowSection = WindowSection()
+    seed: NonNegativeInt | None = None
+    learning: LearningSection = LearningSection()
+
+
+class ModelFile(Section):
+    """A file with the table `[model]` alone."""
+
+    model: ModelSection

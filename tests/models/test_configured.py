@@ -1,0 +1,186 @@
+"""The table [model]: it makes the model that the same arguments make in Python, and names what is wrong."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from forcegp import LearningOptions
+from forcegp.errors import SceneError, UnknownNameError
+from forcegp.forces.mean import AnalyticalMean
+from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
+from forcegp.gp.kernels import Linear, Sum
+from forcegp.gp.stationary import Matern52, SquaredExponential
+from forcegp.models.analytical import ADAM, AnalyticalModel, Window
+from forcegp.models.configured import KEYS, Configured, configured
+from forcegp.models.independent_gp import IndependentGP
+from forcegp.models.minibatch import BatchOptions
+from forcegp.models.neural import SHALLOW, NeuralNetwork
+from forcegp.models.registry import MODELS
+from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
+from forcegp.scene import load_model_table, load_scene
+from forcegp.scene.model_section import LearningSection, ModelSection
+from logs import random_log
+
+ROOT = Path(__file__).parents[2]
+SCENE = load_scene("kuka_plane")
+SYSTEM = SCENE.system()
+
+
+@pytest.fixture
+def made(tmp_path: Path):
+    def make(text: str, **options: object) -> Configured:
+        path = tmp_path / "model.toml"
+        path.write_text(f"[model]\n{text}")
+        return configured(load_model_table(path), SYSTEM, **options)  # pyright: ignore[reportArgumentType]
+
+    return make
+
+
+def test_a_table_without_keys_is_the_default_model(made) -> None:
+    found = made("")
+    assert found.name == "sgp-mean" and found.options is None
+    ours, plain = found.model.specification, StructuredGP(SYSTEM, "analytical").specification
+    assert (ours.mean, ours.priors, ours.torque_noise, ours.automatic) == (
+        plain.mean, plain.priors, plain.torque_noise, plain.automatic,
+    )  # fmt: skip
+
+
+def test_priors_and_kernels_are_those_of_the_classes(made) -> None:
+    found = made("""
+name = "sgp-zero"
+mean = ["gravity", "actuation"]
+noise_std = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
+learn_noise = true
+torque_noise = 0.5
+inference = "exact"
+[[model.priors]]
+type = "joint"
+inputs = ["q", "qd"]
+kernel = { type = "sum", left = { type = "linear", inputs = ["qd"] }, right = { type = "matern52" } }
+[[model.priors]]
+type = "contact"
+contact = "table"
+""")
+    spec = found.model.specification
+    kernel = Sum(Linear(("qd",)), Matern52())
+    assert spec.priors == (JointForcePrior(kernel, ("q", "qd")), ContactForcePrior("table"))
+    assert spec.mean == AnalyticalMean(("gravity", "actuation"))
+    assert spec.noise_std == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
+    assert spec.learn_noise and spec.torque_noise == 0.5 and spec.inference == "exact"
+
+
+def test_robot_parameters_and_learning_of_a_structured_gp(made) -> None:
+    found = made("""
+torque_noise = "none"
+analytical = { damping = "all", mass = ["lbr_iiwa_joint_7"] }
+learning = { optimizer = "adam", restarts = 3, warm_start = false }
+""")
+    spec = found.model.specification
+    assert spec.parameters.joints == {"damping": SYSTEM.robot.joint_names, "mass": ("lbr_iiwa_joint_7",)}
+    assert spec.torque_noise is None
+    expected = LearningOptions("adam", tolerance=WITH_PARAMETERS.tolerance, restarts=3, warm_start=None)
+    assert found.options == expected
+
+
+def test_the_other_models(made) -> None:
+    network = made('name = "nn"\nhidden = [30, 20]\nseed = 4\n[model.learning]\nepochs = 7\n')
+    assert isinstance(network.model, NeuralNetwork) and network.model.hidden == (30, 20)
+    assert network.model.seed == 4
+    assert network.options == BatchOptions(7, SHALLOW.batch, SHALLOW.learning_rate, patience=SHALLOW.patience)
+    independent = made('name = "gp"\nnoise_std = 0.3\n[model.learning]\nmax_evaluations = 5\n')
+    assert isinstance(independent.model, IndependentGP) and independent.model.noise_std == 0.3
+    assert independent.options == LearningOptions(max_evaluations=5)
+    text = 'name = "analytical"\nanalytical = { friction = "all" }\nwindow = { relative = 0.2 }\n'
+    analytical = made(text + "[model.learning]\nbatch = 64\n").model
+    assert isinstance(analytical, AnalyticalModel)
+    assert list(analytical.parameters.joints) == ["friction"] and analytical.window == Window(relative=0.2)
+    assert made(text + "[model.learning]\nbatch = 64\n").options == BatchOptions(
+        ADAM.epochs, 64, ADAM.learning_rate, patience=ADAM.patience
+    )
+    assert made(text + '[model.learning]\noptimizer = "lbfgs"\n').options == LearningOptions()
+
+
+def test_options_of_the_caller_override_the_table(made) -> None:
+    found = made('name = "nn"\nnoise_std = 0.1\nseed = 1\n', name="gp", noise_std=0.5, seed=2)
+    assert found.name == "gp" and found.model.noise_std == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('name = "sgp-meen"', r"model\.toml:2: model\.name: unknown model 'sgp-meen'(.|\n)*'sgp-mean'"),
+        ('prior = "joint"', r"model\.toml:2: model\.prior: unknown key(.|\n)*did you mean 'priors'"),
+        ('inference = "magic"', r"model\.toml:2: model\.inference(.|\n)*'exact'(.|\n)*'magic'"),
+        ('name = "nn"\nmean = "zero"', r"model\.toml:3: model\.mean: not a setting of the model 'nn'"),
+        (
+            'name = "gp"\n[model.learning]\nepochs = 3',
+            r"model\.toml:4: model\.learning\.epochs: not a",
+        ),
+        (
+            "[model.learning]\nrestart = 3",
+            r"toml:3: model\.learning\.restart: unknown(.|\n)*'restarts'",
+        ),
+        ("[model.learning]\nrestarts = -3", r"model\.toml:3: model\.learning\.restarts: (.|\n)*greater"),
+        ('[model.analytical]\nmas = "all"', r"model\.toml:2: model\.analytical: (.|\n)*'mas'(.|\n)*'mass'"),
+        ('mean = ["gravty"]', r"model\.toml:2: model\.mean: (.|\n)*did you mean 'gravity'"),
+        (
+            '[[model.priors]]\ntype = "join"',
+            r"toml:2: model\.priors\[0\]: (.|\n)*did you mean 'joint'",
+        ),
+        (
+            '[[model.priors]]\ntype = "joint"\nkernell = { type = "linear" }',
+            r"model\.toml:2: model\.priors\[0\]: prior: wrong fields of 'joint'(.|\n)*did you mean 'kernel'",
+        ),
+        (
+            '[[model.priors]]\ntype = "joint"\nkernel = { type = "matern", inputs = ["q"] }',
+            r"unknown type in prior\.kernel 'matern'(.|\n)*did you mean 'matern",
+        ),
+        ('[[model.priors]]\ntype = "sliding_friction"', r"wrong fields(.|\n)*contact(.|\n)*got: \[\]"),
+        (
+            '[[model.priors]]\ntype = "linear"',
+            r"priors\[0\]: not a force prior(.|\n)*sliding_friction",
+        ),
+        (
+            '[[model.priors]]\ntype = "contact"\ncontact = "tabel"',
+            r"'tabel'(.|\n)*did you mean 'table'",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_place(made, text: str, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        made(text)
+
+
+def test_a_model_that_the_caller_misspells_is_not_blamed_on_the_file(made) -> None:
+    with pytest.raises(UnknownNameError, match="unknown model 'sgp-men'") as raised:
+        made("", name="sgp-men")
+    assert "model.toml" not in str(raised.value)
+
+
+def test_every_kind_of_model_has_its_keys() -> None:
+    assert {entry.kind for entry in MODELS.values()} == set(KEYS)
+
+
+def test_the_template_is_valid_and_shows_every_key() -> None:
+    path = ROOT / "examples" / "model.toml"
+    text = path.read_text()
+    for name in (*ModelSection.model_fields, *LearningSection.model_fields):
+        assert re.search(rf"\b{name}\b", text), name
+    found = configured(load_model_table(path), load_scene(ROOT / "scenes" / "kuka_sphere.toml").system())
+    assert isinstance(found.model, StructuredGP)
+    assert [type(prior) for prior in found.model.force_priors][-1] is SlidingFrictionPrior
+
+
+def test_a_table_learns_what_the_same_arguments_learn(made) -> None:
+    data = random_log(40, SYSTEM.robot.joint_names)
+    text = '[[model.priors]]\ntype = "joint"\nkernel = { type = "squared_exponential", shared = true }\n'
+    found = made(text + "[model.learning]\nmax_evaluations = 5\n").fit(data)
+    prior = JointForcePrior(SquaredExponential(shared=True))
+    model = StructuredGP(SYSTEM, "analytical", [prior])
+    plain = model.fit(data, options=LearningOptions(max_evaluations=5))
+    assert found.log_marginal_likelihood == plain.log_marginal_likelihood
