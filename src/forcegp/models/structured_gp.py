@@ -13,6 +13,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.footprint import announce_states
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.inference import check_method
@@ -34,6 +35,8 @@ from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
+FIT_COPIES = 3.0
+"""Memory of a fit besides the matrices of its inference, in that of the equations of motion."""
 WITH_PARAMETERS = LearningOptions(tolerance=1e-9)
 """Default options where θ_A is learned too: L-BFGS then stalls on its way for a step or two."""
 
@@ -197,6 +200,7 @@ class StructuredGP(Model[StructuredFit]):
         options = options or (LearningOptions() if spec.parameters is None else WITH_PARAMETERS)
         chosen = self._chosen(learn)
         training, doubts = in_motion(spec, self._training(known, chosen))
+        announce_states(spec.system, training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
         log = None
         if sample is not None:
             training = dataclasses.replace(training, part_of=sample.count)
