@@ -56,6 +56,7 @@ class ModelSection(Section):
     noise_std: NonNegativeFloat | tuple[NonNegativeFloat, ...] | None = None
     learn_noise: bool = False
     torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["auto", "learn", "none"] = "auto"
+    sensor_noise_std: PositiveFloat | None = None
     inference: Literal["auto", "exact", "sparse"] = "auto"
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: tuple[dict[str, Any], ...] = ()
