@@ -12,7 +12,11 @@ from forcegp.cli.common import AsJson, progress_bar, show
 
 def reproduce(
     profile: Annotated[
-        Literal["quick", "paper"], typer.Option(help="A few minutes, or the paper's sizes.")
+        Literal["quick", "paper", "real-contact"],
+        typer.Option(
+            help="A few minutes, or the paper's sizes; or from a log in CSV to the contact force, on scenes "
+            "whose contact MuJoCo's solver makes."
+        ),
     ] = "quick",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the page and its data.")] = Path("out"),
     seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
@@ -25,10 +29,18 @@ def reproduce(
     forcegp reproduce
 
     forcegp reproduce --profile paper --out out/paper --seed 1
+
+    forcegp reproduce --profile real-contact --out out/real-contact
     """
-    from forcegp.paper.reproduce import run
 
     def say(line: str) -> None:
         typer.echo(line, err=True)
+
+    if profile == "real-contact":
+        from forcegp.paper.real_contact_page import run_real_contact
+
+        show(run_real_contact(out, seed=seed, progress=progress_bar, say=say).summary(), as_json)
+        return
+    from forcegp.paper.reproduce import run
 
     show(run(profile, out, seed=seed, progress=progress_bar, say=say).summary(), as_json)

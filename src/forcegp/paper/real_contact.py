@@ -66,11 +66,13 @@ def imported(stages: Stages, scene: str, run: Stage) -> Stage:
         system = load_scene(scene).system()
         truth = Dataset.read(run / "run.parquet")
         write_foreign_log(folder / "run.csv", truth, system)
-        numbers: dict[str, Any] = {"rows_right": {}}
-        for source in reversed(SOURCES):
+        logs: dict[str, Dataset] = {}
+        for source in SOURCES:
             write_text(folder / f"{source}.toml", mapping_of(system, source))
-            log = import_log(folder / "run.csv", system, folder / f"{source}.toml").data
-            numbers["rows_right"][source] = rows_right(log, truth, system)
+            logs[source] = import_log(folder / "run.csv", system, folder / f"{source}.toml").data
+        right = {source: rows_right(log, truth, system) for source, log in logs.items()}
+        numbers: dict[str, Any] = {"rows_right": right}
+        log = logs[SOURCES[0]]
         log.write(folder / "log.parquet")
         numbers["surface"] = surface_error(log, system)
         numbers["check"] = _checked(folder, scene, system).to_dict()
