@@ -2,10 +2,10 @@
 
     python benchmarks/contact_detection.py --json detection.json
 
-Each run is simulated, exported as CSV in degrees and milliseconds, and imported with the contact read from the
-distance to the scene's surface, from the wrist sensor, and from the rigid-body multiplier. Printed: the share of
-rows whose contact is the solver's, and the distance and angle between the surface fitted to the tip's path and
-the true one, over that path. The scenes are soft: the tip sinks in by about 0.08 mm.
+Each run is simulated, exported as CSV in degrees and milliseconds, and imported with the contact read from
+the distance to the scene's surface, from the wrist sensor, and from the rigid-body multiplier. Printed: the
+share of rows whose contact is the solver's, and distance and angle between the surface fitted to the tip's
+path and the true one, over that path. The scenes are soft: the tip sinks in by about 0.08 mm.
 """
 
 from __future__ import annotations
