@@ -6,7 +6,7 @@ READY  := $(VENV)/.ready
 PROFILE ?= quick
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce test lint types package benchmark clean attack
+.PHONY: help setup reproduce test lint types package docs benchmark clean attack
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -20,7 +20,7 @@ $(READY): pyproject.toml constraints.txt
 	@echo "[setup] PyTorch"
 	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt torch
 	@echo "[setup] forcegp and the tools that test it"
-	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt -e ".[mujoco,pybullet,test,dev]"
+	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt -e ".[mujoco,pybullet,test,dev,docs]"
 	@touch $(READY)
 	@echo "[setup] done"
 
@@ -38,6 +38,10 @@ lint: $(READY)   ## ruff, check and format
 
 package: $(READY)  ## build the wheel and try it in an environment of its own
 	sh .ci/wheel $(BIN)/python
+
+docs: $(READY)   ## the documentation site; runs the code of every page
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs $(OUT)/docs
+	@echo "[docs] open $(OUT)/docs/index.html"
 
 types: $(READY)  ## pyright
 	$(BIN)/pyright

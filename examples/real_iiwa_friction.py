@@ -1,6 +1,6 @@
 """A real robot: learn the joint friction of a KUKA iiwa14 from its log, beside its robot file.
 
-    python examples/real_iiwa_friction.py
+    python examples/real_iiwa_friction.py [figure.png]
 
 The log is a part of a published one (examples/data/README.md): seven segments train the default model, three
 others test it. On a measured log, `StructuredGP(system, "analytical")` has a prior on the friction of each
@@ -9,8 +9,10 @@ M(q) (q̈_predicted − q̈_measured), with the robot file alone and with the mo
 error is within ±2σ of the prediction.
 """
 
+# %%
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import torch
@@ -54,9 +56,12 @@ def main() -> None:
         file, model, share = (float(value) for value in values)
         print(f"{name:15} {file:10.3f} {model:13.3f} {share:15.0%}")
     ratio = float((after / before).log().mean().exp())
+    figure = next((x for x in sys.argv[1:] if x.endswith(".png")), "real_iiwa_friction.png")
+    fit.plot(data[data.segment == TRAINING_SEGMENTS], noise=True)[0].figure.savefig(figure, dpi=150)
     print(
         f"torque error, model / robot file: {ratio:.2f} (geometric mean), {float(covered.mean()):.0%} covered"
     )
+    print(f"figure: {figure}")
 
 
 if __name__ == "__main__":

@@ -29,6 +29,9 @@ def options() -> argparse.Namespace:
     """Options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--inputs", type=int, default=20_000, help="per target")
+    parser.add_argument(
+        "--first", type=int, default=0, help="number of the first random input, to go on there"
+    )
     parser.add_argument("--target", action="append", help="only this one; may be repeated")
     parser.add_argument("--engine", choices=("auto", "atheris", "mutate"), default="auto")
     parser.add_argument("--seed", type=int, default=0)
@@ -37,7 +40,7 @@ def options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def mutate(target: str, inputs: int, seed: int) -> None:
+def mutate(target: str, first: int, inputs: int, seed: int) -> None:
     """Run a target on random mutations; a file `current` beside tells a crash's input."""
     import faulthandler
 
@@ -48,7 +51,7 @@ def mutate(target: str, inputs: int, seed: int) -> None:
     for data in corpus:
         run_one(target, data)
     memory, answers = peak(), dict[str, int]()
-    for number in range(inputs):
+    for number in range(first, first + inputs):
         data = mutated(random.Random(f"{seed}-{number}"), corpus)
         current.write_bytes(data)
         faulthandler.dump_traceback_later(SECONDS, exit=True)
@@ -67,7 +70,7 @@ def peak() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def guided(target: str, inputs: int, seed: int) -> None:
+def guided(target: str, first: int, inputs: int, seed: int) -> None:
     """Run a target on inputs that atheris finds by coverage."""
     import atheris
 
@@ -77,7 +80,7 @@ def guided(target: str, inputs: int, seed: int) -> None:
     found = HERE.parent / "out" / "fuzz" / target
     found.mkdir(parents=True, exist_ok=True)
     flags = (
-        f"-runs={inputs}", f"-seed={seed + 1}", f"-timeout={int(SECONDS)}", "-rss_limit_mb=2048",
+        f"-runs={inputs}", f"-seed={seed + first + 1}", f"-timeout={int(SECONDS)}", "-rss_limit_mb=2048",
         "-max_len=100000", "-detect_leaks=0", "-verbosity=0", f"-artifact_prefix={CORPORA / target}/finding-",
     )  # fmt: skip
     atheris.Setup(
@@ -86,10 +89,10 @@ def guided(target: str, inputs: int, seed: int) -> None:
     atheris.Fuzz()
 
 
-def one_target(target: str, engine: str, inputs: int, seed: int) -> bool:
+def one_target(target: str, engine: str, first: int, inputs: int, seed: int) -> bool:
     """Run one target in a process of its own; whether it ended without a finding."""
     command = [sys.executable, str(Path(__file__)), "--worker", engine, "--target", target]
-    command += ["--inputs", str(inputs), "--seed", str(seed)]
+    command += ["--first", str(first), "--inputs", str(inputs), "--seed", str(seed)]
     start = time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     took = f"{time.perf_counter() - start:.0f} s"
@@ -113,7 +116,8 @@ def main() -> int:
     """Attack what was asked for; the number of targets with a finding."""
     asked = options()
     if asked.worker:
-        {"mutate": mutate, "atheris": guided}[asked.worker](asked.target[0], asked.inputs, asked.seed)
+        run = {"mutate": mutate, "atheris": guided}[asked.worker]
+        run(asked.target[0], asked.first, asked.inputs, asked.seed)
         return 0
     if asked.input:
         from targets import run_one
@@ -125,7 +129,7 @@ def main() -> int:
         engine = "atheris" if importlib.util.find_spec("atheris") else "mutate"
     names = asked.target or sorted(p.name for p in (HERE / "corpora").iterdir() if p.is_dir())
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    return sum(not one_target(name, engine, asked.inputs, asked.seed) for name in names)
+    return sum(not one_target(name, engine, asked.first, asked.inputs, asked.seed) for name in names)
 
 
 if __name__ == "__main__":

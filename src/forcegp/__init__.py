@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         Sphere,
         SurfaceContact,
     )
-    from forcegp.data import Dataset, SavitzkyGolay
+    from forcegp.data import Dataset, SavitzkyGolay, StreamedDataset
     from forcegp.evaluation import Evaluation, evaluate
     from forcegp.forces.mean import AnalyticalMean
     from forcegp.forces.measurements import Observation
@@ -70,6 +70,7 @@ _HOME = {
     "SavitzkyGolay": "data",
     "Scene": "scene",
     "Sphere": "constraints",
+    "StreamedDataset": "data",
     "StructuredGP": "models.structured_gp",
     "SlidingFrictionPrior": "forces.priors.sliding_friction",
     "SurfaceContact": "constraints",
@@ -118,6 +119,7 @@ __all__ = [
     "Scene",
     "SlidingFrictionPrior",
     "Sphere",
+    "StreamedDataset",
     "StructuredGP",
     "SurfaceContact",
     "TaskSpaceControl",

@@ -59,7 +59,7 @@ def check_destination(
         ) from cause
 
 
-def write_or_keep(write: Callable[[Path], None], path: str | Path) -> None:
+def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
     """Write a result; if that fails, write it to another place, which the error names.
 
     Args:
@@ -87,7 +87,7 @@ def write_or_keep(write: Callable[[Path], None], path: str | Path) -> None:
     ) from cause
 
 
-def _kept(write: Callable[[Path], None], name: str) -> Path | None:
+def _kept(write: Callable[[Path], object], name: str) -> Path | None:
     """A private place where the result could be written, or `None`."""
     for parent in (tempfile.gettempdir(), os.getcwd(), str(Path.home())):
         with contextlib.suppress(OSError, ForceGPError):

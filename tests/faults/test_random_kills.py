@@ -1,109 +1,104 @@
-"""Processes killed at random moments and started again: they end with the numbers of one that was left alone.
+"""Commands killed at random moments and started again: they end with the numbers of one that was left alone.
 
-The short version kills a few; FORCEGP_ATTACK=1 kills fifty of each command.
+The short version kills a few; FORCEGP_ATTACK=1 kills fifty of each command. Every command runs in a process
+of its own that is forked from one that has loaded the library, so that the kills meet work and not imports.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import random
 import signal
-import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pytest
-import torch
-from safetensors.torch import load_file
 
-from forcegp.data import Dataset
+from faults.commands import COMMANDS, Command, child, numbers, prepare, stages
 
-ATTACK = bool(os.environ.get("FORCEGP_ATTACK"))
-KILLS = 50 if ATTACK else 2
-HERE = Path(__file__).parent
-SCENE = """
-[robot]
-model = "kuka_iiwa"
-[[contact]]
-name = "table"
-frame = "lbr_iiwa_link_7"
-point = [0.0, 0.0, 0.1]
-surface = { type = "plane", normal = [0.0, 0.0, 1.0], offset = 0.055 }
-[simulation]
-duration = 0.2
-"""
+KILLS = 50 if os.environ.get("FORCEGP_ATTACK") else 3
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="SIGKILL")
 
 
-def started(command: list[str]) -> subprocess.Popen[str]:
-    paths = os.pathsep.join([str(HERE.parent), *sys.path])
-    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    )
+@pytest.fixture(scope="module")
+def context() -> Iterator[ForkServerContext]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ONE_THREAD:
+            patch.setenv(name, "1")
+        patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+        found = multiprocessing.get_context("forkserver")
+        found.set_forkserver_preload(["faults.commands"])
+        yield found
 
 
-def finished(command: list[str]) -> float:
-    """Run a command to its end; how long it took [s]."""
-    start = time.perf_counter()
-    process = started(command)
-    _, errors = process.communicate(timeout=600)
-    assert process.returncode == 0, errors[-2000:]
-    return time.perf_counter() - start
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    prepare(folder)
+    return folder
 
 
-def killed(command: list[str], after: float) -> bool:
-    """Kill a command; whether it was still running."""
-    process = started(command)
-    try:
-        process.communicate(timeout=after)
-    except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-    return process.returncode == -signal.SIGKILL
+@pytest.fixture(params=COMMANDS.values(), ids=lambda command: command.name)
+def command(request: pytest.FixtureRequest) -> Command:
+    return request.param
 
 
-def numbers_of_model(folder: Path) -> dict[str, torch.Tensor]:
-    return load_file(folder / "model" / "model.safetensors")
+class Runs:
+    """Runs one command in processes of its own."""
+
+    def __init__(self, context: ForkServerContext, name: str, inputs: Path, log: Path) -> None:
+        self.context, self.name, self.inputs, self.log = context, name, inputs, log
+
+    def run(self, out: Path, kill_after: float | None = None) -> bool:
+        """Whether the command ran to its end; it may be killed before."""
+        arguments = (self.name, str(self.inputs), str(out), str(self.log))
+        process = self.context.Process(target=child, args=arguments)
+        process.start()
+        process.join(kill_after)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        assert process.exitcode in (0, -signal.SIGKILL), self.log.read_text()[-3000:]
+        return process.exitcode == 0
 
 
-def numbers_of_log(folder: Path) -> dict[str, torch.Tensor]:
-    log = Dataset.read(folder / "run.parquet")
-    return {name: getattr(log, name) for name in ("t", "q", "qd", "tau", "qdd")}
-
-
-def attacked(command_for, read, tmp_path: Path) -> None:
-    """Kill a command at random moments until it gets through, and compare with an undisturbed run."""
-    rng, alone, here = random.Random(0), tmp_path / "alone", tmp_path / "killed"
+def test_killed_commands_end_with_the_same_numbers(
+    command: Command, context: ForkServerContext, inputs: Path, tmp_path: Path
+) -> None:
+    runs, alone = Runs(context, command.name, inputs, tmp_path / "log.txt"), tmp_path / "alone"
     alone.mkdir()
-    here.mkdir()
-    seconds = finished(command_for(alone))
-    expected, deaths = read(alone), 0
+    start = time.perf_counter()
+    assert runs.run(alone)
+    seconds = time.perf_counter() - start
+    expected, rng, deaths, rounds = numbers(alone), random.Random(16), 0, 0
     while deaths < KILLS:
-        # Starting takes most of the time of a short run; moments near the end are those that write.
-        deaths += killed(command_for(here), rng.uniform(0.3, 1.0) * seconds)
-        if rng.random() < 0.2:
-            break
-    finished(command_for(here))
-    found = read(here)
-    assert found.keys() == expected.keys()
-    assert all(torch.equal(found[name], expected[name]) for name in expected)
-    assert sorted(os.listdir(here)) == sorted(os.listdir(alone)), "no litter"
+        here = tmp_path / f"round-{rounds}"
+        here.mkdir()
+        rounds += 1
+        done: dict[str, int] = {}
+        while not runs.run(here, rng.uniform(0.0, seconds) if deaths < KILLS else None):
+            deaths += 1
+            if command.name != "reproduce":
+                assert complete(command, here, expected)
+            done |= {name: at for name, at in stages(here).items() if name not in done}
+        assert numbers(here) == expected, "files and numbers, and no litter"
+        assert done.items() <= stages(here).items(), "finished stages are not run again"
+    assert deaths == KILLS
 
 
-def test_a_fit_resumes(tmp_path: Path) -> None:
-    script = str(HERE / "fit_script.py")
-    attacked(lambda folder: [sys.executable, script, str(folder)], numbers_of_model, tmp_path)
-
-
-def test_a_simulation_starts_again(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(SCENE)
-    tool = [sys.executable, "-c", "from forcegp.cli import main; main()"]
-
-    def command(folder: Path) -> list[str]:
-        return [*tool, "simulate", "--scene", str(scene), "--out", str(folder / "run.parquet")]
-
-    attacked(command, numbers_of_log, tmp_path)
+def complete(command: Command, folder: Path, expected: dict[str, object]) -> bool:
+    """Whether the target is not there, or whole with the numbers that it should have."""
+    found = {
+        n: v for n, v in numbers(folder).items() if n == command.target or n.startswith(f"{command.target}/")
+    }
+    return (
+        not (folder / command.target).exists()
+        or found.items()
+        == {name: value for name, value in expected.items() if name.startswith(command.target)}.items()
+    )

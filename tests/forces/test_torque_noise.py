@@ -11,10 +11,11 @@ import torch
 import forcegp
 from forcegp.errors import ModelError
 from forcegp.forces.inference import force_posterior, log_likelihood, without_inducing
-from forcegp.forces.learn import TORQUE_NOISE, kernel_parameters
+from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.quantities import affine_map
+from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
 
@@ -112,3 +113,25 @@ def test_noise_of_a_predicted_measurement() -> None:
 def test_torque_noise_that_is_not_valid(given: object) -> None:
     with pytest.raises(ModelError, match="noise of the motor torque"):
         forcegp.StructuredGP(two_contacts(), "analytical", FINITE, torque_noise=given)  # type: ignore[arg-type]
+
+
+def test_a_joint_that_sticks_has_a_spread_of_its_own() -> None:
+    """Friction within ±2 N m of a joint that hardly moves is learned as a spread, read where it sticks."""
+    generator = torch.Generator().manual_seed(3)
+    robot = forcegp.load_robot("double_pendulum")
+    robot = robot.replace(damping=torch.zeros_like(robot.damping), friction=torch.zeros_like(robot.friction))
+    n = 400
+    q, qd, qdd, u = (torch.randn(n, 2, generator=generator, dtype=torch.float64) for _ in range(4))
+    qd[::2, 0] *= 1e-3
+    friction = torch.stack(
+        [torch.where(qd[:, 0].abs() < 0.02, 2.0 * u[:, 0], 0.5 * qd[:, 0].sign()), 0.1 * u[:, 1]], -1
+    )
+    tau = forcegp.dynamics.inverse_dynamics(robot, q, qd, qdd) + friction
+    t = torch.arange(n, dtype=torch.float64) * 0.01
+    data = forcegp.Dataset(t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names)
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", noise_std=0.01).fit(data)
+    assert float(fit.hyperparameters[STICK_NOISE].exp()[0]) == pytest.approx(2.0, rel=0.2)
+    assert fit.torque_std is not None and float(fit.torque_std[0]) < 0.2
+    at = torch.zeros(2, 2, dtype=torch.float64), torch.tensor([[0.0, 1.0], [1.0, 1.0]]).double()
+    std = fit.predict(*at, torch.zeros(2, 2, dtype=torch.float64), "joint_force").std
+    assert float(std[0, 0]) == pytest.approx(2.0, rel=0.2) and float(std[1, 0]) < 0.3

@@ -12,8 +12,6 @@ import torch
 import forcegp
 from forcegp.constraints.surface import Surface
 from forcegp.data import farthest_points, standardized
-from forcegp.forces.priors.default import REMAINING
-from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.gp.features import FLOOR, Standardization
 from forcegp.scene.load import load_scene
 from forcegp.simulate import simulate
@@ -47,11 +45,10 @@ def motion(surface: str, seed: int, duration: float) -> forcegp.Dataset:
 def fitted(kind: str) -> forcegp.StructuredGP:
     data = motion("learned", 0, 4.0)
     few = data[farthest_points(standardized(torch.cat([data.q, data.qd, data.tau], -1)), 60)]
-    joint = forcegp.JointForcePrior(REMAINING)
     priors = {
         "sliding": [forcegp.SlidingFrictionPrior("table")],
         "any force": [forcegp.ContactForcePrior("table")],
-        "with joints": [joint, NormalForcePrior(joint), forcegp.SlidingFrictionPrior("table")],
+        "defaults": None,
     }
     model = forcegp.StructuredGP(on("learned"), "analytical", priors[kind], noise_std=0.1)
     model.fit(few, options=SHORT)
@@ -72,7 +69,7 @@ def score(kind: str, surface: str, quantity: str = "qdd") -> tuple[float, float]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["sliding", "any force", "with joints"])
+@pytest.mark.parametrize("kind", ["sliding", "any force", "defaults"])
 @pytest.mark.parametrize("surface", ["raised", "tilted", "sphere"])
 def test_friction_holds_on_another_surface(kind: str, surface: str) -> None:
     here, there = score(kind, "learned"), score(kind, surface)
@@ -81,7 +78,7 @@ def test_friction_holds_on_another_surface(kind: str, surface: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["sliding", "with joints"])
+@pytest.mark.parametrize("kind", ["sliding", "defaults"])
 @pytest.mark.parametrize("surface", list(SURFACES))
 def test_free_motion_read_from_contact_knows_its_error(kind: str, surface: str) -> None:
     assert score(kind, surface, "qdd_free")[1] >= 0.85

@@ -35,11 +35,11 @@ def test_the_structured_models_differ_in_mean_and_priors() -> None:
     assert isinstance(zero, forcegp.StructuredGP) and isinstance(mean, forcegp.StructuredGP)
     assert isinstance(contact, forcegp.StructuredGP)
     assert zero.mean.terms == () and mean.mean == contact.mean == forcegp.AnalyticalMean()
-    assert (
-        [prior.name for prior in zero.force_priors]
-        == [prior.name for prior in mean.force_priors]
-        == ["joint", "joint_normal"]
-    )
+    assert [prior.name for prior in zero.force_priors] == ["joint", "joint_normal"]
+    assert [prior.name for prior in mean.force_priors] == ["joint", "joint_normal", "contact_table"]
+    paper = create("sgp-mean-se", system)
+    assert isinstance(paper, forcegp.StructuredGP)
+    assert [prior.name for prior in paper.force_priors] == ["joint", "joint_normal"]
     assert [prior.name for prior in contact.force_priors] == ["contact_table"]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,18 @@ def test_a_second_run_does_nothing_again(made: Reproduction) -> None:
     again = run(TEN_SECONDS, made.page.parent, seed=3)
     assert again.reused == again.stages == made.stages
     assert again.results == made.results
+
+
+def test_two_processes_make_the_same_page(made: Reproduction, tmp_path: Path) -> None:
+    sizes = dataclasses.replace(TEN_SECONDS, sizes=(20,), main=20, identification_evaluations=5)
+    said: list[str] = []
+    alone = run(sizes, tmp_path / "alone", seed=3)
+    together = run(sizes, tmp_path / "together", seed=3, processes=2, say=said.append)
+    assert together.reused == 0 and together.stages == alone.stages == len(set(said))
+    # Sums over one thread are ordered differently from sums over two.
+    for one, two in zip(alone.results.scores, together.results.scores, strict=True):
+        assert (one.model, one.split, one.points) == (two.model, two.split, two.points)
+        assert two.noisy_mae == pytest.approx(one.noisy_mae, rel=1e-3)
 
 
 def folder(made: Reproduction) -> Path:

@@ -40,8 +40,11 @@ def check(
     """
     from forcegp.checks import check as run
     from forcegp.checks import read_log
+    from forcegp.destination import check_destination, write_or_keep
     from forcegp.scene import load_scene
 
+    if out is not None:
+        check_destination(out)
     system = load_scene(scene).system()
     log = read_log(data)
     with progress_bar("checking", 1) as progress:
@@ -49,7 +52,8 @@ def check(
     if out is not None:
         from forcegp.report.check import write_check
 
-        write_check(out, f"{data} on {scene}", report, system, log)
+        title = f"{data} on {scene}"
+        write_or_keep(lambda path: write_check(path, title, report, system, log), out)
     if as_json:
         show({**report.to_dict(), "page": str(out) if out else None}, as_json)
     else:

@@ -25,6 +25,10 @@ Config = Annotated[
     Path | None,
     typer.Option(help="TOML file with a table \\[model], in place of the scene's: priors, learning."),
 ]
+DataFiles = Annotated[
+    list[Path],
+    typer.Option("--data", "-d", help="Data set, .parquet or .csv; may be given several times."),
+]
 Differentiate = Annotated[
     int | None,
     typer.Option(
@@ -70,6 +74,20 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
     for name, value in result.items():
         text = f"{value:.6g}" if isinstance(value, float) else str(value)
         typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
+
+
+def check_data_destination(path: Path) -> None:
+    """Check, before long work, that a data set can be written.
+
+    Raises:
+        DataError: the name does not end in `.parquet`.
+        DestinationError: the place cannot be written.
+    """
+    from forcegp.data.table import check_ending
+    from forcegp.destination import check_destination
+
+    check_ending(path)
+    check_destination(path)
 
 
 def read_data(path: Path, differentiate: int | None = None) -> Dataset:

@@ -60,7 +60,7 @@ def evaluate(
 
     forcegp evaluate --scene my_scene.toml --config model.toml --train train.parquet --data test.parquet
     """
-    from forcegp.destination import check_destination
+    from forcegp.destination import check_destination, write_or_keep
     from forcegp.evaluation import evaluate as run
     from forcegp.files import atomic_directory, write_json
 
@@ -74,16 +74,21 @@ def evaluate(
         found = run(regression, test, train=known, progress=progress)
     result: dict[str, object] = {"verdict": found.verdict or "too few samples", **found.summary()}
     if out is not None:
-        from forcegp.report.evaluation import write_evaluation
+        from forcegp.report.evaluation import PAGE, write_evaluation
         from forcegp.report.window import opening, predicted_window
 
         window = predicted_window(regression, opening(test, WINDOW_SECONDS), regression.kind)
         fitted_to = None if train is None else str(train)
-        with atomic_directory(out) as temporary:
-            write_json(temporary / "evaluation.json", found.to_dict())
-            name = str(model or config or scene)
-            page = write_evaluation(temporary, name, str(data), found, window, fitted_to)
-        result |= {"file": str(out / "evaluation.json"), "page": str(out / page.name)}
+
+        def write(folder: Path) -> None:
+            with atomic_directory(folder) as temporary:
+                write_json(temporary / "evaluation.json", found.to_dict())
+                write_evaluation(
+                    temporary, str(model or config or scene), str(data), found, window, fitted_to
+                )
+
+        write_or_keep(write, out)
+        result |= {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}
     show(result, as_json)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +12,7 @@ import typer
 from forcegp.cli.common import (
     AsJson,
     Config,
-    DataFile,
+    DataFiles,
     Differentiate,
     SceneName,
     data_of_robot,
@@ -22,12 +23,17 @@ from forcegp.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from forcegp.data import Dataset, StreamedDataset
     from forcegp.models.base import FitResult, Model
+    from forcegp.robot import RobotModel
+
+STREAM_ROWS = 100_000
+"""Rows of a log from which it is read piece by piece."""
 
 
 def fit(
     scene: SceneName,
-    data: DataFile,
+    data: DataFiles,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fitted model.")],
     model: Annotated[
         str | None,
@@ -56,6 +62,8 @@ def fit(
     The table \\[model] of the scene, or of --config, chooses priors, kernels, noise, robot parameters and how
     to learn; the options override it.
 
+    Structured models read Parquet logs of more than 100,000 rows, and several files, piece by piece.
+
     [bold]Examples[/bold]
 
     forcegp fit --scene kuka_plane --data train.parquet --model sgp-mean --out model/
@@ -63,30 +71,56 @@ def fit(
     forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model/ --json
 
     forcegp fit -s my_scene.toml -d train.parquet --config model.toml -o model/
+
+    forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model/
     """
     from forcegp.destination import check_destination, write_or_keep
     from forcegp.models.configured import configured
     from forcegp.scene import load_scene
     from forcegp.storage.folder import HEADER_FILE
+    from forcegp.storage.sums import beside
 
     check_destination(out, folder=True, own_files=[HEADER_FILE])
     read = load_scene(scene)
     system = read.system()
-    training = data_of_robot(read_data(data, differentiate), system.robot)
     regression = configured(model_table(config, read), system, name=model, noise_std=noise_std, seed=seed)
+    training = _training(regression.model, data, differentiate, system.robot)
     settings: dict[str, Any] = {} if checkpoint is None else _resumable(regression.model, checkpoint)
     with progress_bar(f"fitting {regression.name}", 1) as progress:
         fitted = regression.fit(
-            training,
-            progress=lambda done, most, value: progress(done, most, f"objective {value:.4g}"),
+            training,  # pyright: ignore[reportArgumentType]  # a stream for a structured GP only
+            progress=lambda done, most, value: progress(
+                done, most, "" if math.isnan(value) else f"objective {value:.4g}"
+            ),
             **settings,
         )
     write_or_keep(fitted.save, out)
     if checkpoint is not None:
-        checkpoint.unlink(missing_ok=True)
+        for file in (checkpoint, beside(checkpoint)):
+            file.unlink(missing_ok=True)
     _warn(fitted.result)
     figures = {name: value for name, value in asdict(fitted.result).items() if name != "history"}
     show({"model": regression.name, "training_points": len(training), **figures, "folder": str(out)}, as_json)
+
+
+def _training(
+    regression: Model, files: list[Path], differentiate: int | None, robot: RobotModel
+) -> Dataset | StreamedDataset:
+    """The data that a model is fitted to: read piece by piece where they are long and the model can.
+
+    Raises:
+        DataError: a file cannot be read.
+    """
+    from forcegp.data import Dataset, SavitzkyGolay, StreamedDataset
+    from forcegp.models.structured_gp import StructuredGP
+
+    if isinstance(regression, StructuredGP) and all(file.suffix.lower() == ".parquet" for file in files):
+        method = SavitzkyGolay(window=differentiate) if differentiate is not None else None
+        log = StreamedDataset(tuple(files), method, robot.joint_names)
+        if len(files) > 1 or len(log) > STREAM_ROWS:
+            return log
+    parts = [data_of_robot(read_data(file, differentiate), robot) for file in files]
+    return parts[0] if len(parts) == 1 else Dataset.concatenate(parts)
 
 
 def _warn(result: FitResult) -> None:

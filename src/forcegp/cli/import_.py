@@ -87,12 +87,14 @@ def _system(scene: str | None, robot: str | None) -> ConstrainedSystem:
 
 
 def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]:
+    from forcegp.destination import check_destination, write_or_keep
     from forcegp.files import write_text
     from forcegp.logs.guess import guess_mapping
 
+    check_destination(out)
     with progress_bar(f"looking at {log.name}", 1) as advance:
         guessed = guess_mapping(log, system, progress=lambda done, total: advance(done, total))
-    write_text(out, guessed.toml)
+    write_or_keep(lambda path: write_text(path, guessed.toml), out)
     doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
     return {"mapping": str(out), **doubts, "next": f"check {out}, then import with --mapping {out}"}
 

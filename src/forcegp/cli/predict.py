@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, progress_bar, read_data, show
+from forcegp.cli.common import (
+    AsJson,
+    DataFile,
+    ModelFolder,
+    check_data_destination,
+    data_of_robot,
+    progress_bar,
+    read_data,
+    show,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -49,8 +58,10 @@ def predict(
     """
     import torch
 
+    from forcegp.destination import write_or_keep
     from forcegp.models.load import load_model
 
+    check_data_destination(out)
     regression = load_model(model)
     test = data_of_robot(read_data(data), regression.system.robot)
     active = test.active(regression.system.contact_names)
@@ -69,7 +80,7 @@ def predict(
     if stds:
         name = f"predicted_{quantity}_std"
         test = _with_columns(test, regression.system, quantity, name, torch.cat(stds))
-    test.with_step(f"predicted {quantity} by the model in {model}").write(out)
+    write_or_keep(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
     show({"quantity": quantity, "samples": len(test), "uncertainty": bool(stds), "file": str(out)}, as_json)
 
 

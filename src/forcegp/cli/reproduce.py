@@ -20,6 +20,10 @@ def reproduce(
     ] = "quick",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the page and its data.")] = Path("out"),
     seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
+    processes: Annotated[
+        int | None,
+        typer.Option(min=1, help="Stages run at the same time. By default, one per processor, at most 8."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate the paper's task, select data, fit all models, and write a page with the results.
@@ -32,6 +36,7 @@ def reproduce(
 
     forcegp reproduce --profile real-contact --out out/real-contact
     """
+    from forcegp.paper.parallel import MOST_PROCESSES, available_processors
 
     def say(line: str) -> None:
         typer.echo(line, err=True)
@@ -43,4 +48,6 @@ def reproduce(
         return
     from forcegp.paper.reproduce import run
 
-    show(run(profile, out, seed=seed, progress=progress_bar, say=say).summary(), as_json)
+    processes = processes or min(available_processors(), MOST_PROCESSES)
+    made = run(profile, out, seed=seed, processes=processes, progress=progress_bar, say=say)
+    show(made.summary(), as_json)

@@ -7,7 +7,14 @@ from typing import Annotated, Literal
 
 import typer
 
-from forcegp.cli.common import AsJson, Differentiate, progress_bar, read_data, show
+from forcegp.cli.common import (
+    AsJson,
+    Differentiate,
+    check_data_destination,
+    progress_bar,
+    read_data,
+    show,
+)
 
 
 def select(
@@ -41,7 +48,10 @@ def select(
     forcegp select run.csv -n 400 --split stretches --differentiate 11 -o train.parquet --rest test.parquet
     """
     from forcegp.data import split_by_selection, split_by_stretches
+    from forcegp.destination import write_or_keep
 
+    for path in (out, *([] if rest is None else [rest])):
+        check_data_destination(path)
     data = read_data(log, differentiate)
     with progress_bar("selecting points", count) as progress:
         if split == "selection":
@@ -58,10 +68,10 @@ def select(
                 progress=progress,
             )
     how = f"of {len(data)} rows by {method} points, split by {split}, seed {seed}"
-    data[parts.train].with_step(f"selected {count} training points {how}").write(out)
+    write_or_keep(data[parts.train].with_step(f"selected {count} training points {how}").write, out)
     result: dict[str, object] = {"training_points": count, "training_file": str(out)}
     if rest is not None:
-        data[parts.test].with_step(f"kept {len(parts.test)} test points {how}").write(rest)
+        write_or_keep(data[parts.test].with_step(f"kept {len(parts.test)} test points {how}").write, rest)
         result |= {"test_points": len(parts.test), "test_file": str(rest)}
     if parts.stretches:
         result["held_out_rows"] = [list(rows) for rows in parts.stretches]

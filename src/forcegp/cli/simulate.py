@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, SceneName, progress_bar, show
+from forcegp.cli.common import AsJson, SceneName, check_data_destination, progress_bar, show
 
 
 def simulate(
@@ -35,14 +35,16 @@ def simulate(
 
     forcegp simulate --scene ur5_wiping --engine mujoco --contact solver --out run.parquet
     """
+    from forcegp.destination import write_or_keep
     from forcegp.scene import load_scene
     from forcegp.simulate import simulate as run
 
+    check_data_destination(out)
     read = load_scene(scene)
     changes = {"duration": duration, "seed": seed, "engine": engine, "contact": contact}
     config = replace(read.simulation, **{name: v for name, v in changes.items() if v is not None})
     system = read.system()
     with progress_bar("simulating", config.steps) as progress:
         result = run(system, config, progress=lambda done, _: progress(done))
-    result.data.write(out)
+    write_or_keep(result.data.write, out)
     show({**result.summary(), "file": str(out)}, as_json)

@@ -59,7 +59,7 @@ def _vector(values: Sequence[float], like: Tensor) -> Tensor:
 
 
 def _unit(values: Sequence[float], what: str) -> tuple[float, ...]:
-    length = sum(float(x) ** 2 for x in values) ** 0.5
+    length = math.hypot(*map(float, values))
     if len(values) != 3 or not 0.0 < length < float("inf"):
         raise ParameterError(
             f"{what} has no direction", expected="three finite numbers, not all zero", got=values

@@ -16,6 +16,7 @@ from forcegp.constraints.gauss import Equations
 from forcegp.constraints.linearization import Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
 from forcegp.kinematics import LinkMotion, LinkPoses
+from forcegp.notebook import html_table
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintVector, JointVector
 
@@ -88,6 +89,22 @@ class ConstrainedSystem:
         contacts = ", ".join(f"{type(contact).__name__} {contact.name!r}" for contact in self.contacts)
         rule = f"; {self.baumgarte}" if self.baumgarte is not None else ""
         return f"<ConstrainedSystem: {self.robot!r}; {contacts or 'no contacts'}{rule}>"
+
+    def _repr_html_(self) -> str:
+        """A table of the constraints for notebooks."""
+        rows = [
+            (
+                c.name,
+                type(c).__name__,
+                ", ".join(frame for frame, _ in c.anchors),
+                str(getattr(c, "surface", "–")),
+            )
+            for c in self.contacts
+        ]
+        notes = [] if self.baumgarte is None else [str(self.baumgarte)]
+        head = ("constraint", "kind", "frames", "surface")
+        title = f"ConstrainedSystem of {repr(self.robot).strip('<>')}"
+        return html_table(title, head, rows, notes)
 
     @property
     def contact_names(self) -> tuple[str, ...]:

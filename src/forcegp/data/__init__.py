@@ -7,6 +7,7 @@ from forcegp.data.header import DataHeader
 from forcegp.data.noise import with_noise
 from forcegp.data.selection import farthest_points, select_points, standardized, standardized_inputs
 from forcegp.data.split import Split, complement, split_by_selection, split_by_stretches
+from forcegp.data.stream import StreamedDataset
 
 __all__ = [
     "DataHeader",
@@ -15,6 +16,7 @@ __all__ = [
     "RobotMismatchWarning",
     "SavitzkyGolay",
     "Split",
+    "StreamedDataset",
     "complement",
     "farthest_points",
     "select_points",

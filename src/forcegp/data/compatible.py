@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
-from forcegp.data.fields import Fields
+import torch
+
+from forcegp.data.fields import JOINT_VECTORS, Fields
 from forcegp.data.header import DataHeader
 from forcegp.errors import DataError, near_names
 from forcegp.robot.model import RobotModel
@@ -82,3 +85,26 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
     agreed["ordered"] = all(header.ordered for header in headers)
     return DataHeader(**agreed)
+
+
+def concatenated(parts: Sequence[Fields]) -> dict[str, Any]:
+    """Fields of data sets one after another, each with segments of its own; errors as of `check_alike`."""
+    check_alike(parts)
+    first = parts[0]
+    segments, start = [], 0
+    for part in parts:
+        _, own = torch.unique_consecutive(part.segment, return_inverse=True)
+        segments.append(own + start)
+        start += int(own.max()) + 1 if len(part) else 0
+    return {
+        **{name: torch.cat([getattr(p, name) for p in parts]) for name in ("t", *JOINT_VECTORS)},
+        "joint_names": first.joint_names,
+        "contact": {name: torch.cat([p.contact[name] for p in parts]) for name in first.contact},
+        "extras": {name: torch.cat([p.extras[name] for p in parts]) for name in first.extras},
+        "contact_extras": {
+            name: {c: torch.cat([p.contact_extras[name][c] for p in parts]) for c in group}
+            for name, group in first.contact_extras.items()
+        },
+        "segment": torch.cat(segments),
+        "header": common_header([part.header for part in parts]),
+    }

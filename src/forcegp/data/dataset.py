@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -15,9 +15,15 @@ from forcegp.data import check, columns, compatible, table
 from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.fields import JOINT_VECTORS, contact_table
 from forcegp.data.header import DataHeader
-from forcegp.data.summary import summary
+from forcegp.data.summary import summary, summary_table
 from forcegp.errors import DataError, UnknownNameError
+from forcegp.notebook import html_table
 from forcegp.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from forcegp.plots.panels import Target
 
 
 class NotLoggedError(DataError, AttributeError):
@@ -172,6 +178,32 @@ class Dataset:
         """
         compatible.check_robot(self, robot)
 
+    def plot(
+        self, quantity: str | None = None, *, joints: Sequence[str] | None = None, ax: Target = None
+    ) -> list[Axes]:
+        """Draw the log over time; the time in contact is shaded.
+
+        Args:
+            quantity: a logged quantity, such as `"tau"` or `"multiplier"`, with one panel per joint or
+                contact; by default q, qd, tau and qdd, one panel each with all joints.
+            joints: which joints; default all.
+            ax: matplotlib axes to draw on, one per panel; default a new figure.
+
+        Returns:
+            The axes, one per panel.
+
+        Raises:
+            UnknownNameError: no such quantity or joint.
+            ParameterError: the number of axes is not that of the panels.
+        """
+        from forcegp.data.plot import plot
+
+        return plot(self, quantity, joints, ax)
+
+    def _repr_html_(self) -> str:
+        """A table for notebooks."""
+        return html_table(*summary_table(self))
+
     def _map(self, change: Callable[[Tensor], Tensor], **fields: object) -> Dataset:
         """The data set with every column changed alike."""
         vectors = {name: change(getattr(self, name)) for name in ("t", "segment", *JOINT_VECTORS)}
@@ -193,26 +225,7 @@ class Dataset:
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
         """
-        compatible.check_alike(parts)
-        first = parts[0]
-        segments, start = [], 0
-        for part in parts:
-            _, own = torch.unique_consecutive(part.segment, return_inverse=True)
-            segments.append(own + start)
-            start += int(own.max()) + 1 if len(part) else 0
-        header = compatible.common_header([part.header for part in parts])
-        return Dataset(
-            **{name: torch.cat([getattr(p, name) for p in parts]) for name in ("t", *JOINT_VECTORS)},
-            joint_names=first.joint_names,
-            contact={name: torch.cat([p.contact[name] for p in parts]) for name in first.contact},
-            extras={name: torch.cat([p.extras[name] for p in parts]) for name in first.extras},
-            contact_extras={
-                name: {c: torch.cat([p.contact_extras[name][c] for p in parts]) for c in group}
-                for name, group in first.contact_extras.items()
-            },
-            segment=torch.cat(segments),
-            header=header,
-        )
+        return Dataset(**compatible.concatenated(parts))
 
     @classmethod
     def read(
@@ -247,6 +260,5 @@ class Dataset:
             DataError: the name does not end in `.parquet`.
             OSError: the place cannot be written.
         """
-        if Path(path).suffix.lower() != ".parquet":
-            raise DataError(f"{path}: data sets are written as Parquet", hint="end the name in .parquet")
+        table.check_ending(path)
         table.write_parquet(path, *columns.unparse(self))

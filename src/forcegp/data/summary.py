@@ -32,3 +32,14 @@ def _time(data: Fields) -> str:
 def _contacts(data: Fields) -> list[str]:
     closed = [f"{name} ({float(value.double().mean()):.0%} closed)" for name, value in data.contact.items()]
     return [f"contact {', '.join(closed)}"] if closed else []
+
+
+def summary_table(data: Fields) -> tuple[str, tuple[str, ...], list[tuple[object, ...]], list[str]]:
+    """Title, head, rows and notes of a table with the range of each joint's motion."""
+    names = {"q": "rad, m", "qd": "rad/s, m/s", "tau": "N m, N", "qdd": "rad/s², m/s²"}
+    head = ("joint", *(f"{name} [{unit}]" for name, unit in names.items()))
+    rows: list[tuple[object, ...]] = []
+    for j, joint in enumerate(data.joint_names if len(data) else ()):
+        columns = (getattr(data, name)[:, j] for name in names)
+        rows.append((joint, *(f"{float(x.min()):.3g} … {float(x.max()):.3g}" for x in columns)))
+    return summary(data).strip("<>"), head, rows, list(data.header.provenance)

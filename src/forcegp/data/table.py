@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -21,6 +23,7 @@ from forcegp.memory import announce_memory
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -34,6 +37,12 @@ GROUP_ROWS = 1 << 18
 
 class IgnoredColumnsWarning(UserWarning):
     """Columns of a log that are not of a name this library knows were left out."""
+
+
+def check_ending(path: str | Path) -> None:
+    """Raise `DataError` unless the name of a file to write ends in `.parquet`."""
+    if Path(path).suffix.lower() != ".parquet":
+        raise DataError(f"{path}: data sets are written as Parquet", hint="end the name in .parquet")
 
 
 def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> None:
@@ -66,9 +75,7 @@ def read_table(
     Raises:
         DataError: no such file, a kind of file that is not read, or one that is damaged or too large.
     """
-    file = Path(path)
-    if not file.is_file():
-        raise DataError(f"{file}: no such file", hint=_files_beside(file))
+    file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}
     if file.suffix.lower() not in readers:
         raise DataError(
@@ -76,7 +83,19 @@ def read_table(
         )
     table, header = readers[file.suffix.lower()](file)
     pairs = zip(table.column_names, table.columns, strict=True)
-    return {name: _numeric(file, name, column, missing) for name, column in pairs}, header
+    return {name: numeric(file, name, column, missing) for name, column in pairs}, header
+
+
+def existing(path: str | Path) -> Path:
+    """The path of a file that exists.
+
+    Raises:
+        DataError: no such file; the hint names the nearest one.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise DataError(f"{file}: no such file", hint=_files_beside(file))
+    return file
 
 
 def _files_beside(file: Path) -> str | None:
@@ -87,19 +106,30 @@ def _files_beside(file: Path) -> str | None:
 
 
 def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
+    with opened_parquet(file) as (parquet, usable, header):
+        _check_size(file, parquet.metadata.num_rows, len(usable))
+        return parquet.read(columns=usable, use_threads=False), header
+
+
+@contextmanager
+def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], DataHeader]]:
+    """A Parquet file, its numeric columns and its header; errors of the format become a `DataError`.
+
+    Raises:
+        DataError: the file is damaged, or is not a log.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
+        # pre_buffer is off: a damaged offset must not make the reader ask for the whole address space.
         with pq.ParquetFile(file) as parquet:
             shape = parquet.metadata
             _check_count(file, shape.num_columns)
             header = _header(file, parquet.schema_arrow.metadata or {})
             usable = _usable(file, parquet.schema_arrow)
             _check_flat(file, usable, [parquet.schema.column(i).path for i in range(shape.num_columns)])
-            _check_size(file, shape.num_rows, len(usable))
-            # pre_buffer off: a damaged offset must not make the reader ask for the whole address space.
-            return parquet.read(columns=usable, use_threads=False), header
+            yield parquet, usable, header
     except (pa.ArrowException, OSError, MemoryError, OverflowError, UnicodeDecodeError) as cause:
         raise DataError(
             f"{file}: the file is damaged, truncated or not Parquet",
@@ -207,7 +237,12 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
     return numeric
 
 
-def _numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
+def numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
+    """The values of a column.
+
+    Raises:
+        DataError: a value is missing, and that is refused.
+    """
     if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(

@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
+from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.quantities import affine_map
+from forcegp.forces.torque_noise import stick_variance
 
 STRETCHES = 8
 """Contiguous stretches that a log of fewer than three segments is divided into."""
@@ -26,6 +29,10 @@ MOST_STRETCHES = 16
 """Segments beyond this number are left out together with others, since each costs a conditioning."""
 FEWEST = 50
 """Samples in free motion below which nothing is calibrated."""
+MOST_RESIDUALS = 16_000
+"""Samples whose residuals are looked at for their correlation, in contiguous stretches of a longer log."""
+CHUNK_STATES = 2000
+"""States whose residuals are computed at a time, which bounds the memory."""
 NEGLIGIBLE = 0.05
 """Autocorrelation below which the rest is noise of the estimate."""
 
@@ -64,22 +71,53 @@ def _motions(training: Training) -> list[int]:
     return [i for i, quantity in enumerate(training.quantities) if quantity == "qdd"]
 
 
-def likelihood_power(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> float:
-    """κ = 1/τ̄, the geometric mean over the joints of the autocorrelation time of torque residuals; at most
-    1."""
+def likelihood_power(
+    problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training | None = None
+) -> float:
+    """κ = 1/τ̄, τ̄ the geometric mean over the joints of the autocorrelation time of torque residuals.
+
+    The n samples of a log hold as much evidence as n/τ̄ independent ones.
+
+    Args:
+        problem: what is conditioned on.
+        hyperparameters: learned tensors.
+        training: samples whose residuals are looked at, at their own rate; by default those of the problem.
+
+    Returns:
+        κ, at most 1.
+    """
     posterior = force_posterior(problem, hyperparameters)
     logs = []
-    for i in _motions(problem.training):
-        m = problem.training.measurements[i]
-        m = m[_free(m)]
+    training = training or problem.training
+    for i in _motions(training):
+        m = training.measurements[i]
+        m = m[_some(_free(m))]
         if len(m.q) < FEWEST:
             continue
-        at = m.at(problem.system)
-        z = affine_map(problem.system, at, "total_force")
-        force = (at.eom.M @ m.values[..., None])[..., 0]
-        residual = force - posterior.read_mean(problem.system, at, z)
+        residual = torch.cat([_residual(posterior, problem.system, part) for part in _chunks(m)])
         logs.append(autocorrelation_time(residual, m.segment).log())
     return min(1.0, math.exp(-float(torch.stack(logs).mean()))) if logs else 1.0
+
+
+def _some(rows: Tensor) -> Tensor:
+    """At most `MOST_RESIDUALS` rows in a few contiguous stretches, as neighbours show the correlation."""
+    if len(rows) <= MOST_RESIDUALS:
+        return rows
+    length = MOST_RESIDUALS // STRETCHES
+    first = torch.linspace(0, len(rows) - length, STRETCHES).round().long()
+    return rows[(first[:, None] + torch.arange(length)).flatten().to(rows.device)]
+
+
+def _chunks(m: Measurement) -> Iterator[Measurement]:
+    for i in range(0, len(m.q), CHUNK_STATES):
+        yield m[torch.arange(i, min(i + CHUNK_STATES, len(m.q)), device=m.q.device)]
+
+
+def _residual(posterior: ForcePosterior, system: ConstrainedSystem, m: Measurement) -> Tensor:
+    """M q̈ − Q̄ of the posterior mean, `(n, nq)` [N m]."""
+    at = m.at(system)
+    z = affine_map(system, at, "total_force")
+    return (at.eom.M @ m.values[..., None])[..., 0] - posterior.read_mean(system, at, z)
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
@@ -131,7 +169,7 @@ def _held_out(
     residual = (at.eom.M @ m.values[..., None])[..., 0] - posterior.read_mean(system, at, z)
     spread = posterior.read_covariance(system, at, z).diagonal(dim1=-2, dim2=-1)
     std = noise_std if noise_std.ndim == 1 else noise_std.square().mean(0).sqrt()
-    return residual, spread + (at.eom.M**2 @ std**2)
+    return residual, spread + (at.eom.M**2 @ std**2) + stick_variance(hyperparameters, at)
 
 
 def _unit_scale(r2: Tensor, V: Tensor, least: Tensor) -> Tensor:

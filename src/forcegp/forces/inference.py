@@ -11,16 +11,15 @@ from torch import Tensor
 
 from forcegp.errors import UnknownNameError
 from forcegp.forces.learn import Problem, kernel_parameters
-from forcegp.forces.posterior import ForcePosterior, LatentPosterior
+from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.totals import PIECE_SAMPLES, basis_of, posterior_of, total_over
 from forcegp.gp.bound import bound_of
 from forcegp.gp.capacity import require_exact_fits
 from forcegp.gp.decomposition import split
 from forcegp.gp.exact import ExactPosterior
-from forcegp.gp.inducing import candidates, select_inducing
-from forcegp.gp.kernels import Parameters
-from forcegp.gp.sparse import SparsePosterior, condition_sparse
-from forcegp.gp.structured_covariance import Block
+from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
+from forcegp.gp.sparse import SparsePosterior
 
 METHODS = ("auto", "exact", "sparse")
 EXACT_SAMPLES = 1000
@@ -49,46 +48,67 @@ def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> boo
 
 
 @torch.no_grad()
-def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> Problem:
-    """The problem with inducing points chosen from its data by conditional variance."""
-    rows = problem.rows(hyperparameters)
+def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit: int = LIMIT) -> Problem:
+    """The problem with inducing points chosen from its data by conditional variance.
+
+    Args:
+        problem: with the samples that are conditioned on.
+        hyperparameters: of the priors.
+        limit: maximum number of inducing points of one prior.
+    """
+    training = problem.training
+    few = dataclasses.replace(problem, training=training.evenly(CANDIDATES))
+    blocks = few.rows(hyperparameters).blocks
     chosen = select_inducing(
         problem.priors,
         kernel_parameters(hyperparameters),
-        candidates(rows.blocks, sum(len(block.target) for block in rows.blocks)),
-        rows=sum(block.rows for block in rows.blocks),
+        blocks,
+        rows=round(sum(block.rows for block in blocks) * training.all_samples / few.training.samples),
+        limit=limit,
     )
     return dataclasses.replace(problem, inducing=tuple(selection.points for selection in chosen))
 
 
 def without_inducing(problem: Problem) -> Problem:
     """The problem for priors that are finite features, which need no inducing points."""
-    block = problem.fixed_rows.blocks[0]
+    block = dataclasses.replace(problem, training=problem.training.evenly(1)).fixed_rows.blocks[0]
     empty = tuple({name: x[:0] for name, x in features.items()} for features in block.features)
     return dataclasses.replace(problem, inducing=empty)
 
 
-@torch.no_grad()
 def force_posterior(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> ForcePosterior:
     """Forces conditioned on the data of a problem.
 
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
+    return forces_and_constant(problem, hyperparameters)[0]
+
+
+@torch.no_grad()
+def forces_and_constant(
+    problem: Problem, hyperparameters: Mapping[str, Tensor]
+) -> tuple[ForcePosterior, Tensor]:
+    """Forces conditioned on the data of a problem, and the part of the likelihood that they do not change.
+
+    Raises:
+        ModelError: exact inference does not fit into memory.
+        NumericalError: the covariance of the data is not positive definite.
+    """
+    if problem.inducing is not None:
+        basis = basis_of(problem, hyperparameters)
+        total = total_over(problem, hyperparameters, basis, problem.training.pieces(PIECE_SAMPLES))
+        return posterior_of(problem, hyperparameters, basis, total), total.constant
     scales, params = problem.training.scales, kernel_parameters(hyperparameters)
-    latent = _conditioned(problem, params, problem.rows(hyperparameters).blocks)
-    if not problem.pinned:
-        return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets)
-    known = problem.of_means().rows(hyperparameters).blocks
-    central = _conditioned(problem, params, problem.silenced(known))
-    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central)
-
-
-def _conditioned(problem: Problem, params: Parameters, blocks: list[Block]) -> LatentPosterior:
-    if problem.inducing is None:
-        require_exact_fits(blocks, learning=False)
-        return ExactPosterior.of(problem.priors, params, blocks)
-    return condition_sparse(problem.priors, params, blocks, problem.inducing)
+    rows = problem.rows(hyperparameters)
+    require_exact_fits(rows.blocks, learning=False)
+    latent, central = ExactPosterior.of(problem.priors, params, rows.blocks), None
+    if problem.pinned:
+        known = problem.silenced(problem.of_means().rows(hyperparameters).blocks)
+        central = ExactPosterior.of(problem.priors, params, known)
+    coulomb, offsets = problem.coulomb(hyperparameters), problem.offsets
+    posterior = ForcePosterior(problem.priors, scales, problem.mean, latent, offsets, central, coulomb)
+    return posterior, rows.constant
 
 
 def log_likelihood(posterior: ForcePosterior) -> float:

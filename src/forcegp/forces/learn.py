@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.coulomb import CoulombFriction, below_jamming, coulomb_of, initial_coulomb
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, ForcePrior
 from forcegp.forces.projection import ForceMean, ForceNoise, WhitenedRows, combine, whiten
@@ -23,6 +24,7 @@ from forcegp.forces.start import (
     random_starts,
     warm_start_sizes,
 )
+from forcegp.forces.torque_noise import TORQUE_NOISE, initial_torque_noise, stick_variance
 from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features
 from forcegp.gp.likelihood import negative_log_likelihood
@@ -30,8 +32,8 @@ from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, m
 from forcegp.gp.structured_covariance import Block
 
 Tensors = dict[str, Tensor]
-TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
-"""Name of the learned noise of the motor torque."""
+START_SAMPLES = 5000
+"""Evenly spaced samples that the start of learning is computed from, where there are more."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -62,10 +64,12 @@ class Problem:
         parameters: module whose `forward()` gives the robot at θ_A, or `None`.
         torque_std: standard deviation of the white noise of the motor torque, `(nq,)`, unless it is learned.
         power: κ, which the likelihood is raised to; below 1 where samples are correlated.
+        correlation_time: how long the noise of the torque is correlated [s]; 0 where that is not known.
         offsets: prior means of latent forces, by prior.
         pinned: priors whose force has mean zero from here on, since the robot contains it; the others are
             conditioned on that, and only the uncertainty of the pinned ones remains.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
+        state_std: standard deviation of the noise of q and q̇, `(2 nq,)`, or `None` for none.
     """
 
     system: ConstrainedSystem
@@ -75,9 +79,11 @@ class Problem:
     parameters: nn.Module | None = None
     torque_std: Tensor | None = None
     power: float = 1.0
+    correlation_time: float = 0.0
     offsets: Mapping[str, Tensor] = field(default_factory=dict)
     inducing: tuple[Features, ...] | None = None
     pinned: tuple[str, ...] = ()
+    state_std: Tensor | None = None
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """The system with the robot at the analytical parameters among the tensors."""
@@ -94,15 +100,20 @@ class Problem:
             return std
         return learned.exp() if std.ndim == 1 else std * (learned.exp() / _typical(std))
 
+    def coulomb(self, tensors: Mapping[str, Tensor]) -> tuple[CoulombFriction, ...]:
+        """Coulomb friction of contacts, at its start where it is not among the tensors."""
+        return coulomb_of(self.priors, tensors, self.system.robot.mass)
+
     def force_noise(self, tensors: Mapping[str, Tensor]) -> ForceNoise | None:
         """Variance of the white noise on the joint force, or `None` for none."""
         learned = tensors.get(TORQUE_NOISE)
         std = self.torque_std if learned is None else learned.exp()
-        return None if std is None else lambda at: (std**2).expand_as(at.q)
+        return None if std is None else lambda at: std**2 + stick_variance(tensors, at)
 
     def rows(self, tensors: Mapping[str, Tensor]) -> WhitenedRows:
         """Whitened rows at the noise and analytical parameters among the tensors."""
         system, force_noise = self.system_at(tensors), self.force_noise(tensors)
+        friction = self.coulomb(tensors)
         return combine(
             [
                 whiten(
@@ -114,6 +125,8 @@ class Problem:
                     self.noise_at(tensors, i),
                     force_noise,
                     self.offsets,
+                    friction,
+                    self.state_std,
                 )
                 for i, m in enumerate(self.training.measurements)
             ]
@@ -142,9 +155,13 @@ class Problem:
 
     def initial(self, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
         """Default start of everything that can be learned."""
-        start = initial_hyperparameters(self.priors, self.fixed_rows.blocks)
+        few = self
+        if self.training.samples > START_SAMPLES:
+            few = dataclasses.replace(self, training=self.training.evenly(START_SAMPLES))
+        start = initial_hyperparameters(self.priors, few.fixed_rows.blocks)
+        start |= initial_coulomb(self.priors, self.system.robot.mass)
         if learn_torque_noise:
-            start[TORQUE_NOISE] = (0.5 * self.torque_residual()).clamp(min=1e-4).log().double()
+            start |= initial_torque_noise(few.torque_residual())
         if learn_noise:
             noise = self.training.noise_std
             start |= {noise_key(i): _typical(std).double().log() for i, std in enumerate(noise)}
@@ -250,6 +267,7 @@ class Search:
         constant = float(problem.fixed_rows.constant)
         analytical = frozenset(key for key in begin if key.startswith(ANALYTICAL + "."))
         bounds = bounds_of({key: value for key, value in begin.items() if key not in analytical})
+        bounds = below_jamming(problem.system, problem.training.measurements, problem.priors, bounds)
 
         def objective(tensors: Tensors) -> Tensor:
             return problem.objective(tensors, self.held, self.start) - constant

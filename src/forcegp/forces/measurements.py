@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -183,16 +183,31 @@ class Training:
         measurements: the values.
         noise_std: of each measurement, `(d,)` or `(n, d)`.
         scales: standardization of the inputs of each prior.
+        part_of: number of samples that are conditioned on, of which these are a part; 0 where these are all.
+        period: sampling period of the log that these are from [s]; 0 where its rows are not in order.
     """
 
     measurements: tuple[Measurement, ...]
     noise_std: tuple[Tensor, ...]
     scales: tuple[Standardization, ...]
+    part_of: int = 0
+    period: float = 0.0
 
     @property
     def samples(self) -> int:
         """Number of samples in all measurements."""
         return sum(len(m.q) for m in self.measurements)
+
+    @property
+    def all_samples(self) -> int:
+        """Number of samples that are conditioned on, of which these may be a part."""
+        return self.part_of or self.samples
+
+    def pieces(self, samples: int) -> Iterator[Training]:
+        """The same samples in pieces of about this many, each with its share of every measurement."""
+        count = max(1, math.ceil(self.samples / samples))
+        parts = [torch.arange(len(m.q), device=m.q.device).tensor_split(count) for m in self.measurements]
+        yield from (self.of_rows(rows) for rows in zip(*parts, strict=True))
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -219,6 +234,7 @@ class Training:
         """Some rows of each measurement."""
         return dataclasses.replace(
             self,
+            part_of=0,
             measurements=tuple(m[own] for m, own in zip(self.measurements, rows, strict=True)),
             noise_std=tuple(
                 std[own] if std.ndim == 2 else std for std, own in zip(self.noise_std, rows, strict=True)
@@ -268,7 +284,7 @@ def training_of(
             "there are no samples to learn from", expected="at least one observation", got="none"
         )
     pairs = [measurement_of(o, system, noise_std) for o in observations]
-    at = [m.at(system) for m, _ in pairs]
+    at = [m.at(system) for m, _ in pairs] if any(prior.name not in kept for prior in priors) else []
     scales = []
     for prior in priors:
         if prior.name in kept:
@@ -277,4 +293,13 @@ def training_of(
         features = [prior.features(system, a) for a in at]
         together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
         scales.append(Standardization.of(together, prior.vectors))
-    return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales))
+    period = _period(observations[0].data)
+    return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales), period=period)
+
+
+def _period(data: Dataset) -> float:
+    """Median time step within the trajectories of a log in order; 0 otherwise [s]."""
+    if not data.header.ordered or len(data) < 2:
+        return 0.0
+    steps = data.t.diff()[data.segment[1:] == data.segment[:-1]]
+    return float(steps.median()) if len(steps) else 0.0

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.coulomb import CoulombFriction, coupled, with_coulomb
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.projection import ForceMean, prior_mean, prior_operators
 from forcegp.forces.quantities import AffineMap, States
@@ -53,6 +54,7 @@ class ForcePosterior:
         offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
         central: processes that means are read from, where some forces are pinned to zero; `latent` by
             default.
+        coulomb: friction of contacts that is proportional to the multiplier.
     """
 
     priors: tuple[ForcePrior, ...]
@@ -61,6 +63,7 @@ class ForcePosterior:
     latent: LatentPosterior
     offsets: Mapping[str, Tensor] = field(default_factory=dict)
     central: LatentPosterior | None = None
+    coulomb: tuple[CoulombFriction, ...] = ()
 
     def latent_mean(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | None:
         """Posterior mean of the force of prior p, `(n, components)`; `None` where it is zero."""
@@ -97,10 +100,11 @@ class ForcePosterior:
             latent = self.latent_mean(p, system, at)
             if latent is not None:
                 force = force + (prior.operator(system, at) @ latent[..., None])[..., 0]
-        return force
+        return with_coulomb(system, at, force, self.coulomb)
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
         """Posterior mean of a quantity, o + B(m + Σ E f), `(n, d)`."""
+        z = coupled(system, at, z, self.coulomb)
         mean = prior_mean(system, at, z, self.mean)
         for p, prior in enumerate(self.priors):
             latent = self.latent_mean(p, system, at)
@@ -124,6 +128,7 @@ class ForcePosterior:
             z: the quantity.
             without: targets of priors that are left out.
         """
+        z = coupled(system, at, z, self.coulomb)
         operators = [
             torch.zeros_like(W) if prior.target in without else W
             for prior, W in zip(self.priors, prior_operators(self.priors, system, at, z), strict=True)

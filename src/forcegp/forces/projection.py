@@ -5,8 +5,9 @@ noise. With an orthonormal basis U of the null space of A (after scaling by the 
 whole Gaussian process in nq − rank A rows per sample, and the likelihood splits exactly into the two parts.
 
 Noise of the motor torque is white noise on the joint force. It reaches a sample's rows through the same
-operator as the force, so they have the covariance I + N Σ_τ Nᵀ, whose Cholesky factor whitens them sample by
-sample.
+operator as the force, so they have the covariance I + N Nᵀ with N = B Σ_τ½, whose Cholesky factor whitens
+them sample by sample. Noise of the state reaches them, to first order, through the Jacobian of the measured
+quantity.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.coulomb import CoulombFriction, coupled
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, ForcePrior
 from forcegp.forces.quantities import AffineMap, States, affine_map
+from forcegp.forces.state_noise import state_jacobian
 from forcegp.gp.features import Standardization
 from forcegp.gp.structured_covariance import Block
 from forcegp.linalg import null_space_basis
@@ -87,13 +90,13 @@ def _split(A: Tensor, rank: int) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Samples with a common number of rows: residual `(n, r)`, operators `(n, r, ·)` and the torque's `(n,
-    r, nq)`."""
+    """Samples with a common number of rows: residual `(n, r)`, operators `(n, r, ·)`, and the factor N of
+    the noise `(n, r, k)`, whose covariance is 1 + N Nᵀ; `None` for white noise alone."""
 
     features: tuple[dict[str, Tensor], ...]
     operators: tuple[Tensor, ...]
     residual: Tensor
-    torque: Tensor
+    noise: Tensor | None
 
     def of(self, own: Tensor, U: Tensor) -> _Rows:
         """Uᵀ times the rows of some samples."""
@@ -101,16 +104,16 @@ class _Rows:
             tuple({name: x[own] for name, x in f.items()} for f in self.features),
             tuple(U.mT @ W[own] for W in self.operators),
             (U.mT @ self.residual[own][..., None])[..., 0],
-            U.mT @ self.torque[own],
+            None if self.noise is None else U.mT @ self.noise[own],
         )
 
-    def whitened(self, variance: Tensor | None) -> tuple[Block, Tensor]:
-        """The rows divided by the factor of I + N Σ_τ Nᵀ, and the log determinant of the factors."""
-        if variance is None:
+    def whitened(self) -> tuple[Block, Tensor]:
+        """The rows divided by the factor of I + N Nᵀ, and the log determinant of the factors."""
+        if self.noise is None:
             return Block(self.features, self.operators, self.residual), self.residual.new_zeros(())
-        # QR of (1, N Σ½)ᵀ instead of Cholesky of 1 + N Σ Nᵀ: noise of 0.05 N m at a wrist of 10⁻³ kg m² is
+        # QR of (1, N)ᵀ instead of Cholesky of 1 + N Nᵀ: noise of 0.05 N m at a wrist of 10⁻³ kg m² is
         # 50 rad/s², and squares of such ratios lose all digits.
-        N = self.torque * variance.sqrt()[:, None, :]
+        N = self.noise
         eye = torch.eye(N.shape[1], dtype=N.dtype, device=N.device).expand(len(N), -1, -1)
         C = torch.linalg.qr(torch.cat([eye, N.mT], dim=1)).R.mT
         operators = tuple(torch.linalg.solve_triangular(C, W, upper=False) for W in self.operators)
@@ -128,6 +131,8 @@ def whiten(
     noise_std: Tensor,
     force_noise: ForceNoise | None = None,
     offsets: Mapping[str, Tensor] | None = None,
+    coulomb: Sequence[CoulombFriction] = (),
+    state_std: Tensor | None = None,
 ) -> WhitenedRows:
     """Rows of one measurement with unit white noise, without noise-free directions.
 
@@ -139,9 +144,11 @@ def whiten(
         noise_std: `(d,)` or `(n, d)` standard deviation of each component.
         force_noise: variance of the white noise on the joint force.
         offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
+        coulomb: friction of contacts that is proportional to the multiplier.
+        state_std: `(2 nq,)` standard deviation of the noise of q and q̇.
     """
     at = measurement.at(system)
-    z = affine_map(system, at, measurement.quantity)
+    z = coupled(system, at, affine_map(system, at, measurement.quantity), coulomb)
     std = noise_std.expand_as(measurement.values)
     operators = prior_operators(priors, system, at, z)
     expected = prior_mean(system, at, z, mean)
@@ -152,12 +159,12 @@ def whiten(
         tuple(scale.apply(prior.features(system, at)) for prior, scale in zip(priors, scales, strict=True)),
         tuple(W / std[..., None] for W in operators),
         (measurement.values - expected) / std,
-        z.B_Q / std[..., None],
+        _noise_factor(system, at, measurement, z, force_noise, state_std, std),
     )
-    variance = None if force_noise is None else force_noise(at)
     constant = std.log().sum()
-    if measurement.quantity != "qdd" or system.m == 0:
-        block, log_det = everything.whitened(variance)
+    # Noise of the state reaches the directions that the constraint fixes too, so these tell of it.
+    if measurement.quantity != "qdd" or system.m == 0 or state_std is not None:
+        block, log_det = everything.whitened()
         return WhitenedRows([block], constant + log_det)
     A, rank = at.eom.A * std[:, None, :], at.eom.rank
     violated = (at.eom.A @ measurement.values[..., None])[..., 0] - at.eom.b
@@ -165,11 +172,29 @@ def whiten(
     for value in rank.unique().tolist():
         own = (rank == value).nonzero()[:, 0]
         U, pinv = _split(A[own], value)
-        block, log_det = everything.of(own, U).whitened(None if variance is None else variance[own])
+        block, log_det = everything.of(own, U).whitened()
         fixed = 0.5 * ((pinv @ violated[own][..., None]) ** 2).sum()
         constant = constant + fixed + log_det + 0.5 * value * len(own) * math.log(2 * math.pi)
         blocks.append(block)
     return WhitenedRows(blocks, constant)
+
+
+def _noise_factor(
+    system: ConstrainedSystem,
+    at: States,
+    measurement: Measurement,
+    z: AffineMap,
+    force_noise: ForceNoise | None,
+    state_std: Tensor | None,
+    std: Tensor,
+) -> Tensor | None:
+    """N `(n, d, k)` of noise beside that of the sensor, in units of the latter; `None` for none."""
+    parts = []
+    if force_noise is not None:
+        parts.append(z.B_Q * force_noise(at).sqrt()[:, None, :])
+    if state_std is not None and (G := state_jacobian(system, measurement)) is not None:
+        parts.append(G * state_std)
+    return torch.cat(parts, dim=-1) / std[..., None] if parts else None
 
 
 def combine(rows: Sequence[WhitenedRows]) -> WhitenedRows:

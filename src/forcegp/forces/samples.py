@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.coulomb import with_coulomb
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import CONTACT
 from forcegp.forces.quantities import States
@@ -55,7 +56,7 @@ class ForceSamples:
             latent = latent + self.posterior.shift(p, system, at)
             force = (prior.operator(system, at) @ latent[..., None])[..., 0]
             Q, Q_z = (Q, Q_z + force) if prior.target == CONTACT else (Q + force, Q_z)
-        return Q, Q_z
+        return Q, with_coulomb(system, at, Q + Q_z, self.posterior.coulomb) - Q
 
     def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Q̄ = Q + Q_z of one sample per trajectory, the force field of a rollout.
@@ -86,7 +87,7 @@ class ForceSamples:
             )
             force = force + self.posterior.shift(p, system, at)
             Q_bar = Q_bar + (prior.operator(system, at) @ force[..., None])[..., 0]
-        return Q_bar
+        return with_coulomb(system, at, Q_bar, self.posterior.coulomb)
 
 
 def draw_samples(

@@ -23,7 +23,17 @@ from forcegp.gp.structured_covariance import Block
 LOG_LENGTHSCALE_BOUNDS = (math.log(0.03), math.log(3e4))
 LOG_STD_BOUNDS = (math.log(1e-6), math.log(1e6))
 LOG_NOISE_BOUNDS = (math.log(1e-6), math.log(1e4))
-WIDTH = {"log_lengthscale": (1.0, 4.0), "log_noise_std": (5.0, 5.0), "log_scale": (1.0, 1.0)}
+LOG_COEFFICIENT_BOUNDS = (math.log(1e-3), math.log(2.0))
+LOG_SPEED_BOUNDS = (math.log(1e-3), math.log(1.0))
+LOG_SMOOTHING_BOUNDS = (math.log(1e-4), math.log(0.1))
+WIDTH = {
+    "log_coefficient": (2.0, 1.0),
+    "log_smoothing": (2.0, 1.0),
+    "log_speed": (1.0, 1.0),
+    "log_lengthscale": (1.0, 4.0),
+    "log_noise_std": (5.0, 5.0),
+    "log_scale": (1.0, 1.0),
+}
 """Standard deviations of the log-normal priors below and above the start, in e-folds; 3 where not named."""
 OWN = tuple(name + "." for name in RESERVED)
 """Prefixes of what is learned besides the hyperparameters of the priors."""
@@ -53,7 +63,13 @@ def _force_scale(p: int, blocks: Sequence[Block]) -> Tensor:
 
 def bounds_of(params: Parameters) -> dict[str, tuple[float, float]]:
     """Box of each hyperparameter, for the optimiser."""
-    kinds = {"log_lengthscale": LOG_LENGTHSCALE_BOUNDS, "log_noise_std": LOG_NOISE_BOUNDS}
+    kinds = {
+        "log_lengthscale": LOG_LENGTHSCALE_BOUNDS,
+        "log_noise_std": LOG_NOISE_BOUNDS,
+        "log_coefficient": LOG_COEFFICIENT_BOUNDS,
+        "log_smoothing": LOG_SMOOTHING_BOUNDS,
+        "log_speed": LOG_SPEED_BOUNDS,
+    }
     return {key: kinds.get(key.rsplit(".", 1)[-1], LOG_STD_BOUNDS) for key in params}
 
 

@@ -44,11 +44,17 @@ def shard(samples: int, rank: int, processes: int) -> slice:
 
 def reduce_sums(sums: Sums, group: Group = None) -> Sums:
     """The sums of all processes added, the same in each of them."""
-    _require_processes()
-    flat = torch.cat([part.reshape(-1) for part in sums.tensors])
-    dist.all_reduce(flat, op=dist.ReduceOp.SUM, group=group)
+    flat = add_over_processes(torch.cat([part.reshape(-1) for part in sums.tensors]), group)
     pieces = flat.split([part.numel() for part in sums.tensors])
     return Sums(*(new.reshape(old.shape) for new, old in zip(pieces, sums.tensors, strict=True)))
+
+
+def add_over_processes(x: Tensor, group: Group = None) -> Tensor:
+    """The tensors of all processes added, the same in each of them."""
+    _require_processes()
+    total = x.detach().clone()
+    dist.all_reduce(total, op=dist.ReduceOp.SUM, group=group)
+    return total
 
 
 def accumulate_shards(

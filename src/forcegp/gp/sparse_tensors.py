@@ -20,6 +20,7 @@ from forcegp.gp.spectrum import Spectrum
 from forcegp.gp.structured_covariance import Process
 from forcegp.gp.sums import Moments
 
+INCOMPLETE = "a saved sparse posterior is not complete"
 MOMENTS = ("v", "yy", "rows", "prior", "missed")
 
 
@@ -27,14 +28,21 @@ def tensors_of_posterior(posterior: SparsePosterior) -> dict[str, Tensor]:
     """Everything but processes and hyperparameters, by name."""
     tensors = {f"moments.{name}": getattr(posterior.moments, name) for name in MOMENTS}
     tensors |= {"L": posterior.L, "jitter": torch.tensor(posterior.jitter, dtype=torch.float64)}
-    for p, part in enumerate(posterior.basis.parts):
+    tensors |= tensors_of_basis(posterior.basis)
+    # A copy of its own for each, as files do not keep views.
+    return {name: x.detach().clone(memory_format=torch.contiguous_format) for name, x in tensors.items()}
+
+
+def tensors_of_basis(basis: LatentBasis) -> dict[str, Tensor]:
+    """Inducing points and eigenvectors, by name."""
+    tensors: dict[str, Tensor] = {}
+    for p, part in enumerate(basis.parts):
         tensors[f"{p}.components"] = torch.tensor(part.components)
         tensors |= {f"{p}.inducing.{name}": x for name, x in part.inducing.items()}
         for k, spectrum in enumerate(part.spectra):
             tensors[f"{p}.{k}.values"], tensors[f"{p}.{k}.vectors"] = spectrum.values, spectrum.vectors
             tensors[f"{p}.{k}.dropped"] = torch.tensor(spectrum.dropped)
-    # A copy of its own for each, as files do not keep views.
-    return {name: x.detach().clone(memory_format=torch.contiguous_format) for name, x in tensors.items()}
+    return tensors
 
 
 def posterior_of_tensors(
@@ -50,21 +58,35 @@ def posterior_of_tensors(
     Raises:
         ModelError: a tensor is missing, or does not fit the processes.
     """
+    basis = basis_of_tensors(processes, params, tensors)
     try:
-        parts = tuple(_part(p, process, params, tensors) for p, process in enumerate(processes))
         moments = Moments(*(tensors[f"moments.{name}"] for name in MOMENTS))
         L, jitter = tensors["L"], float(tensors["jitter"])
     except KeyError as error:
-        raise ModelError("a saved sparse posterior is not complete", expected=f"a tensor {error}") from None
-    basis = LatentBasis(tuple(processes), dict(params), parts)
+        raise ModelError(INCOMPLETE, expected=f"a tensor {error}") from None
     size = (basis.size, basis.size)
-    if L.shape != size or moments.v.shape != size[:1] or moments.prior.shape != (len(parts),):
+    if L.shape != size or moments.v.shape != size[:1] or moments.prior.shape != (len(processes),):
         raise ModelError(
             "a saved sparse posterior does not fit its processes",
-            expected=f"{basis.size} basis functions of {len(parts)} processes",
+            expected=f"{basis.size} basis functions of {len(processes)} processes",
             got=f"{len(moments.v)} of {len(moments.prior)}",
         )
     return SparsePosterior(basis, moments, L, jitter)
+
+
+def basis_of_tensors(
+    processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
+) -> LatentBasis:
+    """The basis that `tensors_of_basis` was given.
+
+    Raises:
+        ModelError: a tensor is missing.
+    """
+    try:
+        parts = tuple(_part(p, process, params, tensors) for p, process in enumerate(processes))
+    except KeyError as error:
+        raise ModelError(INCOMPLETE, expected=f"a tensor {error}") from None
+    return LatentBasis(tuple(processes), dict(params), parts)
 
 
 def _part(p: int, process: Process, params: Parameters, tensors: Mapping[str, Tensor]) -> ProcessBasis:

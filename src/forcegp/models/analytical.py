@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -90,6 +90,15 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         self.window = window or Window()
         self.seed = seed
         self.parameters = AnalyticalParameters(system.robot, learn)
+        self._learn = learn
+
+    def get_params(self) -> dict[str, Any]:
+        return {
+            "system": self.specified,
+            "learn": self._learn,
+            "window": self.window,
+            "seed": self.seed,
+        }
 
     def fit(
         self,
@@ -139,7 +148,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         return AnalyticalFit(self.specified, self.parameters, self.window, self.seed, result)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class AnalyticalFit(FittedModel):
     """The equations of motion of a robot with learned parameters.
 
@@ -157,6 +166,9 @@ class AnalyticalFit(FittedModel):
     result: FitResult
 
     kind = KIND
+
+    def described(self) -> list[tuple[str, object]]:
+        return [(name, getattr(self.system.robot, name)) for name in ("mass", "damping")]
 
     @torch.no_grad()
     def predict(

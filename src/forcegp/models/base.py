@@ -4,114 +4,32 @@ predicts."""
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ModelError, NumericalError
-from forcegp.gp.optimise import Learned
+from forcegp.errors import ModelError
+from forcegp.models.fit_result import FitResult
+from forcegp.models.prediction import Prediction
+from forcegp.models.show import fit_table, model_line
 from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Torque
 from forcegp.rollout.law import ForceField
 from forcegp.rollout.trajectory import Rollout
 from forcegp.storage.folder import Settings, write_model
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from forcegp.plots.panels import Target
+
 FitProgress = Callable[[int, int, float], None]
 """Called with the number of evaluations, their maximum, and the objective."""
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """A predicted quantity at a batch of states.
-
-    Attributes:
-        mean: `(*batch, d)`.
-        covariance: `(*batch, d, d)`, of the noise-free quantity unless noise was asked for; `None` where the
-            model gives none or it was not asked for.
-        parts: the slice of each quantity, where several were asked for.
-    """
-
-    mean: Tensor
-    covariance: Tensor | None = None
-    parts: dict[str, slice] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that are not finite.
-
-        Raises:
-            NumericalError: the mean or the covariance holds one.
-        """
-        for name, value in (("mean", self.mean), ("covariance", self.covariance)):
-            if value is not None and not bool(torch.isfinite(value).all()):
-                raise NumericalError(
-                    f"the {name} of a prediction is not finite",
-                    got=f"{int((~torch.isfinite(value)).sum())} of {value.numel()} numbers",
-                    hint="states beyond what a robot can do overflow; check q, qd and tau",
-                )
-
-    @property
-    def variance(self) -> Tensor | None:
-        """`(*batch, d)`, the diagonal of the covariance."""
-        return None if self.covariance is None else self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)
-
-    @property
-    def std(self) -> Tensor | None:
-        """`(*batch, d)` standard deviation."""
-        variance = self.variance
-        return None if variance is None else variance.sqrt()
-
-
-@dataclass(frozen=True)
-class FitResult:
-    """How a fit went.
-
-    Attributes:
-        converged: whether the optimiser reached its tolerance.
-        evaluations: number of evaluations of the objective.
-        seconds: duration of the fit.
-        objective: final value (mean squared error, or negative log posterior of the hyperparameters).
-        log_marginal_likelihood: of the training data, `None` for models without one.
-        jitter: added to the diagonal of the covariance to factorise it, relative to unit noise: the noise
-            that the model works with is √(1 + jitter) times the stated noise.
-        constant_inputs: inputs that do not vary in the training data and were left unscaled.
-        message: why the optimiser stopped.
-        history: the objective at each evaluation.
-        force_correlation: mean posterior correlation of the joint force Q and the contact's force Q_z at
-            training
-            states: near −1 only their sum is identifiable, near 0 both are. `None` without priors on both.
-        warnings: doubts about the fit, each with a remedy.
-    """
-
-    converged: bool
-    evaluations: int
-    seconds: float
-    objective: float
-    log_marginal_likelihood: float | None = None
-    jitter: float = 0.0
-    constant_inputs: tuple[str, ...] = ()
-    message: str = ""
-    history: tuple[float, ...] = ()
-    force_correlation: float | None = None
-    warnings: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, learned: Learned, **more: Any) -> FitResult:
-        """The result of an optimisation, with what else is known."""
-        return cls(
-            converged=learned.converged,
-            evaluations=learned.evaluations,
-            seconds=learned.seconds,
-            objective=learned.value,
-            message=learned.message,
-            history=tuple(learned.history),
-            **more,
-        )
 
 
 class Predictor(ABC):
@@ -149,6 +67,12 @@ class Predictor(ABC):
 
     def force_field(self) -> ForceField | None:
         """The mean impressed force Q̄ `(n, nq)` at states, or `None` for a model of accelerations alone."""
+        return None
+
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        """Root of the spectral density of torque noise `(nq,)` [N m √s], where one was learned with its
+        correlation in time."""
         return None
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
@@ -189,6 +113,54 @@ class Predictor(ABC):
         """
         return rollout_model(self, q0, qd0, tau, duration, samples, **settings)
 
+    def score(self, data: Dataset, quantity: str = "qdd") -> float:
+        """Coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
+
+        R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components: 1 is perfect, 0
+        as good as the mean of the data, and negative worse. It says nothing about the uncertainty;
+        `forcegp.evaluate` does.
+
+        Args:
+            data: logged states and measured values.
+            quantity: what to predict; the data set must contain it.
+
+        Raises:
+            UnknownNameError, NotLoggedError: the quantity is unknown or not logged.
+            DataError: the joints are not those of the robot, or the quantity does not vary.
+        """
+        from forcegp.models.measured import score
+
+        return score(self, data, quantity)
+
+    def plot(
+        self,
+        data: Dataset,
+        quantity: str = "qdd",
+        *,
+        joints: Sequence[str] | None = None,
+        ax: Target = None,
+        **settings: Any,
+    ) -> list[Axes]:
+        """Draw a predicted quantity with ±2 standard deviations beside the measured one, if it is logged.
+
+        Args:
+            data: logged states; of a long log, every k-th row is predicted and drawn.
+            quantity: what to predict.
+            joints: which joints or contacts, of a quantity with several; default all.
+            ax: matplotlib axes to draw on, one per panel; default a new figure.
+            **settings: further arguments of `predict`, such as `noise=True` for the band of a measurement.
+
+        Returns:
+            The axes, one per panel.
+
+        Raises:
+            UnknownNameError: no such quantity or joint.
+            ParameterError: the number of axes is not that of the panels.
+        """
+        from forcegp.models.plot import plot_model
+
+        return plot_model(self, data, quantity, joints, ax, settings)
+
     @abstractmethod
     def save(self, path: str | Path) -> None:
         """Write the model as a folder; `forcegp.load_model` reads it back exactly.
@@ -203,6 +175,18 @@ class FittedModel(Predictor):
     """A model with learned parameters; immutable."""
 
     result: FitResult
+
+    def __repr__(self) -> str:
+        """One line: robot, contacts, and how the fit went."""
+        return model_line(type(self).__name__, self.system, self.result)
+
+    def _repr_html_(self) -> str:
+        """A table for notebooks."""
+        return fit_table(repr(self), self.result, self.described())
+
+    def described(self) -> list[tuple[str, object]]:
+        """What was learned, by name, for tables."""
+        return []
 
     @abstractmethod
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
@@ -272,6 +256,21 @@ class Model(Predictor, Generic[F]):
     """Robot and contacts as given."""
     _fitted: F | None = None
 
+    def __repr__(self) -> str:
+        """One line: robot, contacts, and how the most recent fit went."""
+        result = None if self._fitted is None else self._fitted.result
+        return model_line(type(self).__name__, self.system, result)
+
+    def _repr_html_(self) -> str:
+        """A table for notebooks."""
+        if self._fitted is not None:
+            return self._fitted._repr_html_()
+        return fit_table(repr(self), None, list(self.get_params().items()))
+
+    @abstractmethod
+    def get_params(self) -> dict[str, Any]:
+        """Arguments of the constructor: `type(model)(**model.get_params())` is an unfitted copy."""
+
     @abstractmethod
     def fit(self, data: Dataset, *, progress: FitProgress | None = None) -> F:
         """Learn from a data set.
@@ -317,6 +316,10 @@ class Model(Predictor, Generic[F]):
 
     def force_field(self) -> ForceField | None:
         return self.fitted.force_field()
+
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        return self.fitted.torque_disturbance
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         return self.fitted.force_samples(samples, generator)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 
@@ -12,6 +13,7 @@ from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import CONTACT, JOINT, ForcePrior
 from forcegp.forces.quantities import affine_map
+from forcegp.gp.sparse import SparsePosterior
 
 CORRELATION_STATES = 50
 """Training states at which the correlation of Q and Q_z is evaluated after a fit."""
@@ -19,6 +21,35 @@ UNDETERMINED = 10.0
 """Standard deviations of the multiplier per its size from which a fit warns."""
 LARGE_JITTER = 0.01
 """Jitter, relative to unit noise, from which a fit warns: the noise grows by half of it."""
+
+
+def inference_of(posterior: ForcePosterior) -> dict[str, Any]:
+    """Which inference a posterior has, and what a sparse one loses by its inducing points, by field of the
+    result of a fit."""
+    latent = posterior.latent
+    if not isinstance(latent, SparsePosterior):
+        return {"inference": "exact"}
+    found = latent.diagnostics
+    return {
+        "inference": "sparse",
+        "basis_functions": found.size,
+        "determined": found.learned,
+        "missed": found.missed,
+        "more_points_would_help": found.more_points_would_help,
+    }
+
+
+def _doubts_on_inducing_points(posterior: ForcePosterior) -> tuple[str, ...]:
+    """A warning where inducing points miss much of what the data could tell."""
+    latent = posterior.latent
+    if not isinstance(latent, SparsePosterior) or not latent.diagnostics.more_points_would_help:
+        return ()
+    found = latent.diagnostics
+    return (
+        f"more inducing points would help: {found.size} basis functions miss a variance of "
+        f"{found.missed:.3g} in units of the noise, where noise leaves {found.learned:.3g}; raise "
+        "inducing_points",
+    )
 
 
 def constant_inputs(priors: Sequence[ForcePrior], training: Training) -> tuple[str, ...]:
@@ -31,7 +62,7 @@ def doubts(
     posterior: ForcePosterior, system: ConstrainedSystem, training: Training, jitter: float
 ) -> tuple[str, ...]:
     """Warnings about a fit, each with a remedy."""
-    found = _doubts_on_multiplier(posterior, system, training)
+    found = _doubts_on_multiplier(posterior, system, training) + _doubts_on_inducing_points(posterior)
     if jitter >= LARGE_JITTER:
         found += (
             f"the covariance was factorised with a jitter of {jitter:.2g} times the noise variance: "

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from pydantic import PositiveFloat
@@ -89,6 +90,9 @@ class IndependentGP(Model["IndependentFit"]):
     def __init__(self, system: ConstrainedSystem, noise_std: NoiseStd | None = None) -> None:
         self.specified = system
         self.noise_std = noise_std
+
+    def get_params(self) -> dict[str, Any]:
+        return {"system": self.specified, "noise_std": self.noise_std}
 
     def fit(
         self,
@@ -193,7 +197,7 @@ def fitted(
     return IndependentFit(system, noise_std, training, hyperparameters, posteriors, result)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class IndependentFit(FittedModel):
     """Conditioned processes.
 

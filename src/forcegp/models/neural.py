@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -66,6 +67,9 @@ class NeuralNetwork(Model["NetworkFit"]):
         self.hidden = tuple(hidden)
         self.seed = seed
 
+    def get_params(self) -> dict[str, Any]:
+        return {"system": self.specified, "hidden": self.hidden, "seed": self.seed}
+
     def fit(
         self,
         data: Dataset,
@@ -109,7 +113,7 @@ class NeuralNetwork(Model["NetworkFit"]):
         return self._fitted
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class NetworkFit(FittedModel):
     """A trained network.
 

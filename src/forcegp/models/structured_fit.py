@@ -11,25 +11,27 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.inference import force_posterior, jitter_of, log_likelihood
-from forcegp.forces.learn import TORQUE_NOISE, Problem, analytical_parameters
+from forcegp.forces.coulomb import coupled
+from forcegp.forces.inference import forces_and_constant, jitter_of, log_likelihood
+from forcegp.forces.learn import Problem, analytical_parameters
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states, stack
 from forcegp.forces.samples import draw_samples
+from forcegp.forces.torque_noise import TORQUE_NOISE, stick_variance
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
-from forcegp.models.doubts import constant_inputs, doubts, mean_correlation
+from forcegp.models.doubts import constant_inputs, doubts, inference_of, mean_correlation
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
 
 KIND = "structured_gp"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StructuredFit(FittedModel):
     """Priors on forces conditioned on data, with learned hyperparameters.
 
@@ -53,6 +55,14 @@ class StructuredFit(FittedModel):
 
     kind = KIND
     has_function_samples = True
+
+    def described(self) -> list[tuple[str, object]]:
+        return [
+            ("training samples", sum(len(part.q) for part in self.training.measurements)),
+            *((f"prior {prior.name}", type(prior).__name__) for prior in self.posterior.priors),
+            *((f"noise of {name}", std) for name, std in self.noise.items()),
+            *([] if self.torque_std is None else [("noise of the torque", self.torque_std)]),
+        ]
 
     @property
     def training(self) -> Training:
@@ -95,8 +105,11 @@ class StructuredFit(FittedModel):
         z, parts = stack(affine_maps(system, at, quantity))
         mean = self.posterior.read_mean(system, at, z)
         spread = self.posterior.read_covariance(system, at, z) if covariance else None
-        if spread is not None and noise:
-            spread = spread + self._noise_covariance(z, parts)
+        if spread is not None:
+            z = coupled(system, at, z, self.posterior.coulomb)
+            spread = spread + _carried(z, stick_variance(self.hyperparameters, at))
+            if noise:
+                spread = spread + self._noise_covariance(z, parts)
         return Prediction(
             mean.reshape(*flat.batch, z.o.shape[-1]),
             None if spread is None else spread.reshape(*flat.batch, *spread.shape[-2:]),
@@ -161,11 +174,21 @@ class StructuredFit(FittedModel):
             return self.problem.torque_std
         return None if learned is None else learned.exp()
 
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        """s √T of torque noise with standard deviation s that is correlated for a time T, [N m √s].
+
+        Over times longer than T it acts like white noise with this root of a spectral density.
+        """
+        if self.torque_std is None or self.problem.correlation_time == 0.0:
+            return None
+        return self.torque_std * self.problem.correlation_time**0.5
+
     def _noise_covariance(self, z: AffineMap, parts: Mapping[str, slice]) -> Tensor:
         """B Σ_τ Bᵀ + Σ_q̈ of a measurement of the quantities, `(n, d, d)`."""
         noise = z.o.new_zeros(*z.o.shape, z.o.shape[-1])
         if self.torque_std is not None:
-            noise = noise + (z.B_Q * self.torque_std**2) @ z.B_Q.mT
+            noise = noise + _carried(z, self.torque_std**2)
         for quantity, rows in parts.items():
             if quantity in self.noise:
                 own = torch.zeros_like(z.o[0])
@@ -186,9 +209,16 @@ class StructuredFit(FittedModel):
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
         """
         flat = flat_states(self.system, q, qd, tau, active)
-        z, parts = stack(affine_maps(self.system, flat.at(self.system), quantity))
+        at = flat.at(self.system)
+        z, parts = stack(affine_maps(self.system, at, quantity))
+        z = coupled(self.system, at, z, self.posterior.coulomb)
         noise = self._noise_covariance(z, parts).diagonal(dim1=-2, dim2=-1)
         return noise.reshape(*flat.batch, z.o.shape[-1])
+
+
+def _carried(z: AffineMap, variance: Tensor) -> Tensor:
+    """B Σ Bᵀ of white noise on the joint force, `(n, d, d)`."""
+    return (z.B_Q * variance[..., None, :]) @ z.B_Q.mT
 
 
 def _sparse(posterior: ForcePosterior) -> SparsePosterior:
@@ -215,6 +245,8 @@ def conditioned(
     hyperparameters: Mapping[str, Tensor],
     learned: Learned | None = None,
     warnings: Sequence[str] = (),
+    learned_on: int | None = None,
+    forces: tuple[ForcePosterior, Tensor] | None = None,
 ) -> StructuredFit:
     """Condition forces on the data of a problem at given hyperparameters.
 
@@ -224,13 +256,15 @@ def conditioned(
         hyperparameters: of priors, noise and robot.
         learned: how they were learned.
         warnings: doubts that have come up.
+        learned_on: number of samples that they were learned on.
+        forces: result of conditioning, where the data of the problem are only a part of the log.
 
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
-    posterior = force_posterior(problem, hyperparameters)
+    posterior, constant = forces or forces_and_constant(problem, hyperparameters)
     system = learned_system(problem, hyperparameters)
-    likelihood = log_likelihood(posterior) - float(problem.rows(hyperparameters).constant)
+    likelihood = log_likelihood(posterior) - float(constant)
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     jitter = jitter_of(posterior)
     result = FitResult.of(
@@ -240,6 +274,9 @@ def conditioned(
         constant_inputs=constant_inputs(problem.priors, problem.training),
         force_correlation=mean_correlation(posterior, system, problem.training),
         warnings=(*warnings, *doubts(posterior, system, problem.training, jitter)),
+        samples=problem.training.all_samples,
+        learned_on=learned_on,
+        **inference_of(posterior),
     )
     noise = typical_noise(problem, hyperparameters)
     return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)

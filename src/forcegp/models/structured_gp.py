@@ -8,24 +8,28 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.data import Dataset
+from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.inference import check_method
 from forcegp.forces.learn import Problem, Search
 from forcegp.forces.mean import AnalyticalMean, mean_of
 from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ANALYTICAL, NOISE, ForcePrior, check_priors
+from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
-from forcegp.gp.optimise import LearningOptions
+from forcegp.forces.state_noise import state_std_of
+from forcegp.gp.inducing import LIMIT, check_limit
+from forcegp.gp.optimise import LearningOptions, Progress
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_learning import in_motion, prepared, solve
+from forcegp.models.structured_learning import Lesson, in_motion, prepared, solve
 from forcegp.models.structured_spec import Specification, torque_noise_of
+from forcegp.models.structured_stream import Pass, sample_of
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
@@ -41,13 +45,21 @@ class StructuredGP(Model[StructuredFit]):
         mean: `"zero"`, `"analytical"`, or an `AnalyticalMean` with some terms left out.
         force_priors: priors on the unknown forces. The default depends on the mean and on the data: around
             the analytical forces of a measured robot, `measured_priors` (friction of each joint and contact,
-            noise of the torque); else `default_priors`: a `JointForcePrior`, and in contact its
-            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest.
+            noise of the torque); else `default_priors`: a `JointForcePrior`, in contact its
+            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest,
+            and around the analytical forces a `SlidingFrictionPrior` for each surface.
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states (`qdd_std` by sample, else its header), else 0.1.
         learn_noise: whether the noise is a hyperparameter too, starting from `noise_std`.
         analytical_parameters: a module whose `forward()` gives the robot with its analytical parameters θ_A
             as learned tensors; `None` keeps the robot as it is.
+        torque_noise: standard deviation of the motor torque's white noise [N m, N], `"learn"`, `None` for
+            none, or `"auto"`: learned with priors for measured robots.
+        inference: `"exact"`, `"sparse"` or `"auto"`.
+        inducing_points: maximum number of inducing points of one prior; fewer are taken where they suffice,
+            and the result of the fit says where more would help.
+        state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
+            or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
 
     Raises:
         ModelError, UnknownNameError: the priors do not fit the system.
@@ -66,10 +78,13 @@ class StructuredGP(Model[StructuredFit]):
         analytical_parameters: nn.Module | None = None,
         torque_noise: NoiseStd | str | None = "auto",
         inference: str = "auto",
+        inducing_points: int = LIMIT,
+        state_noise: tuple[NoiseStd, NoiseStd] | None = None,
     ) -> None:
         form = mean_of(mean)
         priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
         check_priors(priors, system)
+        state_std_of(state_noise, system.robot)
         self.specified = system
         self.specification = Specification(
             system,
@@ -80,7 +95,9 @@ class StructuredGP(Model[StructuredFit]):
             analytical_parameters,
             torque_noise_of(torque_noise, priors),
             check_method(inference),
+            check_limit(inducing_points),
             force_priors is None and torque_noise == "auto" and "actuation" in form.terms,
+            state_noise,
         )
 
     @classmethod
@@ -105,11 +122,24 @@ class StructuredGP(Model[StructuredFit]):
         """Noise of measured accelerations as given, `None` for what the log states."""
         return self.specification.noise_std
 
+    def get_params(self) -> dict[str, Any]:
+        spec = self.specification
+        return {
+            "system": spec.system,
+            "mean": spec.mean,
+            "force_priors": None if spec.automatic else spec.priors,
+            "noise_std": spec.noise_std,
+            "learn_noise": spec.learn_noise,
+            "analytical_parameters": spec.parameters,
+            "torque_noise": "auto" if spec.automatic else spec.torque_noise,
+            "inference": spec.inference,
+        }
+
     # -- learning ---------------------------------------------------------------------------------
 
     def fit(
         self,
-        data: Dataset | Sequence[Observation],
+        data: Dataset | Sequence[Observation] | StreamedDataset,
         *,
         options: LearningOptions | None = None,
         learn: Iterable[str] | None = None,
@@ -117,21 +147,26 @@ class StructuredGP(Model[StructuredFit]):
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
         keep_checkpoint: bool = False,
+        distributed: bool = False,
     ) -> StructuredFit:
         """Learn hyperparameters (and analytical parameters) by maximum a posteriori, then condition.
 
         Args:
-            data: measured accelerations, or any mixture of measurements.
+            data: measured accelerations, any mixture of measurements, or a log that is read piece by piece,
+                in memory that does not grow with its length.
             options: optimiser and its limits; L-BFGS by default, to a tolerance of 1e-9 where θ_A is learned.
             learn: what is learned: names of priors, `"noise"`, `"analytical"`. Everything else keeps the
                 values (and input scales) of the previous fit, or else the initial ones. Default all; an
                 empty list conditions only.
             begin: `hyperparameters` of a fit of the same kind of model, such as one to less data, where
                 learning begins; by default it begins on fewer samples (`options.warm_start`).
-            progress: called after each evaluation.
+            progress: called after each evaluation; for a streamed log also after each piece, with the samples
+                so far, the number of all, and NaN.
             checkpoint: file that records the evaluations of a long fit; a fit that finds it resumes
                 there, to the same bits as one without a break, and removes it at its end.
             keep_checkpoint: leave the file, to be removed once the model is saved.
+            distributed: for a streamed log, share its pieces among the processes of `torch.distributed`, each
+                of which makes this call and gets the same fit.
 
         Returns:
             The fitted model, which is also kept as `fitted`.
@@ -140,38 +175,53 @@ class StructuredGP(Model[StructuredFit]):
             ModelError, DataError, UnknownNameError: the data, or the checkpoint, do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
+        sample, known = None, data
+        if isinstance(known, StreamedDataset):
+            sample = sample_of(self.specification, known)
+            known = sample.data
         if self._fitted is None:
-            self.specification = self.specification.for_data(data)
-        spec = self.specification
+            self.specification = self.specification.for_data(known)
+        spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
         options = options or (LearningOptions() if spec.parameters is None else WITH_PARAMETERS)
         chosen = self._chosen(learn)
-        training, doubts = in_motion(spec, self._training(data, chosen))
+        training, doubts = in_motion(spec, self._training(known, chosen))
+        log = None
+        if sample is not None:
+            training = dataclasses.replace(training, part_of=sample.count)
+            log = Pass(spec, sample, file, progress, distributed)
         problem = spec.problem(training)
+        search, saved = self._search(problem, chosen, options), None
+        if search.start:
+            if file is not None:
+                saved = Checkpoint(file, _key(spec, problem, search, begin))
+                saved.read(search.start)
+                search = dataclasses.replace(search, recorded=saved.recorded)
+            lesson = solve(spec, problem, search, _reported(progress, options), begin)
+            if saved is not None:
+                saved.write()
+        else:
+            lesson = Lesson(prepared(spec, problem, search.held), search.held)
+        values, forces = lesson.hyperparameters, None
+        if log is not None and lesson.problem.inducing is not None:
+            forces = log.forces(lesson.problem, values)
+        doubts = (*doubts, *lesson.warnings)
+        fitted = self.adopt(
+            conditioned(spec, lesson.problem, values, lesson.learned, doubts, lesson.learned_on, forces)
+        )
+        if not keep_checkpoint:
+            for kept in (saved, log):
+                if kept is not None:
+                    kept.remove()
+        return fitted
+
+    def _search(self, problem: Problem, chosen: Sequence[str], options: LearningOptions) -> Search:
+        """What is learned of a problem, from where, and what keeps its values."""
+        spec = self.specification
         start = problem.initial(spec.learn_noise, spec.learns_torque_noise)
         before = {} if self._fitted is None else self._fitted.hyperparameters
         current = {key: before.get(key, value) for key, value in start.items()}
         held = {key: value for key, value in current.items() if key.split(".")[0] not in chosen}
-        free = {key: value for key, value in start.items() if key not in held}
-        if not free:
-            return self.adopt(conditioned(spec, prepared(spec, problem, held), held, warnings=doubts))
-
-        def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
-            if progress is not None:
-                progress(evaluations, options.max_evaluations, value)
-
-        search, saved = Search(free, held, options), None
-        if checkpoint is not None:
-            saved = Checkpoint(Path(checkpoint), _key(spec, problem, search, begin))
-            saved.read(free)
-            search = dataclasses.replace(search, recorded=saved.recorded)
-        lesson = solve(spec, problem, search, report, begin)
-        if saved is not None:
-            saved.write()
-        doubts = (*doubts, *lesson.warnings)
-        fitted = self.adopt(conditioned(spec, lesson.problem, lesson.hyperparameters, lesson.learned, doubts))
-        if saved is not None and not keep_checkpoint:
-            saved.remove()
-        return fitted
+        return Search({key: value for key, value in start.items() if key not in held}, held, options)
 
     def condition(
         self,
@@ -237,7 +287,7 @@ class StructuredGP(Model[StructuredFit]):
 
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""
-        names = (*(prior.name for prior in self.force_priors), NOISE, ANALYTICAL)
+        names = (*(prior.name for prior in self.force_priors), NOISE, ANALYTICAL, COULOMB)
         chosen = names if learn is None else tuple(learn)
         for name in chosen:
             if name not in names:
@@ -287,6 +337,14 @@ class StructuredGP(Model[StructuredFit]):
     def training(self) -> Training:
         """What the posterior is conditioned on."""
         return self.fitted.training
+
+
+def _reported(progress: FitProgress | None, options: LearningOptions) -> Progress:
+    def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
+        if progress is not None:
+            progress(evaluations, options.max_evaluations, value)
+
+    return report
 
 
 def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:

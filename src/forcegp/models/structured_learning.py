@@ -25,10 +25,11 @@ from forcegp.forces.inference import (
     with_inducing,
     without_inducing,
 )
-from forcegp.forces.learn import TORQUE_NOISE, Problem, Search
+from forcegp.forces.learn import Problem, Search
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.torque_noise import TORQUE_NOISE
 from forcegp.gp.capacity import require_exact_fits
 from forcegp.gp.optimise import Learned, Progress
 from forcegp.gp.structured_covariance import Block
@@ -55,12 +56,14 @@ class Lesson:
         problem: all samples, the updated robot, and the noise.
         hyperparameters: learned and held.
         learned: how the optimisation went.
+        learned_on: number of samples that were learned on.
         warnings: doubts that came up.
     """
 
     problem: Problem
     hyperparameters: dict[str, Tensor]
-    learned: Learned | None
+    learned: Learned | None = None
+    learned_on: int | None = None
     warnings: tuple[str, ...] = ()
 
 
@@ -79,7 +82,7 @@ def in_motion(spec: Specification, training: Training) -> tuple[Training, tuple[
 def subset(spec: Specification, problem: Problem) -> Problem:
     """The problem on the samples that hyperparameters are learned on."""
     training, finite = problem.training, is_finite(problem.priors)
-    if not is_sparse(spec.inference, problem.priors, training.samples):
+    if not is_sparse(spec.inference, problem.priors, training.all_samples):
         return problem
     most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
     if training.samples > most:
@@ -111,7 +114,7 @@ def solve(
     correlated = spec.learns_torque_noise and TORQUE_NOISE in search.start
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)
-    learned = search.solve(part, progress, begin)
+    learned, learned_on = search.solve(part, progress, begin), part.training.samples
     values = {**search.held, **learned.tensors}
     if correlated:
         part = dataclasses.replace(part, power=likelihood_power(part, values))
@@ -119,27 +122,29 @@ def solve(
         values = {**search.held, **learned.tensors}
         part = with_updated_robot(part, values)
         values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
-    whole = dataclasses.replace(
-        part,
-        training=problem.training,
-        power=_power_of_all(part, problem.training),
-        inducing=None,
-    )
-    return Lesson(prepared(spec, whole, values), values, learned)
+        part = _at_the_rate_of_the_log(part, values, problem.training)
+    whole = dataclasses.replace(part, training=problem.training, inducing=None)
+    return Lesson(prepared(spec, whole, values), values, learned, learned_on)
 
 
-def _power_of_all(part: Problem, training: Training) -> float:
-    """κ of all samples: as much evidence as the part that was learned on, if that was tempered."""
-    if part.power == 1.0:
-        return 1.0
-    return part.power * part.training.samples / training.samples
+def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:
+    """The problem with the correlation of its residuals among all samples.
+
+    Neighbours in the whole log are closer in time than in the part that was learned on. Of a log that is read
+    piece by piece, only the samples in memory are looked at, whose evidence is that of all samples.
+    """
+    power = part.power if part.training is training else likelihood_power(part, values, training)
+    share = training.samples / training.all_samples
+    return dataclasses.replace(part, power=power * share, correlation_time=training.period / power)
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """The problem with the inference that its samples ask for."""
-    if not is_sparse(spec.inference, problem.priors, problem.training.samples):
+    if not is_sparse(spec.inference, problem.priors, problem.training.all_samples):
         return problem
-    return without_inducing(problem) if is_finite(problem.priors) else with_inducing(problem, values)
+    if is_finite(problem.priors):
+        return without_inducing(problem)
+    return with_inducing(problem, values, spec.inducing_points)
 
 
 @torch.no_grad()

@@ -77,6 +77,8 @@ def _specification(
         parameters,
         settings.torque_noise,
         settings.inference,
+        settings.inducing_points,
+        state_noise=settings.state_noise,
     )
 
 
@@ -141,6 +143,7 @@ def _restored(
         spec.problem(training),
         system=spec.system if spec.parameters is not None else system,
         power=settings.power,
+        correlation_time=settings.correlation_time,
         offsets=_below(tensors, "offset."),
         torque_std=tensors.get("torque_std"),
         pinned=settings.pinned,
@@ -158,12 +161,12 @@ def _restored(
 
 def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str, Tensor]) -> ForcePosterior:
     """The posterior with its weights or sums as they were."""
-    scales, params = problem.training.scales, kernel_parameters(hyper)
+    scales, params, coulomb = problem.training.scales, kernel_parameters(hyper), problem.coulomb(hyper)
     if "alpha" not in tensors:
         kept = {name: _below(tensors, name + ".") for name in ("sparse", "central")}
         latent = posterior_of_tensors(problem.priors, params, kept["sparse"])
         central = posterior_of_tensors(problem.priors, params, kept["central"]) if kept["central"] else None
-        return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central)
+        return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central, coulomb)
     blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
     rows = sum(block.rows for block in blocks)
     if alpha.shape != (rows,):
@@ -171,4 +174,4 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
     if problem.pinned:
         return force_posterior(problem, hyper)
     latent = ExactPosterior(problem.priors, params, blocks, alpha)
-    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets)
+    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, coulomb=coulomb)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
@@ -26,8 +26,10 @@ from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
+from forcegp.forces.state_noise import state_std_of
 from forcegp.gp import kernels, stationary
 from forcegp.gp.exact import ExactPosterior
+from forcegp.gp.inducing import LIMIT
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sparse_tensors import tensors_of_posterior
 from forcegp.models.base import FitResult
@@ -52,6 +54,8 @@ CLASSES: dict[str, type] = {
     "sliding_friction": SlidingFrictionPrior,
 }
 """What can be saved, by the name in the file."""
+Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
+"""A noise that may be zero, as one number or one per joint."""
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """What is kept of each measurement."""
 
@@ -69,7 +73,9 @@ class Specification:
         parameters: module whose `forward()` gives the robot at θ_A, or `None`.
         torque_noise: standard deviation of the motor torque's white noise, `"learn"`, or `None` for none.
         inference: `"auto"`, `"exact"` or `"sparse"`.
+        inducing_points: maximum number of inducing points of one prior.
         automatic: whether the priors depend on whether the data are simulated or measured.
+        state_noise: standard deviations of the noise of q and of q̇, or `None` for none.
     """
 
     system: ConstrainedSystem
@@ -80,8 +86,9 @@ class Specification:
     parameters: nn.Module | None = None
     torque_noise: NoiseStd | str | None = None
     inference: str = "auto"
-
+    inducing_points: int = LIMIT
     automatic: bool = False
+    state_noise: tuple[NoiseStd, NoiseStd] | None = None
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
         """The specification with what was left to the data filled in.
@@ -107,7 +114,10 @@ class Specification:
         std = None
         if noise is not None and not isinstance(noise, str):
             std = torch.as_tensor(noise, dtype=robot.dtype, device=robot.device).expand(robot.nq)
-        return Problem(self.system, self.priors, self.mean, training, self.parameters, std)
+        state_std = state_std_of(self.state_noise, robot)
+        return Problem(
+            self.system, self.priors, self.mean, training, self.parameters, std, state_std=state_std
+        )
 
 
 def torque_noise_of(given: NoiseStd | str | None, priors: Sequence[ForcePrior]) -> NoiseStd | str | None:
@@ -142,6 +152,13 @@ class ResultSettings(Settings):
     message: str
     force_correlation: float | None
     warnings: tuple[str, ...]
+    inference: str = ""
+    samples: NonNegativeInt | None = None
+    learned_on: NonNegativeInt | None = None
+    basis_functions: NonNegativeInt | None = None
+    determined: float | None = None
+    missed: float | None = None
+    more_points_would_help: bool | None = None
 
 
 class StructuredSettings(Settings):
@@ -151,8 +168,11 @@ class StructuredSettings(Settings):
     noise_std: PositiveFloat | tuple[PositiveFloat, ...] | None
     learn_noise: bool
     torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["learn"] | None
+    state_noise: tuple[Stated, Stated] | None
     inference: Literal["auto", "exact", "sparse"]
+    inducing_points: PositiveInt = LIMIT
     power: float = Field(gt=0.0, le=1.0)
+    correlation_time: float = Field(default=0.0, ge=0.0)
     priors: tuple[dict[str, Any], ...]
     pinned: tuple[str, ...]
     measured: tuple[str, ...]
@@ -188,8 +208,11 @@ def pack(
         noise_std=_plain(spec.noise_std),
         learn_noise=spec.learn_noise,
         torque_noise=_plain(spec.torque_noise),
+        state_noise=None if spec.state_noise is None else tuple(map(_plain, spec.state_noise)),  # pyright: ignore[reportArgumentType]
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
+        inducing_points=spec.inducing_points,
         power=problem.power,
+        correlation_time=problem.correlation_time,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
         measured=training.quantities if exact else (),

@@ -48,21 +48,38 @@ class FigureData:
 
 def all_figures(stages: Stages, sizes: Profile, tasks: Sequence[Task], fits: Sequence[Fit]) -> FigureData:
     """The data of every figure; those over time are of the first run and its held-out stretches."""
-    task, sized = tasks[0], (sizes.main, sizes.baseline_points)
-    shown = [
+    task = tasks[0]
+    first = shown(sizes, [fit for fit in fits if fit.task is task and fit.split == "stretches"])
+    covariance, multiplier, task_space, windows = of_fits(stages, sizes, task, first)
+    return FigureData(
+        covariance=covariance,
+        multiplier=multiplier,
+        task_space=task_space,
+        windows=windows,
+        identification=identification(stages, sizes, tasks),
+        rollouts=trajectories(stages, sizes, task, first),
+    )
+
+
+def shown(sizes: Profile, fits: Sequence[Fit]) -> list[Fit]:
+    """The fits that the figures over time show: each model at its main size."""
+    return [
         fit
         for fit in fits
-        if fit.task is task and fit.split == "stretches" and fit.points in sized
-        if fit.name not in PAPER_KERNELS.values()
+        if fit.points in (sizes.main, sizes.baseline_points) and fit.name not in PAPER_KERNELS.values()
     ]
-    structured = [fit for fit in shown if fit.name.startswith("sgp")]
-    return FigureData(
-        covariance=_covariance(stages, task, next(fit for fit in structured if fit.name == "sgp-zero")),
-        multiplier=_multiplier(stages, sizes, task, structured),
-        task_space=_task_space(stages, sizes, task),
-        windows=[_window(stages, task, fit) for fit in shown],
-        identification=_identification(stages, sizes, tasks),
-        rollouts=trajectories(stages, sizes, task, shown),
+
+
+def of_fits(
+    stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]
+) -> tuple[CovarianceData, MultiplierData, TaskSpaceData, list[WindowData]]:
+    """Figures 1 to 5, of the models at their main size."""
+    structured = [fit for fit in fits if fit.name.startswith("sgp")]
+    return (
+        _covariance(stages, task, next(fit for fit in structured if fit.name == "sgp-zero")),
+        _multiplier(stages, sizes, task, structured),
+        _task_space(stages, sizes, task),
+        [_window(stages, task, fit) for fit in fits],
     )
 
 
@@ -115,7 +132,8 @@ def _window(stages: Stages, task: Task, fit: Fit) -> WindowData:
     return stages.data(f"figures/window/{fit.name}", WindowData, make, settings={}, inputs=[fit.stage])
 
 
-def _identification(stages: Stages, sizes: Profile, tasks: Sequence[Task]) -> IdentificationData:
+def identification(stages: Stages, sizes: Profile, tasks: Sequence[Task]) -> IdentificationData:
+    """Mass and offset of the last link, learned from each simulated run."""
     points, most = sizes.identification_points, sizes.identification_evaluations
     parts = []
     for task in tasks:

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import torch
 
+from forcegp.destination import check_destination
 from forcegp.files import write_text
 from forcegp.paper.figures import all_figures
-from forcegp.paper.fits import Fit, fit_model, noise_std_of, score_fit
+from forcegp.paper.fits import Fit, noise_std_of, score_fit
+from forcegp.paper.jobs import fits_of, models_of, run_ahead, splits_of
 from forcegp.paper.page import render_markdown, render_page
 from forcegp.paper.profiles import Profile, profile_of
-from forcegp.paper.results import GP_MODELS, PAPER_KERNELS, SPLITS, Results, Score
+from forcegp.paper.results import Results, Score
 from forcegp.paper.stages import Progress, Stages, silent
 from forcegp.paper.task import Task, make_task
 
 PAGE, RESULTS, MARKDOWN = "report.html", "results.json", "results.md"
-LARGE = 400
-"""From this many points on, the fit to the next size starts from the hyperparameters of the last."""
 PACKAGES = ("forcegp", "torch", "numpy", "scipy", "pybullet", "mujoco", "matplotlib")
 
 
@@ -60,6 +60,7 @@ def run(
     out: str | Path = "out",
     *,
     seed: int = 0,
+    processes: int = 1,
     progress: Progress = silent,
     say: Callable[[str], None] = lambda _: None,
 ) -> Reproduction:
@@ -69,6 +70,7 @@ def run(
         profile: `"quick"`, `"paper"`, or your own sizes.
         out: folder for the page and everything it is made from.
         seed: of the first simulated run; the others follow.
+        processes: how many stages are run at the same time; with more than one, each has one thread.
         progress: opens a progress bar with a description and a total.
         say: called with one line for every stage that ends.
 
@@ -77,15 +79,18 @@ def run(
 
     Raises:
         UnknownNameError: no such profile.
+        DestinationError: the folder cannot be written.
     """
     sizes = profile_of(profile) if isinstance(profile, str) else profile
     root = Path(out)
-    stages = Stages(root / "stages", progress, say)
+    check_destination(root, folder=True)
+    folder = root / "stages"
+    made = run_ahead(folder, sizes, seed, processes, progress, say) if processes > 1 else set()
+    stages = Stages(folder, progress, say, made)
     tasks = [make_task(stages, sizes, seed + i) for i in range(sizes.seeds)]
     fits = []
     for i, task in enumerate(tasks):
-        splits = list(SPLITS) if i < sizes.paper_split_seeds else ["stretches"]
-        fits += _fits(stages, sizes, task, splits)
+        fits += _fits(stages, sizes, task, splits_of(sizes, i))
     scores = [score_fit(stages, sizes, fit) for fit in fits]
     figures = all_figures(stages, sizes, tasks, fits)
     results = _results(sizes, tasks, scores, stages)
@@ -98,20 +103,12 @@ def run(
 
 def _fits(stages: Stages, sizes: Profile, task: Task, splits: list[str]) -> list[Fit]:
     """Every model on the given splits: baselines at one size, GP models at all sizes, smaller ones first."""
-    fits = []
-    for split in splits:
-        baselines = split == "stretches" or sizes.paper_split_baselines
-        for name in ("analytical", *sizes.networks) if baselines else ():
-            fits.append(fit_model(stages, task, name, split, sizes.baseline_points))
-        large: dict[str, Fit] = {}
-        for points in sizes.sizes:
-            papers = PAPER_KERNELS.values() if points <= sizes.paper_kernels_up_to else ()
-            for name in (*GP_MODELS, *papers):
-                fit = fit_model(stages, task, name, split, points, large.get(name))
-                fits.append(fit)
-                if points >= LARGE:
-                    large[name] = fit
-    return fits
+    return [
+        fit
+        for split in splits
+        for name in dict.fromkeys(name for name, _ in models_of(sizes, split))
+        for fit in fits_of(stages, sizes, task, split, name)
+    ]
 
 
 def _results(sizes: Profile, tasks: list[Task], scores: list[Score], stages: Stages) -> Results:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import ClassVar, Protocol, TypeVar, runtime_checkable
 
 from forcegp.errors import DataError, ForceGPError
+from forcegp.exchange import recover
 from forcegp.files import Header, atomic_directory, write_text
 
 STAGE_FILE, DATA = "stage.json", "data.json"
@@ -106,12 +107,17 @@ class Stages:
         root: where the stages' folders go.
         progress: opens a progress bar.
         say: called with one line for every stage that ends.
+        made: names of stages that other processes have just run, which do not count as reused.
     """
 
     def __init__(
-        self, root: Path, progress: Progress = silent, say: Callable[[str], None] = lambda _: None
+        self,
+        root: Path,
+        progress: Progress = silent,
+        say: Callable[[str], None] = lambda _: None,
+        made: Collection[str] = (),
     ) -> None:
-        self.root, self.progress, self.say = root, progress, say
+        self.root, self.progress, self.say, self.made = root, progress, say, made
         self.done: dict[str, Stage] = {}
 
     def run(
@@ -137,7 +143,7 @@ class Stages:
         """
         key = stage_key(name, settings, inputs)
         folder = self.root / name
-        stage = _found(folder, key)
+        stage = _found(folder, key, reused=name not in self.made)
         if stage is None:
             began = time.perf_counter()
             with self.progress(name, total) as advance, atomic_directory(folder) as temporary:
@@ -225,9 +231,10 @@ def _version(library: str) -> str | None:
         return None
 
 
-def _found(folder: Path, key: str) -> Stage | None:
+def _found(folder: Path, key: str, reused: bool) -> Stage | None:
+    recover(folder)
     try:
         header = StageHeader.from_json((folder / STAGE_FILE).read_bytes(), str(folder), DataError)
     except (OSError, DataError):
         return None
-    return Stage(folder, key, header.seconds, reused=True) if header.key == key else None
+    return Stage(folder, key, header.seconds, reused) if header.key == key else None

@@ -15,7 +15,7 @@ from forcegp.paper.profiles import Profile
 from forcegp.paper.stages import Advance, Stage, Stages
 from forcegp.paper.task import LOG, SCENE, Task, simulation_settings
 from forcegp.report.html import Finding
-from forcegp.report.rollout_data import RolloutData, rollout_data, with_bands
+from forcegp.report.rollout_data import RolloutData, rollout_data, together, with_bands
 from forcegp.report.style import label
 from forcegp.rollout import compare
 from forcegp.scene import load_scene
@@ -36,47 +36,63 @@ HELD = (0.80, 0.97)
 OURS = "sgp-mean"
 
 
-def trajectories(stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit]) -> RolloutData:
-    """The data of the section on trajectories, computed or taken from an earlier run.
+def trajectories(
+    stages: Stages, sizes: Profile, task: Task, fits: Sequence[Fit], names: Sequence[str] | None = None
+) -> RolloutData:
+    """The data of the section on trajectories, computed or taken from an earlier run; one stage per model.
 
     Args:
         stages: where results are kept.
         sizes: length and number of the trajectories.
         task: whose scene is simulated once more.
         fits: the models.
+        names: of the models to roll out; all by default.
     """
-    simulated = _unseen_motion(stages, sizes, task)
-    return stages.data(
-        "figures/rollouts",
-        RolloutData,
-        lambda advance: _roll(sizes, task, fits, simulated, advance),
-        settings={
-            "seconds": sizes.rollout_seconds,
-            "starts": sizes.rollout_starts,
-            "samples": sizes.rollout_samples,
-            "band_seconds": BAND_SECONDS,
-        },
-        inputs=[simulated, *(fit.stage for fit in fits)],
-    )
+    simulated = unseen_motion(stages, sizes, task.seed)
+    settings = {
+        "seconds": sizes.rollout_seconds,
+        "starts": sizes.rollout_starts,
+        "samples": sizes.rollout_samples,
+        "band_seconds": BAND_SECONDS,
+    }
+    parts = []
+    for fit in fits:
+        if names is not None and fit.name not in names:
+            continue
+
+        def roll(advance: Advance, fit: Fit = fit) -> RolloutData:
+            return _roll(sizes, task, fit, simulated, advance)
+
+        inputs = [simulated, task.selected, fit.stage]
+        part = stages.data(
+            f"figures/rollouts/{fit.name}", RolloutData, roll, settings=settings, inputs=inputs
+        )
+        parts.append(part)
+    return together(parts)
 
 
-def _unseen_motion(stages: Stages, sizes: Profile, task: Task) -> Stage:
-    """The task with other waypoints, long enough for starts whose trajectories do not overlap."""
+def unseen_motion(stages: Stages, sizes: Profile, seed: int) -> Stage:
+    """The task with other waypoints, long enough for starts whose trajectories do not overlap.
+
+    Args:
+        stages: where results are kept.
+        sizes: length and number of the trajectories.
+        seed: of the task.
+    """
     scene = load_scene(SCENE)
     duration = sizes.rollout_starts * sizes.rollout_seconds
-    config = dataclasses.replace(scene.simulation, duration=duration, seed=task.seed + OTHER_MOTION)
+    config = dataclasses.replace(scene.simulation, duration=duration, seed=seed + OTHER_MOTION)
 
     def make(folder: Path, advance: Advance) -> None:
-        simulate(task.system, config, progress=lambda done, _: advance(done)).data.write(folder / LOG)
+        simulate(scene.system(), config, progress=lambda done, _: advance(done)).data.write(folder / LOG)
 
     settings = simulation_settings(scene, config)
     return stages.run("simulate/rollout", make, settings=settings, total=config.steps)
 
 
-def _roll(sizes: Profile, task: Task, fits: Sequence[Fit], simulated: Stage, advance: Advance) -> RolloutData:
+def _roll(sizes: Profile, task: Task, fit: Fit, simulated: Stage, advance: Advance) -> RolloutData:
     """Mean trajectories from all starts over the whole time, and bands over the first part of it."""
-    models = {fit.name: fit.load() for fit in fits}
-    sampled = {name: model for name, model in models.items() if model.has_function_samples}
+    models = {fit.name: fit.load()}
     data, system, samples = Dataset.read(simulated / LOG), task.system, sizes.rollout_samples
     seconds, starts = sizes.rollout_seconds, sizes.rollout_starts
 
@@ -84,11 +100,13 @@ def _roll(sizes: Profile, task: Task, fits: Sequence[Fit], simulated: Stage, adv
         return lambda done, total: advance(done, total, what)
 
     paths = compare(models, data, seconds, starts, system=system, progress=reported("means"))
+    if not models[fit.name].has_function_samples:
+        return rollout_data(paths)
     seconds, note = min(BAND_SECONDS, seconds), reported("function samples")
-    bands = compare(sampled, data, seconds, starts, samples, system=system, progress=note)
+    bands = compare(models, data, seconds, starts, samples, system=system, progress=note)
     seconds, note = min(seconds, sizes.stretch), reported("calibration")
     rows = _calibration_starts(task, seconds, CALIBRATION_STARTS * starts)
-    calibration = compare(sampled, task.data, seconds, rows, samples, system=system, progress=note)
+    calibration = compare(models, task.data, seconds, rows, samples, system=system, progress=note)
     return with_bands(rollout_data(paths), rollout_data(bands, calibration))
 
 

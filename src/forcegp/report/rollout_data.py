@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -157,6 +158,19 @@ def with_bands(paths: RolloutData, bands: RolloutData) -> RolloutData:
     models = [_with_bands(p, sampled[p.model]) if p.model in sampled else p for p in paths.models]
     seconds = {"band_starts": bands.starts, "band_seconds": bands.band_seconds}
     return paths.model_copy(update={"models": models, **seconds})
+
+
+def together(parts: Sequence[RolloutData]) -> RolloutData:
+    """Trajectories of several models, from one comparison each with the same log.
+
+    Args:
+        parts: at least one; each from the same starts.
+    """
+    # Models without function samples have no bands, whose duration is then that of the trajectories.
+    whole = min(parts, key=lambda part: part.band_seconds)
+    models = [model for part in parts for model in part.models]
+    films = [parts[0].films[0], *(film for part in parts for film in part.films[1:])]
+    return whole.model_copy(update={"models": models, "films": films})
 
 
 def _with_bands(path: ModelPath, band: ModelPath) -> ModelPath:

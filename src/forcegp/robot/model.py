@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ShapeError, UnknownNameError
+from forcegp.notebook import html_table
 
 JointType = Literal["revolute", "prismatic"]
 BASE = -1
@@ -90,6 +91,18 @@ class RobotModel:
         mass = float(self.mass.detach().sum())
         kind = str(self.dtype).removeprefix("torch.")
         return f"<RobotModel {self.name!r}: {self.nq} joints{kinds}; {mass:.4g} kg; {kind} on {self.device}>"
+
+    def _repr_html_(self) -> str:
+        """A table of the joints for notebooks."""
+        head = ("joint", "type", "parent", "lower", "upper", "mass [kg]", "damping", "friction")
+        numbers = torch.stack([self.lower, self.upper, self.mass, self.damping, self.friction], dim=1)
+        rows = [
+            (name, kind, self.joint_names[parent] if parent != BASE else "base", *values)
+            for name, kind, parent, values in zip(
+                self.joint_names, self.joint_types, self.parents, numbers.detach().tolist(), strict=True
+            )
+        ]
+        return html_table(repr(self).strip("<>"), head, rows, self.remarks)
 
     @property
     def nq(self) -> int:

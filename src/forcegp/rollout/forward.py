@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.unilateral import any_row, can_open
-from forcegp.rollout.inputs import Torque, inputs_of
+from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
 from forcegp.rollout.law import ForceLaw, ForwardModel, Law, Problem, State, law_of
 from forcegp.rollout.options import RolloutOptions
@@ -85,7 +85,8 @@ def rollout_model(
     """The mean motion of a model, and the motions of functions drawn from its posterior.
 
     Each sample is one deterministic force function, so each of its trajectories obeys the constraint and
-    Newton's equation.
+    Newton's equation. Models of measured robots have learned that logged torques are noisy: each sample is
+    driven by the torques with its own noise (`RolloutOptions.torque_noise`).
 
     Args:
         model: a fitted model.
@@ -108,9 +109,14 @@ def rollout_model(
     report = _share(progress, 0, shares)
     found = _run(law, system, start, tau, duration, batch, active, options, report)
     if samples:
-        force = ForceLaw(model.force_samples(samples, torch.Generator().manual_seed(seed)))
+        generator = torch.Generator().manual_seed(seed)
+        force = ForceLaw(model.force_samples(samples, generator))
         whole, report = torch.Size((samples, *batch)), _share(progress, 1, shares)
-        sampled = _run(force, system, start, tau, duration, whole, active, options, report, batch=batch)
+        density = model.torque_disturbance if options.torque_noise else None
+        noise = None if density is None else (density, generator)
+        sampled = _run(
+            force, system, start, tau, duration, whole, active, options, report, batch=batch, noise=noise
+        )
         found = dataclasses.replace(found, samples=sampled)
     return _checked(found, options)
 
@@ -127,6 +133,7 @@ def _run(
     progress: Progress | None,
     *,
     batch: torch.Size | None = None,
+    noise: tuple[Tensor, torch.Generator] | None = None,
 ) -> Rollout:
     """Flatten the batch, integrate, and give the result the shape of the whole batch."""
     system.robot.check_state(q0=start[0], qd0=start[1])
@@ -134,6 +141,9 @@ def _run(
     unilateral = options.unilateral and len(system.contacts) > 0
     inputs = inputs_of(tau, whole if batch is None else batch, n, options.dt, options.interpolation)
     dt = options.dt or inputs.period or STEP
+    steps = max(1, round(duration / dt))
+    if noise is not None:
+        inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
     problem = Problem(options.stabilized(system), law, inputs, unilateral)
     q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
     closed = _closed(problem, q, qd) if active is None else active.expand(*whole, -1).reshape(n, -1)
@@ -143,7 +153,7 @@ def _run(
             METHODS[options.method],
             State(q.new_zeros(n, 1), q, qd, closed),
             dt,
-            max(1, round(duration / dt)),
+            steps,
             project=options.stabilization == "projection",
             speed_limit=options.speed_limit,
             progress=progress,

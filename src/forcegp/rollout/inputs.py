@@ -108,6 +108,36 @@ class Feedback(Inputs):
 
 
 @dataclass(frozen=True)
+class Disturbed(Inputs):
+    """Inputs with noise, which is held for a period: logged torques are not quite those that acted.
+
+    Args:
+        inputs: torques without the noise.
+        noise: `(n, steps, nq)` [N m].
+        dt: how long each value is held [s].
+    """
+
+    inputs: Inputs
+    noise: Tensor
+    dt: float
+
+    @property
+    def period(self) -> float | None:
+        return self.inputs.period
+
+    def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
+        return self.inputs.torque(t, end, at) + Sampled(self.noise, self.dt).torque(t, end, at)
+
+    @classmethod
+    def drawn(
+        cls, inputs: Inputs, density: Tensor, rows: int, steps: int, dt: float, generator: torch.Generator
+    ) -> Disturbed:
+        """White noise with a root of a spectral density `(nq,)` [N m √s] for each of n trajectories."""
+        unit = torch.randn(rows, steps, len(density), generator=generator, dtype=density.dtype)
+        return cls(inputs, unit.to(density.device) * density / dt**0.5, dt)
+
+
+@dataclass(frozen=True)
 class TaskSpaceControl(Inputs):
     """The simulator's task-space controller following a plan, with the analytical mechanics of a system.
 

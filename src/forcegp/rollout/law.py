@@ -65,6 +65,11 @@ class ForwardModel(Protocol):
         """Force functions drawn from the posterior, on `(samples * k, nq)` states."""
         ...
 
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        """Root of the spectral density of the logged torques' noise `(nq,)` [N m √s], `None` for none."""
+        ...
+
     def predict(
         self,
         q: Tensor,

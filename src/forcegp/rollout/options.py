@@ -26,8 +26,10 @@ class RolloutOptions:
         stabilization: `none`, `baumgarte` (the system's own terms, or the default ones), other
             `Baumgarte` terms, or `projection` of q and q̇ onto the manifold after each step.
         unilateral: whether contacts with a surface open where they would pull, and close again.
-        interpolation: `hold` each torque of an array for its period, or interpolate `linear`ly.
+        interpolation: of a torque array between its samples, `hold` or `linear`.
         speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
+        torque_noise: whether function samples are driven by torques with noise drawn anew for each of them,
+            where the model has learned the noise of logged torques and its correlation in time.
         on_divergence: `raise` a `DivergedError` that holds the trajectories, or `keep` them.
 
     Raises:
@@ -41,6 +43,7 @@ class RolloutOptions:
     unilateral: bool = False
     interpolation: str = "hold"
     speed_limit: float = 100.0
+    torque_noise: bool = True
     on_divergence: str = "raise"
 
     def __post_init__(self) -> None:

@@ -5,15 +5,21 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
 from forcegp.errors import ModelError, NumericalError
 from forcegp.rollout.events import ContactEvent
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from forcegp.plots.panels import Target
 
 FIELDS = ("q", "qd", "qdd", "tau", "multiplier", "c", "cd", "active")
 """Attributes of a rollout that have the shape of its batch."""
@@ -69,7 +75,7 @@ class Bands(NamedTuple):
         return Bands(lower, self.median + inflation * (self.upper - self.median), self.median)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
     """Trajectories of a batch of initial states at T times; NaN after a trajectory diverged.
 
@@ -98,6 +104,45 @@ class Rollout:
     events: Sequence[ContactEvent] = ()
     diverged: Sequence[Divergence] = ()
     samples: Rollout | None = field(default=None)
+
+    def __repr__(self) -> str:
+        """One line: length, batch, samples and what happened, without the numbers."""
+        n = self.rows
+        what = "one trajectory" if n == 1 else f"{n} trajectories"
+        span = float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
+        more = [f"{self.samples.q.shape[0]} function samples"] if self.samples is not None else []
+        more += [f"{len(self.events)} contact events"] if self.events else []
+        more += [f"{len(self.diverged)} diverged"] if self.diverged else []
+        robot = self.system.robot.name
+        return f"<Rollout of {robot!r}: {', '.join([f'{what} of {span:.4g} s', *more])}>"
+
+    def plot(
+        self,
+        quantity: str = "q",
+        *,
+        log: Dataset | None = None,
+        joints: Sequence[str] | None = None,
+        ax: Target = None,
+    ) -> list[Axes]:
+        """Draw the predicted motion over time, with the band of ±2 standard deviations over function samples.
+
+        Args:
+            quantity: `q`, `qd`, `qdd`, `tau`, `multiplier`, `c` or `cd`.
+            log: the logged motion from the same start, to compare with.
+            joints: which joints or contacts; default all.
+            ax: matplotlib axes to draw on, one per panel; default a new figure.
+
+        Returns:
+            The axes, one per panel.
+
+        Raises:
+            UnknownNameError: no such quantity or joint.
+            ParameterError: several trajectories (choose one: `rollout[0].plot()`), or the number of axes is
+                not that of the panels.
+        """
+        from forcegp.rollout.plot import plot
+
+        return plot(self, quantity, log, joints, ax)
 
     @property
     def batch(self) -> torch.Size:

@@ -68,7 +68,7 @@ class Checkpoint:
         """
         if not self.path.exists():
             return 0
-        tensors, key = self._content()
+        tensors, key = read_keyed(self.path)
         size = sum(value.numel() for value in start.values())
         n = len(tensors["objectives"]) if tensors.get("objectives", torch.zeros(())).ndim == 1 else -1
         shapes = {"positions": (n, size), "objectives": (n,), "gradients": (n, size)}
@@ -91,27 +91,6 @@ class Checkpoint:
         self._record = list(zip(*(tensors[name] for name in NAMES), strict=True))
         self._next = 0
         return n
-
-    def _content(self) -> tuple[dict[str, Tensor], str | None]:
-        if not self.path.is_file():
-            raise ModelError(f"{self.path} is no file", expected="the file of a checkpoint")
-        try:
-            with self.path.open("rb") as file:
-                data = file.read(CHECKPOINT_BYTES + 1)
-            if len(data) > CHECKPOINT_BYTES:
-                raise ModelError(
-                    f"{self.path}: too large for a checkpoint", got=f"> {CHECKPOINT_BYTES} bytes"
-                )
-            # Of one content: a library that opens the file twice may see two versions of it.
-            tensors = safetensors.torch.load(data)
-            header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-            return tensors, header.get("__metadata__", {}).get("key")
-        except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as cause:
-            if isinstance(cause, ModelError):
-                raise
-            raise ModelError(
-                f"{self.path}: the checkpoint is damaged", got=str(cause), hint="remove it to start anew"
-            ) from cause
 
     def recorded(self, objective: Objective) -> Objective:
         """The same objective, with its evaluations read from the record as far as it goes, then recorded."""
@@ -196,3 +175,28 @@ def _bytes_of(value: object) -> bytes:
         return repr(value).encode()
     flat = value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy()
     return f"{value.dtype}{tuple(value.shape)}".encode() + flat.tobytes()
+
+
+def read_keyed(path: Path) -> tuple[dict[str, Tensor], str | None]:
+    """The tensors of a checkpoint, and the key of what it was written for.
+
+    Raises:
+        ModelError: the file is damaged, too large, or is a folder.
+    """
+    if not path.is_file():
+        raise ModelError(f"{path} is no file", expected="the file of a checkpoint")
+    try:
+        with path.open("rb") as file:
+            data = file.read(CHECKPOINT_BYTES + 1)
+        if len(data) > CHECKPOINT_BYTES:
+            raise ModelError(f"{path}: too large for a checkpoint", got=f"> {CHECKPOINT_BYTES} bytes")
+        # Of one content: a library that opens the file twice may see two versions of it.
+        tensors = safetensors.torch.load(data)
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        return tensors, header.get("__metadata__", {}).get("key")
+    except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as cause:
+        if isinstance(cause, ModelError):
+            raise
+        raise ModelError(
+            f"{path}: the checkpoint is damaged", got=str(cause), hint="remove it to start anew"
+        ) from cause

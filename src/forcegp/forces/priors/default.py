@@ -29,14 +29,21 @@ def default_priors(
 ) -> tuple[ForcePrior, ...]:
     """A joint force prior, with what accelerations do not show left open where there are contacts.
 
+    Where the mean includes the motor torque, each contact with a surface also has a `SlidingFrictionPrior`:
+    without one the joints are blamed for its friction, and what is read in free motion is overconfident.
+
     Args:
         system: robot and contacts.
         mean: the model's prior mean, which decides what is left to the prior.
-        kernel: covariance of each joint force; by default `REMAINING` where the mean includes the motor
-            torque, `WHOLE` elsewhere.
+        kernel: covariance of each joint force, without a prior on the contact's friction; by default
+            `REMAINING` where the mean includes the motor torque, `WHOLE` elsewhere.
     """
-    joint = JointForcePrior(kernel or (REMAINING if "actuation" in mean_of(mean).terms else WHOLE))
-    return (joint, NormalForcePrior(joint)) if system.m else (joint,)
+    around = "actuation" in mean_of(mean).terms
+    joint = JointForcePrior(kernel or (REMAINING if around else WHOLE))
+    if not system.m:
+        return (joint,)
+    sliding = [SlidingFrictionPrior(name) for name in _surfaces(system)] if around and kernel is None else []
+    return (joint, NormalForcePrior(joint), *sliding)
 
 
 def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
@@ -47,8 +54,8 @@ def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
     Args:
         system: robot and contacts.
     """
-    surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
-    return (JointFrictionPrior(), *(SlidingFrictionPrior(name) for name in surfaces))
+    sliding = (SlidingFrictionPrior(name, coupled=True) for name in _surfaces(system))
+    return (JointFrictionPrior(), *sliding)
 
 
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
@@ -59,9 +66,14 @@ def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> t
         kernel: covariance of each Cartesian component of any tangential force; by default the force is
             friction that opposes sliding.
     """
-    surfaces = [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
+    names = _surfaces(system)
     if kernel is None:
-        priors = [SlidingFrictionPrior(name) for name in surfaces]
+        priors = [SlidingFrictionPrior(name) for name in names]
     else:
-        priors = [ContactForcePrior(name, kernel) for name in surfaces]
+        priors = [ContactForcePrior(name, kernel) for name in names]
     return tuple(priors) or (JointForcePrior(),)
+
+
+def _surfaces(system: ConstrainedSystem) -> list[str]:
+    """Names of the contacts with a surface."""
+    return [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]

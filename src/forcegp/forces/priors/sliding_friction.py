@@ -18,7 +18,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import check_inputs
-from forcegp.forces.priors.surface_force import SurfaceForcePrior
+from forcegp.forces.priors.surface_force import SurfaceForcePrior, sliding
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel
 from forcegp.gp.stationary import SquaredExponential
@@ -57,6 +57,8 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         friction_coefficient: μ̂.
         stribeck_speed: v_s [m/s].
         torsion_smoothing: rate of turning about the normal below which torsional friction is smooth [rad/s].
+        coupled: whether Coulomb friction −μ λ s(v) with a constant μ, which is learned together with its ε,
+            is part of the mechanics beside the functions in `terms` (`forces/coulomb.py`).
 
     Raises:
         UnknownNameError: an input or a kind of friction is not known.
@@ -74,6 +76,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
     friction_coefficient: float = 0.0
     stribeck_speed: float = 0.05
     torsion_smoothing: float = 0.1
+    coupled: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -99,9 +102,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return len(self.terms)
 
     def directions(self, system: ConstrainedSystem, at: States) -> Tensor:
-        n, J = self.normal(at)[..., None], at.eom.contact_points[self.contact].jacobian
-        J = J - n @ (n.mT @ J)
-        v = (J @ at.qd[..., None])[..., 0]
+        J, v = sliding(at, self.contact)
         square = v.square().sum(-1, keepdim=True)
         against = -(J.mT @ v[..., None])[..., 0]
         dry = against / (square + self.smoothing**2).sqrt()

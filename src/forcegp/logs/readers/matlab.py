@@ -1,16 +1,18 @@
-"""MATLAB files: version 5 by SciPy, version 7.3 as the HDF5 file that it is."""
+"""MATLAB files: versions 5 to 7, version 7.3 as the HDF5 file that it is, and version 4 by SciPy."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
-from forcegp.errors import DataError
 from forcegp.logs import bounds
 from forcegp.logs.readers import hdf5
+from forcegp.logs.readers.matlab5 import Variable, variables
 from forcegp.logs.table import LogTable, Progress, Wanted, arrays_to_streams, foreign
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -30,39 +32,36 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
         head = file.read(520)
     if head.startswith(HDF5_MAGIC) or head[512:520] == HDF5_MAGIC:
         return hdf5.read_matlab(path)
-    from scipy.io import loadmat, whosmat
-
     remarks: list[str] = []
     arrays: dict[str, NDArray[np.generic]] = {}
     with foreign(str(path), "a MATLAB file"):
-        listing = whosmat(path)
-        bounds.check_count(str(path), "arrays", len(listing), limits.COLUMNS)
-        claimed = sum(int(np.prod(shape, dtype=object)) for _, shape, _ in listing)
-        bounds.check_count(str(path), "numbers", claimed, limits.LOG_VALUES)
-        plain = [
-            name
-            for name, _, kind in listing
-            if kind not in ("function", "opaque", "object", "sparse", "cell")
-        ]
-        remarks += [f"{n!r} is of class {k} and was left out" for n, _, k in listing if n not in plain]
-        for name, value in loadmat(path, variable_names=plain, struct_as_record=True).items():
-            if not name.startswith("__"):
-                _collect(name, value, arrays, remarks, 0)
+        for variable in _version4(path) if 0 in head[:4] else variables(path.read_bytes(), str(path)):
+            _collect(variable, arrays, remarks)
+    bounds.check_count(str(path), "arrays", len(arrays), limits.COLUMNS)
     return LogTable(str(path), "matlab", arrays_to_streams(str(path), arrays, remarks), tuple(remarks))
 
 
-def _collect(
-    name: str, value: object, arrays: dict[str, NDArray[np.generic]], remarks: list[str], depth: int
-) -> None:
-    """Numeric arrays of a variable, going into structs of one element."""
-    if depth > limits.GROUP_DEPTH:
-        raise DataError(
-            f"{name[:80]}: structs are nested too deeply", expected=f"at most {limits.GROUP_DEPTH}"
-        )
-    if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
-        for field in value.dtype.names:
-            _collect(f"{name}.{field}", value.reshape(-1)[0][field], arrays, remarks, depth + 1)
+def _version4(path: Path) -> Iterator[Variable]:
+    """The variables of a file of version 4, which has no structs."""
+    from scipy.io import loadmat, whosmat
+
+    listing = whosmat(path)
+    bounds.check_count(str(path), "arrays", len(listing), limits.COLUMNS)
+    claimed = sum(math.prod(shape) for _, shape, _ in listing)
+    bounds.check_count(str(path), "numbers", claimed, min(limits.LOG_VALUES, path.stat().st_size))
+    for name, value in loadmat(path).items():
+        if not name.startswith("__"):
+            yield Variable(name, value if isinstance(value, np.ndarray) else "is sparse")
+
+
+def _collect(variable: Variable, arrays: dict[str, NDArray[np.generic]], remarks: list[str]) -> None:
+    """Numeric arrays of a variable, going into structs."""
+    name, value = variable
+    if isinstance(value, tuple):
+        for field in value:
+            _collect(Variable(f"{name}.{field.name}", field.value), arrays, remarks)
     elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         arrays[name] = value
     else:
-        remarks.append(f"{name!r} holds no numbers and was left out")
+        reason = value if isinstance(value, str) else "holds no numbers"
+        remarks.append(f"{name!r} {reason} and was left out")

@@ -1,0 +1,32 @@
+"""Docstrings are plain text with code in single backticks; this makes them valid reStructuredText."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from sphinx.application import Sphinx
+
+CODE = re.compile(r"(`[^`]+`)")
+SEVERAL = re.compile(r"^(\s+)(\w+(?:, \w+)+): ")
+MARKUP = re.compile(r"(?<!\\)([*|]|(?<=\w)_(?!\w))")
+
+
+def escaped(line: str) -> str:
+    """Absolute values, products and trailing underscores are mathematics, not markup."""
+    if line.lstrip().startswith((">>>", "...")):
+        return line
+    # One entry may describe several attributes; Napoleon takes a name with a space for a type and a name.
+    line = SEVERAL.sub(lambda found: f"{found[1]}{found[2].replace(', ', ',')}: ", line)
+    parts = CODE.split(line)
+    return "".join(f"`{part}`" if CODE.fullmatch(part) else MARKUP.sub(r"\\\1", part) for part in parts)
+
+
+def _process(_: Sphinx, what: str, name: str, obj: object, options: Any, lines: list[str]) -> None:
+    lines[:] = [escaped(line) for line in lines]
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Run before Napoleon."""
+    app.connect("autodoc-process-docstring", _process, priority=100)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

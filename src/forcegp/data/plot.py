@@ -1,0 +1,78 @@
+"""Plots of a data set: all joints at a glance, or one quantity by joint or by contact."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+from torch import Tensor
+
+from forcegp.data.fields import AXES, JOINT_VECTORS, Fields
+from forcegp.errors import UnknownNameError
+from forcegp.plots.panels import Curve, Panel, Target, chosen, draw_panels
+from forcegp.plots.style import CYCLE, MEASURED, axis_label
+from forcegp.plots.timeline import Timeline
+
+
+def plot(
+    data: Fields, quantity: str | None = None, joints: Sequence[str] | None = None, ax: Target = None
+) -> list[Axes]:
+    """Draw a data set; `Dataset.plot` documents the arguments."""
+    if quantity is None:
+        panels = _overview(data, chosen(joints, data.joint_names, "joint of the data set"))
+    elif quantity in data.contact_extras:
+        panels = _by_contact(data, quantity)
+    elif quantity in (*JOINT_VECTORS, *data.extras):
+        panels = _by_joint(data, quantity, chosen(joints, data.joint_names, "joint of the data set"))
+    else:
+        known = (*JOINT_VECTORS, *data.extras, *data.contact_extras)
+        raise UnknownNameError("quantity of the data set", quantity, known)
+    time = Timeline.of(data.t, data.segment, data.header.ordered)
+    return draw_panels(panels, time, tuple(data.contact.values()), ax)
+
+
+def values_of(data: Fields, quantity: str) -> Tensor:
+    """A joint vector `(n, nq)`."""
+    return getattr(data, quantity)
+
+
+def _overview(data: Fields, joints: list[int]) -> list[Panel]:
+    panels = []
+    for name in JOINT_VECTORS:
+        values = values_of(data, name)
+        curves = [Curve(values[:, j], data.joint_names[j], CYCLE[j % len(CYCLE)], width=0.8) for j in joints]
+        panels.append(Panel("", _named(name), curves))
+    multipliers = data.contact_extras.get("multiplier", {})
+    if multipliers:
+        curves = [Curve(x, name, CYCLE[i % len(CYCLE)]) for i, (name, x) in enumerate(multipliers.items())]
+        panels.append(Panel("", _named("multiplier"), curves))
+    return panels
+
+
+def _by_joint(data: Fields, quantity: str, joints: list[int]) -> list[Panel]:
+    values, label = values_of(data, quantity), _named(quantity)
+    return [
+        Panel(data.joint_names[j], label, [Curve(values[:, j], "logged", MEASURED, width=0.8)])
+        for j in joints
+    ]
+
+
+def _by_contact(data: Fields, quantity: str) -> list[Panel]:
+    panels = []
+    for contact, values in data.contact_extras[quantity].items():
+        parts = [values] if values.ndim == 1 else values.unbind(-1)
+        names = ["logged"] if values.ndim == 1 else AXES
+        curves = [Curve(x, name, CYCLE[i]) for i, (x, name) in enumerate(zip(parts, names, strict=True))]
+        panels.append(Panel(contact, _named(quantity), curves))
+    return panels
+
+
+ALIASES = {"Q": "total_force", "Q_z": "contact_friction", "Q_I": "constraint_force", "F_I": "contact_force"}
+"""Quantities that logged columns name by their symbol."""
+
+
+def _named(column: str) -> str:
+    """Symbol and unit of a logged column."""
+    base = column.removesuffix("_clean").removesuffix("_std").removesuffix("_logged")
+    quantity = ALIASES.get(base, "contact_force" if base == "F_z" else base)
+    return axis_label(quantity, (), None if column == quantity else column)

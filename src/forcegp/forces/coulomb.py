@@ -1,0 +1,162 @@
+"""Coulomb friction of contacts that is proportional to the multiplier, coupled with it exactly.
+
+Let Q_z = Q_z′ + U λ, where a contact with friction coefficient μ has the column μ u, u = −J_Eᵀ s(v), and let
+λ₀ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z′) be the multiplier without this friction. Then λ = λ₀ − LᵀU λ has the
+solution λ = (I + LᵀU)⁻¹ λ₀. So at a given μ every quantity remains an affine map of the forces: its operators
+and offset B_Q, B_z, o become
+
+    B_Q − G Lᵀ,  B_z − G Lᵀ,  o + G (A M⁻¹ Aᵀ)⁺ b   with   G = B_z U (I + LᵀU)⁻¹.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.measurements import Measurement
+from forcegp.forces.priors.base import COULOMB, ForcePrior
+from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
+from forcegp.forces.priors.surface_force import sliding
+from forcegp.forces.quantities import AffineMap, States
+
+SHARP = 1e-6
+"""A smoothing speed so small that all friction has its full size [m/s]."""
+
+
+FRICTION_COEFFICIENT = 0.2
+"""Where learning a friction coefficient begins."""
+NEARLY_JAMMED = 0.95
+"""Largest friction coefficient that is considered, relative to the one at which the contact jams."""
+
+
+@dataclass(frozen=True, eq=False)
+class CoulombFriction:
+    """Friction −μ λ s(v) of a contact with a surface, s(v) = v / √(|v|² + ε²).
+
+    Attributes:
+        contact: name of the contact.
+        coefficient: μ, a scalar.
+        smoothing: ε, a scalar [m/s].
+    """
+
+    contact: str
+    coefficient: Tensor
+    smoothing: Tensor
+
+
+def coulomb_keys(contact: str) -> tuple[str, str]:
+    """Names of the learned friction coefficient and smoothing speed of a contact."""
+    return f"{COULOMB}.{contact}.log_coefficient", f"{COULOMB}.{contact}.log_smoothing"
+
+
+def initial_coulomb(priors: Iterable[ForcePrior], like: Tensor) -> dict[str, Tensor]:
+    """Where learning friction begins, for contacts whose prior is coupled with the multiplier."""
+    start = {}
+    for prior in _coupled_priors(priors):
+        coefficient, smoothing = coulomb_keys(prior.contact)
+        start[coefficient] = like.new_tensor(math.log(FRICTION_COEFFICIENT))
+        start[smoothing] = like.new_tensor(math.log(prior.smoothing))
+    return start
+
+
+def coulomb_of(
+    priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor], like: Tensor
+) -> tuple[CoulombFriction, ...]:
+    """Friction at learned tensors, or where its learning begins if it is not among them."""
+    values = initial_coulomb(priors, like) | dict(tensors)
+    return tuple(
+        CoulombFriction(prior.contact, *(values[key].exp() for key in coulomb_keys(prior.contact)))
+        for prior in _coupled_priors(priors)
+    )
+
+
+def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
+    return [p for p in priors if isinstance(p, SlidingFrictionPrior) and p.coupled]
+
+
+def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tensor:
+    """u = −J_Eᵀ s(v), the generalized force of a unit friction force, `(n, nq)`."""
+    J, v = sliding(at, contact)
+    return -(J.mT @ (v / (v.square().sum(-1, keepdim=True) + smoothing**2).sqrt())[..., None])[..., 0]
+
+
+def coupled(
+    system: ConstrainedSystem, at: States, z: AffineMap, friction: Sequence[CoulombFriction]
+) -> AffineMap:
+    """The affine map of a quantity where contacts have Coulomb friction.
+
+    Args:
+        system: robot and contacts; friction of contacts that it does not have is left out.
+        at: n states.
+        z: the quantity without this friction.
+        friction: of each contact that has one.
+    """
+    gain = _gain(system, at, friction)
+    if gain is None:
+        return z
+    G = z.B_z @ gain
+    back = G @ at.eom.L.mT
+    offset = (G @ (at.eom.constraint_inertia @ at.eom.b[..., None]))[..., 0]
+    return AffineMap(z.B_Q - back, z.B_z - back, z.B_N - back, z.o + offset)
+
+
+def with_coulomb(
+    system: ConstrainedSystem, at: States, Q_bar: Tensor, friction: Sequence[CoulombFriction]
+) -> Tensor:
+    """All impressed forces Q̄ `(n, nq)`, Coulomb friction included, from those without it."""
+    gain = _gain(system, at, friction)
+    if gain is None:
+        return Q_bar
+    return Q_bar + (gain @ at.eom.multiplier(Q_bar)[..., None])[..., 0]
+
+
+@torch.no_grad()
+def below_jamming(
+    system: ConstrainedSystem,
+    measurements: Sequence[Measurement],
+    priors: Iterable[ForcePrior],
+    bounds: Mapping[str, tuple[float, float]],
+) -> dict[str, tuple[float, float]]:
+    """Bounds with which no contact jams, 1 + μ Lᵀu > 0, in a state in which it was seen to slide."""
+    changed = dict(bounds)
+    for prior in _coupled_priors(priors):
+        key, row = coulomb_keys(prior.contact)[0], _row(system, prior.contact)
+        if key in changed:
+            gains = [_drag(m.at(system), prior.contact, row) for m in measurements]
+            worst = float(torch.cat(gains).min())
+            low, high = changed[key]
+            if worst < 0.0:
+                changed[key] = low, max(low, min(high, math.log(-NEARLY_JAMMED / worst)))
+    return changed
+
+
+def _drag(at: States, contact: str, row: int) -> Tensor:
+    """Lᵀu of a contact `(n,)`: how much a unit friction force relieves it, negative where it presses."""
+    return (at.eom.L[..., row] * against_sliding(at, contact, SHARP)).sum(-1)
+
+
+def _row(system: ConstrainedSystem, contact: str) -> int:
+    """Row of a contact among the multipliers."""
+    return sum(c.rows for c in system.contacts[: system.contact_names.index(contact)])
+
+
+def _gain(system: ConstrainedSystem, at: States, friction: Sequence[CoulombFriction]) -> Tensor | None:
+    """U (I + LᵀU)⁻¹ `(n, nq, m)`, from the multiplier without friction to the friction; `None` for none."""
+    present = {f.contact: f for f in friction if f.contact in system.contact_names}
+    if not present:
+        return None
+    columns = []
+    for contact in system.contacts:
+        own = present.get(contact.name)
+        if own is None:
+            columns.append(at.q.new_zeros(*at.q.shape, contact.rows))
+        else:
+            columns.append((own.coefficient * against_sliding(at, contact.name, own.smoothing))[..., None])
+    U = torch.cat(columns, dim=-1)
+    eye = torch.eye(U.shape[-1], dtype=U.dtype, device=U.device)
+    return torch.linalg.solve(eye + at.eom.L.mT @ U, U, left=False)

@@ -1,0 +1,213 @@
+"""Fitting a structured Gaussian process to a log that is read piece by piece.
+
+A first pass takes a sample, from which input scales, hyperparameters and inducing points are chosen; a
+second one adds up the sums over all samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.data.stream import StreamedDataset, spaced_sample
+from forcegp.errors import ModelError
+from forcegp.forces.learn import Problem
+from forcegp.forces.measurements import Training, training_of
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.totals import Totals, basis_of, posterior_of, total_over
+from forcegp.gp.basis import LatentBasis
+from forcegp.gp.distributed import share_basis
+from forcegp.gp.kernels import sub
+from forcegp.gp.sparse_tensors import basis_of_tensors, tensors_of_basis
+from forcegp.gp.sums import Sums
+from forcegp.models.base import FitProgress
+from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED
+from forcegp.models.structured_spec import Specification
+from forcegp.storage.checkpoint import Checkpoint
+from forcegp.storage.sums import SumsCheckpoint, beside
+from forcegp.storage.system import pack_system
+
+SAMPLE_ROWS = 20_000
+"""Rows, evenly spaced over the log, that are learned from; fewer than twice as many are held."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Evenly spaced samples of a log.
+
+    Attributes:
+        log: the log.
+        data: the samples.
+        count: number of samples of the log that count.
+        moving: whether those at rest do not.
+    """
+
+    log: StreamedDataset
+    data: Dataset
+    count: int
+    moving: bool
+
+
+@torch.no_grad()
+def sample_of(spec: Specification, stream: StreamedDataset) -> Sample:
+    """What a model learns from: evenly spaced samples of the log, in motion where the model asks for that.
+
+    Raises:
+        DataError: a file is damaged, or holds no samples.
+        ModelError: exact inference is asked for on more samples than are read at once.
+    """
+    first = next(stream.pieces(), None)
+    if first is not None and spec.for_data(first).learns_torque_noise:
+        data, count = spaced_sample(stream.pieces(), SAMPLE_ROWS, moving_rows)
+        if count >= FEWEST_MOVING:
+            return Sample(stream, data, count, moving=True)
+    data, count = spaced_sample(stream.pieces(), SAMPLE_ROWS)
+    if spec.inference == "exact" and count > len(data):
+        raise ModelError(
+            f"exact inference on a log of {count:,} samples that is read piece by piece",
+            expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",
+            hint='use inference="sparse"',
+        )
+    return Sample(stream, data, count, moving=False)
+
+
+def moving_rows(data: Dataset) -> Tensor:
+    """Rows in which a joint moves."""
+    return (data.qd.abs().amax(-1) > REST_SPEED).nonzero()[:, 0]
+
+
+@dataclass(frozen=True)
+class Pass:
+    """A pass over a streamed log, in one or several processes, that can be resumed.
+
+    Attributes:
+        spec: the model.
+        sample: the log, and what the model learned from.
+        checkpoint: file that records the sums, or `None`.
+        progress: called with the samples so far, the number of all, and NaN.
+        distributed: whether the processes of `torch.distributed` share the pieces.
+    """
+
+    spec: Specification
+    sample: Sample
+    checkpoint: Path | None = None
+    progress: FitProgress | None = None
+    distributed: bool = False
+
+    @torch.no_grad()
+    def forces(
+        self, problem: Problem, hyperparameters: Mapping[str, Tensor]
+    ) -> tuple[ForcePosterior, Tensor]:
+        """Forces conditioned on the whole log, and the part of the likelihood that they do not change.
+
+        Raises:
+            ModelError: the checkpoint belongs to another fit.
+            NumericalError: the sums are not finite.
+        """
+        basis, begin = basis_of(problem, hyperparameters), None
+        saved = (
+            None
+            if self.checkpoint is None
+            else SumsCheckpoint(self._own_file(), self._key(problem, hyperparameters))
+        )
+        kept = {} if saved is None else saved.read()
+        if kept:
+            basis, begin = _restored(problem, basis, kept)
+        elif self.distributed:
+            basis = share_basis(basis)
+        processes = dist.get_world_size() if self.distributed else 1
+
+        def after(total: Totals) -> None:
+            if saved is not None:
+                saved.write_now_and_then(_tensors(basis, total))
+            if self.progress is not None:
+                done = processes * int(total.samples)
+                self.progress(done, self.sample.count, math.nan)
+
+        pieces = self._pieces(problem, 0 if begin is None else begin.pieces)
+        total = total_over(problem, hyperparameters, basis, pieces, begin, after)
+        if self.distributed:
+            total = total.over_processes()
+        return posterior_of(problem, hyperparameters, basis, total), total.constant
+
+    def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
+        """The samples of this process, a piece at a time; a piece of another process has none."""
+        rank, processes = (dist.get_rank(), dist.get_world_size()) if self.distributed else (0, 1)
+        scales = zip(problem.priors, problem.training.scales, strict=True)
+        kept = {prior.name: scale for prior, scale in scales}
+        for number, piece in enumerate(self.sample.log.pieces(start), start):
+            if number % processes != rank:
+                piece = piece[:0]
+            elif self.sample.moving:
+                piece = piece[moving_rows(piece)]
+            if len(piece) == 0:
+                yield problem.training.of_rows([torch.arange(0)] * len(problem.training.measurements))
+            else:
+                yield training_of(piece, self.spec.system, problem.priors, self.spec.noise_std, kept)
+
+    def _own_file(self) -> Path:
+        assert self.checkpoint is not None
+        path = beside(self.checkpoint)
+        return path.with_name(f"{path.name}.{dist.get_rank()}") if self.distributed else path
+
+    def remove(self) -> None:
+        """Remove the checkpoint; call it once the model is saved."""
+        if self.checkpoint is not None:
+            self._own_file().unlink(missing_ok=True)
+
+    def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
+        """Identifies the sums over a log, with a basis, a system and a noise."""
+        training = problem.training
+        files = [(path.name, path.stat().st_size) for path in self.sample.log.paths]
+        record, robot = pack_system(problem.system)
+        data = [value for m in training.measurements for value in m.tensors]
+        points = [x for Z in problem.inducing or () for x in Z.values()]
+        named = [part for pair in sorted(hyperparameters.items()) for part in pair]
+        return Checkpoint.key_of(
+            problem.mean, [(type(prior).__name__, prior) for prior in problem.priors], problem.power, files,
+            self.sample.log.differentiate, training.part_of, *data, *training.noise_std, *points, *named,
+            record, *robot.values(),
+        )  # fmt: skip
+
+
+def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
+    """What a pass has computed so far, by name."""
+    tensors = {f"basis.{name}": value for name, value in tensors_of_basis(basis).items()}
+    for name, sums in (("sums", total.sums), ("central", total.central)):
+        if sums is not None:
+            tensors |= {f"{name}.{i}": value for i, value in enumerate(sums.tensors)}
+    counts = {"constant": total.constant, "samples": total.samples, "pieces": torch.tensor(total.pieces)}
+    return tensors | counts
+
+
+def _restored(
+    problem: Problem, basis: LatentBasis, tensors: Mapping[str, Tensor]
+) -> tuple[LatentBasis, Totals]:
+    """The basis and totals that `_tensors` was given.
+
+    Raises:
+        ModelError: they do not fit the problem.
+    """
+    expected = _tensors(basis, Totals.zero(problem, basis))
+    if {k: x.shape for k, x in tensors.items()} != {k: x.shape for k, x in expected.items()}:
+        raise ModelError("the checkpoint's sums do not fit the model", hint="remove it to start anew")
+    own = basis_of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
+    found = {
+        name: Sums(*(tensors[f"{name}.{i}"] for i in range(len(fields(Sums)))))
+        for name in ("sums", "central")
+        if f"{name}.0" in tensors
+    }
+    return own, Totals(
+        found["sums"],
+        found.get("central"),
+        tensors["constant"],
+        tensors["samples"],
+        int(tensors["pieces"]),
+    )

@@ -1,0 +1,1 @@
+"""Plots over time: what `plot` of data sets, predictions, models and rollouts draws with matplotlib."""

@@ -1,0 +1,175 @@
+"""Coulomb friction that is coupled with the multiplier, against dense solves of the coupled equations."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import forcegp
+from forcegp.forces.coulomb import CoulombFriction, below_jamming, coulomb_keys, coupled, with_coulomb
+from forcegp.forces.learn import kernel_parameters
+from forcegp.forces.measurements import Measurement
+from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
+from forcegp.forces.quantities import States, affine_map, states
+from forces.cases import CONTACTS, draw, logged, mixed_contacts, two_contacts
+from random_data import table_system
+
+N, MU, EPS = 8, (0.15, 0.1), 0.004
+DENSE = 1e-8
+"""Agreement of two solves of the same equations in double precision, relative to forces of 100 N m."""
+GRADIENT = 1e-5
+"""Of central differences with steps of 1e-5 on values of order 100."""
+
+
+def friction() -> list[CoulombFriction]:
+    return [
+        CoulombFriction(name, *torch.tensor([mu, EPS], dtype=torch.float64))
+        for name, mu in zip(CONTACTS, MU, strict=True)
+    ]
+
+
+def at_states() -> States:
+    return states(two_contacts(), *draw(N), mixed_contacts(N))
+
+
+def unit_friction(at: States, i: int, contact: str) -> np.ndarray:
+    """u = −Jᵀ v/√(|v|² + ε²) of a sample with the tangential velocity v."""
+    point = at.eom.contact_points[contact]
+    n = point.normal[i].numpy() / np.linalg.norm(point.normal[i].numpy())
+    v = (np.eye(3) - np.outer(n, n)) @ point.jacobian[i].numpy() @ at.qd[i].numpy()
+    return -point.jacobian[i].numpy().T @ v / np.sqrt(v @ v + EPS**2)
+
+
+def dense(at: States, Q: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """q̈, λ and Q_z = Σ μ u λ of a sample from M q̈ − Σ (a + μ u) λ = Q, A q̈ = b over the closed contacts."""
+    closed = [k for k in range(2) if bool(at.active[i, k])]
+    A, M = at.eom.A[i].numpy()[closed], at.eom.M[i].numpy()
+    U = np.array([MU[k] * unit_friction(at, i, CONTACTS[k]) for k in closed]).reshape(-1, 7).T
+    K = np.block([[M, -(A.T + U)], [A, np.zeros((len(closed), len(closed)))]])
+    x = np.linalg.solve(K, np.concatenate([Q, at.eom.b[i].numpy()[closed]]))
+    multiplier = np.zeros(2)
+    multiplier[closed] = x[7:]
+    return x[:7], multiplier, U @ x[7:]
+
+
+@pytest.mark.parametrize("quantity", ["qdd", "multiplier", "contact_friction", "total_force", "joint_force"])
+def test_every_quantity_solves_the_coupled_equations(quantity: str) -> None:
+    at, system = at_states(), two_contacts()
+    z = coupled(system, at, affine_map(system, at, quantity), friction())
+    Q, own = 30.0 * torch.stack(draw(N, seed=3)[:2])
+    found = z.o + (z.B_Q @ Q[..., None])[..., 0] + (z.B_z @ own[..., None])[..., 0]
+    for i in range(N):
+        qdd, multiplier, Q_z = dense(at, (Q + own)[i].numpy(), i)
+        expected = {
+            "qdd": qdd,
+            "multiplier": multiplier,
+            "contact_friction": own[i].numpy() + Q_z,
+            "total_force": (Q + own)[i].numpy() + Q_z,
+            "joint_force": Q[i].numpy(),
+        }[quantity]
+        np.testing.assert_allclose(found[i].numpy(), expected, rtol=DENSE, atol=DENSE * 100.0)
+    whole = with_coulomb(system, at, Q + own, friction())
+    total = coupled(system, at, affine_map(system, at, "total_force"), friction())
+    torch.testing.assert_close(whole, total.o + (total.B_Q @ (Q + own)[..., None])[..., 0])
+
+
+def test_a_contact_that_the_system_lacks_has_no_friction() -> None:
+    system = table_system()
+    at = states(system, *draw(N), torch.ones(N, 1, dtype=torch.bool))
+    z = affine_map(system, at, "qdd")
+    other = CoulombFriction("ball", *torch.tensor([0.3, EPS], dtype=torch.float64))
+    assert coupled(system, at, z, [other]) is z
+
+
+def pressed(mu: float, n: int, seed: int = 0) -> forcegp.Dataset:
+    """States in which a tip is pressed by 20 to 40 N on a table, under friction with the coefficient μ."""
+    system, generator = table_system(), torch.Generator().manual_seed(seed)
+    q, qd, tau = draw(n, seed)
+    closed = torch.ones(n, 1, dtype=torch.bool)
+    eom = system.equations(q, qd, closed)
+    wanted = 20.0 + 20.0 * torch.rand(n, 1, generator=generator, dtype=torch.float64)
+    tau = tau - (eom.A.mT @ (wanted - eom.multiplier(eom.Q_K + tau))[..., None])[..., 0]
+    at = states(system, q, qd, tau, closed)
+    law = [CoulombFriction("table", *torch.tensor([mu, EPS], dtype=torch.float64))]
+    Q_bar = with_coulomb(system, at, at.eom.Q_K + tau, law)
+    noise = 0.01 * torch.randn(n, 7, generator=generator, dtype=torch.float64)
+    return forcegp.Dataset(
+        t=torch.arange(n, dtype=torch.float64),
+        q=q,
+        qd=qd,
+        tau=tau,
+        qdd=at.eom.acceleration(Q_bar) + noise,
+        joint_names=system.robot.joint_names,
+        contact={"table": closed[:, 0]},
+        contact_extras={"multiplier": {"table": at.eom.multiplier(Q_bar)[:, 0]}},
+    )
+
+
+def test_the_coefficient_is_learned_and_the_multiplier_found(tmp_path: Path) -> None:
+    train, test = pressed(0.12, 30), pressed(0.12, 30, seed=7)
+    prior = SlidingFrictionPrior("table", coupled=True)
+    model = forcegp.StructuredGP(table_system(), "analytical", [prior], noise_std=0.01, torque_noise=None)
+    fit = model.fit(train)
+    mu, eps = (float(fit.hyperparameters[key].exp()) for key in coulomb_keys("table"))
+    assert mu == pytest.approx(0.12, rel=0.02) and 0.5 * EPS < eps < 2.0 * EPS
+    read = fit.predict(test.q, test.qd, test.tau, "multiplier")
+    assert float((read.mean[:, 0] - test.multiplier["table"]).abs().max()) < 0.5
+    fit.save(tmp_path / "model")
+    again = forcegp.load_model(tmp_path / "model").predict(test.q, test.qd, test.tau, "multiplier")
+    assert torch.equal(read.mean, again.mean) and torch.equal(read.variance, again.variance)
+
+
+def test_accelerations_follow_from_the_force_field() -> None:
+    fit = forcegp.StructuredGP(
+        two_contacts(), "analytical", [JointFrictionPrior(), SlidingFrictionPrior("table", coupled=True)], 0.1
+    ).fit(logged(two_contacts(), 12), learn=[])
+    at, closed = at_states(), mixed_contacts(N)
+    force = fit.force_field()(fit.system, at)
+    expected = fit.predict(at.q, at.qd, at.tau, active=closed).mean
+    torch.testing.assert_close(at.eom.acceleration(force), expected)
+
+
+def test_gradient_for_the_friction() -> None:
+    priors = [JointFrictionPrior(), SlidingFrictionPrior("table", coupled=True)]
+    model = forcegp.StructuredGP(two_contacts(), "analytical", priors, 0.1, torque_noise=0.3)
+    fit = model.fit(logged(two_contacts(), 8), learn=[])
+    problem = dataclasses.replace(fit.problem, inducing=None)
+    keys = coulomb_keys("table")
+
+    def objective(x: Tensor) -> Tensor:
+        values = {**fit.hyperparameters, keys[0]: x[0], keys[1]: x[1]}
+        return problem.negative_log_likelihood(kernel_parameters(values), problem.rows(values))
+
+    start = torch.tensor([0.1, 0.01], dtype=torch.float64).log()
+    leaf = start.clone().requires_grad_()
+    (found,) = torch.autograd.grad(objective(leaf), [leaf])
+    for j in range(2):
+        step = torch.zeros(2, dtype=torch.float64)
+        step[j] = 1e-5
+        difference = (objective(start + step) - objective(start - step)) / 2e-5
+        assert float(found[j]) == pytest.approx(float(difference), rel=GRADIENT, abs=GRADIENT)
+
+
+def test_no_contact_jams_where_it_was_seen_to_slide() -> None:
+    system, data = table_system(), pressed(0.1, 20)
+    m = Measurement("qdd", data.q, data.qd, data.tau, data.active(("table",)), data.qdd)
+    key = coulomb_keys("table")[0]
+    bounds = below_jamming(system, [m], [SlidingFrictionPrior("table", coupled=True)], {key: (-7.0, 9.0)})
+    largest = float(np.exp(bounds[key][1]))
+    at = m.at(system)
+    u = np.stack([unit_friction_of_table(at, i) for i in range(20)])
+    gains = 1.0 + largest * np.einsum("ij,ij->i", at.eom.L[..., 0].numpy(), u)
+    assert gains.min() == pytest.approx(0.05, abs=1e-3)
+
+
+def unit_friction_of_table(at: States, i: int) -> np.ndarray:
+    """The generalized force of a unit force against the sliding."""
+    J = at.eom.contact_points["table"].jacobian[i].numpy() * np.array([[1.0], [1.0], [0.0]])
+    v = J @ at.qd[i].numpy()
+    return -J.T @ v / np.linalg.norm(v)

@@ -1,0 +1,146 @@
+"""A fit to a log that is read piece by piece is the fit to the log in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+import torch.multiprocessing
+from safetensors.torch import load_file
+
+import forcegp
+from forcegp import LearningOptions, StreamedDataset
+from forcegp.data import stream
+from forcegp.errors import ModelError
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.gp.sparse import SparsePosterior
+from forcegp.models import structured_stream
+from forcegp.storage import sums
+from forces.cases import draw, logged, mixed_contacts, two_contacts
+from models.stream_worker import PIECE, model, run
+
+SAME = 1e-8
+"""Of sums in another order, through a factorisation of some dozens of basis functions."""
+ADDED = 1e-9
+"""Relative: the same sums in another order."""
+SHORT = LearningOptions(max_evaluations=3)
+data = logged(two_contacts(), 100)
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StreamedDataset:
+    monkeypatch.setattr(stream, "PIECE_ROWS", PIECE)
+    monkeypatch.setattr(sums, "INTERVAL", 0.0)
+    data[:70].write(tmp_path / "a.parquet")
+    data[70:].write(tmp_path / "b.parquet")
+    return StreamedDataset((tmp_path / "a.parquet", tmp_path / "b.parquet"))
+
+
+def assert_same(one: forcegp.StructuredGP, other: forcegp.StructuredGP, tolerance: float) -> None:
+    q, qd, tau = draw(5, seed=3)
+    for quantity in ("qdd", "multiplier"):
+        a, b = (m.predict(q, qd, tau, quantity, active=mixed_contacts(5)) for m in (one, other))
+        torch.testing.assert_close(a.mean, b.mean, rtol=tolerance, atol=tolerance)
+        torch.testing.assert_close(a.covariance, b.covariance, rtol=tolerance, atol=tolerance)
+    assert one.log_marginal_likelihood() == pytest.approx(other.log_marginal_likelihood(), rel=SAME)
+
+
+def test_as_in_memory(files: StreamedDataset) -> None:
+    streamed, whole = model(), model()
+    fit = streamed.fit(files, options=SHORT)
+    whole.fit(data, options=SHORT)
+    assert_same(streamed, whole, SAME)
+    assert (fit.result.samples, fit.result.inference) == (100, "sparse")
+
+
+def test_inducing_points(files: StreamedDataset) -> None:
+    make = lambda: forcegp.StructuredGP(  # noqa: E731
+        two_contacts(), "analytical", noise_std=0.1, inference="sparse", inducing_points=12
+    )
+    streamed, whole = make(), make()
+    fit = streamed.fit(files, learn=[])
+    whole.fit(data, learn=[])
+    assert_same(streamed, whole, SAME)
+    assert fit.result.basis_functions == 12 * 7 and fit.result.more_points_would_help
+    assert any("more inducing points would help" in warning for warning in fit.result.warnings)
+
+
+def test_a_measured_robot(files: StreamedDataset) -> None:
+    """Samples in motion, torque noise, and forces that the robot contains."""
+    make = lambda: forcegp.StructuredGP(  # noqa: E731
+        two_contacts(), "analytical", [JointFrictionPrior(), InertialPrior()], noise_std=0.1
+    )
+    streamed, whole = make(), make()
+    streamed.fit(files, options=SHORT)
+    whole.fit(data, options=SHORT)
+    assert streamed.posterior.central is not None
+    assert_same(streamed, whole, 1e-6)  # The updated robot comes from an optimiser of its own.
+
+
+def test_a_part_of_a_long_log_is_learned_from(
+    files: StreamedDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(structured_stream, "SAMPLE_ROWS", 20)
+    fit = model().fit(files, learn=[])
+    assert fit.training.samples == 25 and fit.result.samples == 100
+    assert isinstance(fit.posterior.latent, SparsePosterior)
+    assert float(fit.posterior.latent.moments.rows) > 400
+
+
+class Interrupted(Exception):
+    """Stands for the end of the process."""
+
+
+@pytest.mark.parametrize("after", [1, 3, 7])
+def test_a_fit_goes_on_where_it_stopped(files: StreamedDataset, tmp_path: Path, after: int) -> None:
+    reference = model()
+    reference.fit(files, options=SHORT)
+    seen: list[int] = []
+
+    def stop(done: int, most: int, value: float) -> None:
+        if value != value:
+            seen.append(done)
+            if len(seen) == after:
+                raise Interrupted
+
+    file = tmp_path / "checkpoint"
+    with pytest.raises(Interrupted):
+        model().fit(files, options=SHORT, checkpoint=file, progress=stop)
+    assert sums.beside(file).is_file()
+    again = model()
+    again.fit(files, options=SHORT, checkpoint=file, progress=stop)
+    assert seen == [16, 32, 48, 64, 70, 86, 100]
+    assert not file.exists() and not sums.beside(file).exists()
+    assert_same(again, reference, 0.0)
+
+
+def test_a_checkpoint_of_another_log(files: StreamedDataset, tmp_path: Path) -> None:
+    file = tmp_path / "checkpoint"
+    model().fit(files, learn=[], checkpoint=file, keep_checkpoint=True)
+    data[5:].write(files.paths[1])
+    with pytest.raises(ModelError, match="belongs to another fit"):
+        model().fit(StreamedDataset(files.paths), learn=[], checkpoint=file)
+    sums.beside(file).write_bytes(b"cut off")
+    with pytest.raises(ModelError, match="damaged"):
+        model().fit(files, learn=[], checkpoint=file)
+
+
+def test_exact_inference_needs_the_whole_log(files: StreamedDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert model("exact").fit(files, learn=[]).result.inference == "exact"
+    monkeypatch.setattr(structured_stream, "SAMPLE_ROWS", 20)
+    with pytest.raises(ModelError, match=r"exact inference on a log of 100 samples[\s\S]*sparse"):
+        model("exact").fit(files, learn=[])
+
+
+def test_two_processes_equal_one(tmp_path: Path) -> None:
+    data.write(tmp_path / "log.parquet")
+    torch.multiprocessing.spawn(run, args=(2, str(tmp_path)), nprocs=2)
+    one = model()
+    fit = one.fit(data, learn=[])
+    for rank in range(2):
+        got = load_file(tmp_path / f"{rank}.safetensors")
+        want = fit.posterior.latent.weights  # type: ignore[attr-defined]
+        assert float((got["weights"] - want).abs().max()) < ADDED * float(want.abs().max())
+        assert float(got["likelihood"]) == pytest.approx(fit.log_marginal_likelihood, rel=ADDED)
