@@ -19,7 +19,7 @@ from forcegp import kinematics
 from forcegp.checks import Report, check
 from forcegp.checks import read_log as read_checked
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
-from forcegp.data import Dataset, split_by_stretches
+from forcegp.data import Dataset, split_by_stretches, without_impacts
 from forcegp.errors import DataError
 from forcegp.evaluation import evaluate
 from forcegp.files import write_json, write_text
@@ -125,7 +125,11 @@ def surface_error(log: Dataset, system: ConstrainedSystem) -> dict[str, float]:
 
 
 def selected(log: Dataset, truth: Dataset, system: ConstrainedSystem) -> tuple[Dataset, Dataset]:
-    """Training points of the log, and the held-out stretches with the simulator's normal force."""
+    """Training points of the log, and the held-out stretches with the simulator's normal force.
+
+    Rows at impacts are left out, as by `forcegp select`: no smooth acceleration describes them.
+    """
+    log = without_impacts(log)
     split = split_by_stretches(log, POINTS)
     name, rows = system.contact_names[0], rows_of(log, truth)
     force = {name: truth.contact_extras["multiplier"][name][rows]}
