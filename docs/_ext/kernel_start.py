@@ -1,7 +1,7 @@
 """Run at the start of each page's kernel: `%%bash` cells whose output comes in one piece, without colours.
 
-The magic of IPython passes output on in pieces of 100 bytes, which end up on lines of their own, and its kernel
-asks programs for colours and progress bars.
+The magic of IPython passes output on in pieces of 100 bytes, which end up on lines of their own, and its
+kernel asks programs for colours and progress bars.
 """
 
 import os
