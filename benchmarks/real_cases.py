@@ -26,6 +26,8 @@ class Case:
     system: forcegp.ConstrainedSystem
     train: forcegp.Dataset
     tests: dict[str, forcegp.Dataset]
+    rollouts: bool = False
+    """Whether the first test is predicted in open loop too."""
 
 
 def existing(path: Path) -> Path:
@@ -71,7 +73,8 @@ def double_pendulum(logs: Path) -> list[Case]:
             forcegp.read_log(path, known, "double_pendulum_csv") for path in sorted(folder.glob("*.csv"))
         ]
         train = forcegp.Dataset.concatenate(recordings[:3])
-        cases.append(Case(name, forcegp.ConstrainedSystem(known), train, {"fourth file": recordings[3]}))
+        tests = {"fourth file": recordings[3]}
+        cases.append(Case(name, forcegp.ConstrainedSystem(known), train, tests, rollouts=True))
     return cases
 
 

@@ -24,6 +24,7 @@ import torch
 from real_cases import CASES, Case, evenly, moving
 from real_models import LEAST_SQUARES, Predicted, Predictor, models
 from real_plots import draw_errors
+from real_rollouts import run_rollouts
 from results_page import table, write_section
 
 import forcegp
@@ -36,6 +37,7 @@ COLUMNS = [
     "torque RMSE by joint [N m]",
     "geometric mean / least squares",
     "/ least squares in motion",
+    "/ least squares, one mass matrix for all",
     "squared acceleration error by joint / least squares",
     "±2σ coverage of torque by joint",
     "response to torque by joint",
@@ -45,13 +47,15 @@ RESPONSE_SAMPLES = 500
 
 
 @torch.no_grad()
-def scores(predicted: Predicted, data: forcegp.Dataset) -> dict:
-    """Errors and coverage by joint."""
+def scores(predicted: Predicted, data: forcegp.Dataset, robot: forcegp.RobotModel) -> dict:
+    """Errors and coverage by joint; the mass matrix of `robot`, that of the file, serves all models alike."""
     error = predicted.mean - data.qdd
+    alike = (dynamics.mass_matrix(robot, data.q) @ error[..., None])[..., 0]
     M = dynamics.mass_matrix(predicted.system.robot, data.q)
     torque = (M @ error[..., None])[..., 0]
     found = {
         "torque_rmse": torque.square().mean(0).sqrt().tolist(),
+        "torque_rmse_one_mass_matrix": alike.square().mean(0).sqrt().tolist(),
         "acceleration_mse": error.square().mean(0).tolist(),
     }
     if predicted.covariance is not None:
@@ -87,10 +91,13 @@ def add_ratios(by_model: dict[str, dict]) -> None:
         for found in by_model.values():
             ratio = {
                 key: (torch.tensor(found[key]) / torch.tensor(reference[key])).tolist()
-                for key in ("torque_rmse", "acceleration_mse")
+                for key in ("torque_rmse", "torque_rmse_one_mass_matrix", "acceleration_mse")
             }
-            mean = float(torch.tensor(ratio["torque_rmse"]).log().mean().exp())
-            found[f"ratio_to_{baseline}"] = ratio | {"torque_geometric_mean": mean}
+            means = {
+                f"{key}_geometric_mean": float(torch.tensor(ratio[key]).log().mean().exp())
+                for key in ("torque_rmse", "torque_rmse_one_mass_matrix")
+            }
+            found[f"ratio_to_{baseline}"] = ratio | means
 
 
 def run_case(case: Case) -> dict:
@@ -106,12 +113,14 @@ def run_case(case: Case) -> dict:
         fitted = fit()
         result["fits"][name] = {"seconds": fitted.seconds, **fitted.notes}
         for test, data in tests.items():
-            found = scores(fitted.predict(data), data)
+            found = scores(fitted.predict(data), data, case.system.robot)
             found["torque_response"] = torque_response(fitted.predict, data)
             result["tests"][test][name] = found
         print(f"{case.name}: {name}, fitted in {fitted.seconds:.1f} s", flush=True)
     for by_model in result["tests"].values():
         add_ratios(by_model)
+    if case.rollouts:
+        result["rollouts"] = run_rollouts(case)
     return result
 
 
@@ -133,8 +142,9 @@ def markdown(result: dict) -> str:
                 [
                     name,
                     numbers(row["torque_rmse"]),
-                    f"{row[baseline]['torque_geometric_mean']:.2f}",
-                    f"{row[in_motion]['torque_geometric_mean']:.2f}",
+                    f"{row[baseline]['torque_rmse_geometric_mean']:.2f}",
+                    f"{row[in_motion]['torque_rmse_geometric_mean']:.2f}",
+                    f"{row[baseline]['torque_rmse_one_mass_matrix_geometric_mean']:.2f}",
                     " ".join(f"{value:.3g}" for value in row[baseline]["acceleration_mse"]),
                     numbers(row.get("torque_coverage")),
                     numbers(row["torque_response"], 1),
@@ -142,7 +152,19 @@ def markdown(result: dict) -> str:
                 for name, row in by_model.items()
             ]
             parts += [f"### {case}: {test}", table(COLUMNS, rows)]
+        if "rollouts" in found:
+            parts += [f"### {case}: open loop", rollouts(found["rollouts"])]
     return "\n\n".join(parts)
+
+
+def rollouts(found: dict) -> str:
+    """The table of open-loop trajectories."""
+    columns = ["model", *(f"joint angles after {h:g} s, RMSE [rad]" for h in found["horizons_s"])]
+    names = ("least squares", "structured GP, defaults")
+    rows = [[name, *(f"{error:.3f}" for error in found[name])] for name in names]
+    share = found["coverage_of_90_%_bands"]
+    text = f"{found['starts']} starts; the 90 % bands of {found['samples']} samples hold {share:.1%}."
+    return table(columns, rows) + "\n\n" + text
 
 
 def main() -> None:

@@ -58,9 +58,10 @@ def constant(case: Case) -> Fitted:
     return Fitted(lambda data: Predicted(mean.expand_as(data.qdd), None, case.system), 0.0)
 
 
-def structured(case: Case, with_inertia: bool) -> Fitted:
-    """The structured GP with its defaults, or with a prior on inertial parameters too."""
-    priors = [JointFrictionPrior(), InertialPrior()] if with_inertia else None
+def structured(case: Case, with_inertia: bool | None = None) -> Fitted:
+    """The structured GP with its defaults, which choose; or with a prior on inertial parameters; or not."""
+    priors = [JointFrictionPrior(), InertialPrior()] if with_inertia else [JointFrictionPrior()]
+    priors = None if with_inertia is None else priors
     fit = forcegp.StructuredGP(case.system, "analytical", force_priors=priors).fit(case.train)
 
     def predict(data: forcegp.Dataset) -> Predicted:
@@ -76,6 +77,7 @@ def structured(case: Case, with_inertia: bool) -> Fitted:
         "converged": result.converged,
         "evaluations": result.evaluations,
         "power": fit.problem.power,
+        "priors": [prior.name for prior in fit.problem.priors],
         "warnings": list(result.warnings),
     }
     return Fitted(predict, result.seconds, notes)
@@ -118,6 +120,7 @@ def models(case: Case) -> dict[str, Callable[[], Fitted]]:
         LEAST_SQUARES[1]: lambda: rigid(lambda: identify_rigid(case.system, moving(case.train))),
         "independent GP": lambda: independent_gp(case),
         "network": lambda: network(case),
-        "structured GP, defaults": lambda: structured(case, with_inertia=False),
-        "structured GP, inertial prior": lambda: structured(case, with_inertia=True),
+        "structured GP, defaults": lambda: structured(case),
+        "structured GP, friction": lambda: structured(case, with_inertia=False),
+        "structured GP, friction and inertia": lambda: structured(case, with_inertia=True),
     }

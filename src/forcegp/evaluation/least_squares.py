@@ -55,8 +55,11 @@ class LeastSquares:
 
     def _predict(self, data: Dataset) -> Tensor:
         eom = self.system.equations(data.q, data.qd, data.active(self.system.contact_names))
-        lost = (_friction_columns(self.system.robot, data.qd) @ self.friction[:, None])[..., 0]
-        return eom.acceleration(eom.Q_K + data.tau - lost)
+        return eom.acceleration(eom.Q_K + data.tau - self.losses(data.qd))
+
+    def losses(self, qd: Tensor) -> Tensor:
+        """Torque that the identified friction and offsets take away `(n, nq)`, at velocities `(n, nq)`."""
+        return (_friction_columns(self.system.robot, qd) @ self.friction[:, None])[..., 0]
 
 
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
