@@ -1,7 +1,7 @@
 """Run at the start of each page's kernel: `%%bash` cells whose output comes in one piece, without colours.
 
-The magic of IPython passes output on in pieces of 100 bytes, which end up on lines of their own, and its kernel
-asks programs for colours and progress bars.
+The magic of IPython passes output on in pieces of 100 bytes, which end up on lines of their own, and its
+kernel asks programs for colours and progress bars.
 """
 
 import os
@@ -9,7 +9,7 @@ import subprocess
 
 from IPython import get_ipython
 
-PLAIN = {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "96"}
+PLAIN = {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "84"}
 NOISE = "pybullet build time"
 
 
