@@ -12,7 +12,8 @@ from forcegp.cli.common import AsJson, progress_bar, show
 
 def reproduce(
     profile: Annotated[
-        Literal["quick", "paper"], typer.Option(help="A few minutes, or the paper's sizes.")
+        Literal["quick", "paper", "large"],
+        typer.Option(help="A few minutes, the paper's sizes, or all samples of a ten-minute log."),
     ] = "quick",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the page and its data.")] = Path("out"),
     seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
@@ -29,6 +30,8 @@ def reproduce(
     forcegp reproduce
 
     forcegp reproduce --profile paper --out out/paper --seed 1
+
+    forcegp reproduce --profile large --out out/large
     """
     from forcegp.paper.parallel import MOST_PROCESSES, available_processors
     from forcegp.paper.reproduce import run

@@ -50,8 +50,9 @@ def select(
     from forcegp.data import split_by_selection, split_by_stretches
     from forcegp.destination import write_or_keep
 
-    for path in (out, *([] if rest is None else [rest])):
-        check_data_destination(path)
+    check_data_destination(out, log)
+    if rest is not None:
+        check_data_destination(rest, log, out)
     data = read_data(log, differentiate)
     with progress_bar("selecting points", count) as progress:
         if split == "selection":

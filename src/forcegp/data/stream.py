@@ -80,6 +80,11 @@ class StreamedDataset:
         """Number of samples."""
         return sum(rows for rows, _ in self._shapes)
 
+    @property
+    def piece_count(self) -> int:
+        """Number of pieces."""
+        return sum(-(-rows // PIECE_ROWS) for rows, _ in self._shapes)
+
     @cached_property
     def header(self) -> DataHeader:
         """What the headers of all files agree on."""

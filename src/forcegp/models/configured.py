@@ -34,7 +34,16 @@ KEYS: dict[str, tuple[str, ...]] = {
     AnalyticalModel.kind: ("analytical", "window"),
     NeuralNetwork.kind: ("hidden",),
     IndependentGP.kind: (),
-    StructuredGP.kind: ("mean", "priors", "learn_noise", "torque_noise", "inference", "analytical"),
+    StructuredGP.kind: (
+        "mean",
+        "priors",
+        "learn_noise",
+        "torque_noise",
+        "state_noise",
+        "inference",
+        "inducing_points",
+        "analytical",
+    ),
 }
 """Further keys by the kind of model."""
 Options = LearningOptions | BatchOptions
@@ -104,7 +113,8 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
     given = {key: value for key, value in table.section.given().items() if key not in COMMON}
     for key in given:
         _check_key(table, ("model", key), (*COMMON, *KEYS[kind]), f"the model {name!r}")
-    arguments = {key: given[key] for key in ("learn_noise", "inference", "hidden") if key in given}
+    plain = ("learn_noise", "state_noise", "inference", "inducing_points", "hidden")
+    arguments = {key: given[key] for key in plain if key in given}
     at = table.document.at
     if isinstance(mean := given.get("mean"), str):
         arguments["mean"] = mean

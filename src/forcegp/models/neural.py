@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,6 +26,8 @@ from forcegp.models.base import (
     check_acceleration_only,
 )
 from forcegp.models.minibatch import BatchOptions, train
+from forcegp.storage.checkpoint import Checkpoint
+from forcegp.storage.epochs import EpochCheckpoint
 from forcegp.storage.folder import ModelHeader, Settings, settings_of
 from forcegp.storage.system import take
 
@@ -87,6 +90,8 @@ class NeuralNetwork(Model["NetworkFit"]):
         *,
         options: BatchOptions | None = None,
         progress: FitProgress | None = None,
+        checkpoint: str | Path | None = None,
+        keep_checkpoint: bool = False,
     ) -> NetworkFit:
         """Train with ADAM on batches; the weights of the best epoch on held-out samples are kept.
 
@@ -94,6 +99,9 @@ class NeuralNetwork(Model["NetworkFit"]):
             data: states and measured accelerations.
             options: how to train; `SHALLOW` or `DEEP` by default.
             progress: called after each epoch.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits, and
+                removes it at its end.
+            keep_checkpoint: leave the file, to be removed once the model is saved.
 
         Returns:
             The epochs as `evaluations`, and the held-out error of standardized accelerations.
@@ -116,11 +124,17 @@ class NeuralNetwork(Model["NetworkFit"]):
 
         options = options or (DEEP if len(self.hidden) > 2 else SHALLOW)
         start = dict(network.named_parameters())
-        learned = train(loss, start, len(x), options, generator, progress)
+        saved = None
+        if checkpoint is not None:
+            weights = (part for pair in start.items() for part in pair)
+            saved = EpochCheckpoint(Path(checkpoint), Checkpoint.key_of(options, self.seed, x, y, *weights))
+        learned = train(loss, start, len(x), options, generator, progress, saved)
         network.load_state_dict(learned.tensors)
         result = FitResult.of(learned, constant_inputs=inputs.constant)
         network.requires_grad_(False)
         self._fitted = NetworkFit(self.specified, self.hidden, self.seed, network, inputs, outputs, result)
+        if saved is not None and not keep_checkpoint:
+            saved.remove()
         return self._fitted
 
 

@@ -66,7 +66,7 @@ def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
         >>> [type(prior).__name__ for prior in measured_priors(system)]
         ['JointFrictionPrior', 'SlidingFrictionPrior']
     """
-    sliding = (SlidingFrictionPrior(name, coupled=True) for name in _surfaces(system))
+    sliding = (SlidingFrictionPrior(name, Linear(), coupled=True) for name in _surfaces(system))
     return (JointFrictionPrior(), *sliding)
 
 
