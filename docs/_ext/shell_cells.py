@@ -1,4 +1,4 @@
-"""Cells that begin with `%%bash` or `%%writefile` are shown as what they are: commands, or the file they write."""
+"""Cells that begin with `%%bash` or `%%writefile` are shown as commands, or as the file that they write."""
 
 from __future__ import annotations
 
