@@ -9,15 +9,19 @@ import argparse
 import json
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import forcegp
 from forcegp.checks import Log, check, log_of
 from forcegp.constraints import ConstrainedSystem
+from forcegp.scene import load_scene
 from forcegp.simulate import SimulationConfig, simulate
 from planted_faults import FAULTS, REAL, Case, found, free_log, real_iiwa, real_pendulum, serious
 
 TRUE = {
+    "simulated pendulum on a wire": {"force-directions"},
     "real iiwa": {"friction-undeclared", "torque-offset", "joint-still", "disturbance"},
     "real pendulum": {"friction-undeclared", "masses-mismatch", "time-gap"},
 }
@@ -37,6 +41,22 @@ def contact() -> Case:
     return system, log_of(simulate(system, config).data)
 
 
+def wire() -> Case:
+    """The double pendulum on a wire, with lifts."""
+    return _scene("pendulum_wire", duration=14.0, lift_probability=0.15)
+
+
+def tilted() -> Case:
+    """The Panda on a tilted plane, by MuJoCo's contact solver."""
+    return _scene("panda_tilted", duration=14.0, lift_probability=0.15, engine="mujoco", contact="solver")
+
+
+def _scene(name: str, **settings: Any) -> Case:
+    scene = load_scene(name)
+    system = scene.system()
+    return system, log_of(simulate(system, replace(scene.simulation, seed=11, **settings)).data)
+
+
 def pendulum() -> Case:
     """The double pendulum with both joints driven."""
     with tempfile.TemporaryDirectory() as folder:
@@ -46,6 +66,8 @@ def pendulum() -> Case:
 CASES: dict[str, Callable[[], Case]] = {
     "simulated free motion": free,
     "simulated contact": contact,
+    "simulated pendulum on a wire": wire,
+    "simulated Panda, MuJoCo's solver": tilted,
     "real iiwa": real_iiwa,
     "real pendulum": pendulum,
 }

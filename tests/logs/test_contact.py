@@ -133,3 +133,13 @@ def test_what_is_not_said_of_a_contact_is_an_error(
         contact.detect(signals, system, parse_mapping(text, "m.toml"), Report("log"))
     contact.detect(signals, system, mapping("always"), Report("log"))  # type: ignore[arg-type]
     assert signals.contact["table"].all()
+
+
+def test_the_tip_coming_near_is_not_taken_for_contact() -> None:
+    random = np.random.default_rng(0)
+    closed, near = -8e-5 + 1e-5 * random.standard_normal(500), np.linspace(1e-4, 5e-2, 400)
+    threshold = contact.touching(np.concatenate([closed, near]))
+    assert closed.max() < threshold < near.min()
+    # A surface that is known to a millimetre only: nothing nearer than that tells the two apart.
+    assert contact.touching(random.uniform(-3e-3, 3e-3, 500)) == contact.TOUCHING
+    assert contact.touching(near + 1.0) == contact.TOUCHING

@@ -10,6 +10,8 @@ import forcegp
 from forcegp.constraints import Plane, Sphere
 from forcegp.errors import DataError
 from forcegp.logs import surface_fit
+from forcegp.logs.robust_fit import correlation_time
+from forcegp.logs.tip import Tip, tip_of
 
 
 def on_plane(n: int, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, float]:
@@ -76,7 +78,7 @@ def test_correlated_residuals_count_as_fewer() -> None:
     for k in range(1, len(x)):
         x[k] = 0.9 * x[k - 1] + random.standard_normal()
     # (1 + φ)/(1 − φ) = 19 of a first-order process.
-    assert surface_fit.correlation_time(x) == pytest.approx(19.0, rel=0.2)
+    assert correlation_time(x) == pytest.approx(19.0, rel=0.2)
 
 
 def test_from_a_log_to_a_line_of_the_scene() -> None:
@@ -103,3 +105,76 @@ def test_from_a_log_to_a_line_of_the_scene() -> None:
     assert fit.surface.offset == pytest.approx(0.3, abs=1e-8)
     with pytest.raises(DataError, match="closed in too few rows"):
         surface_fit.fit_surface(data[:10], system, "table")
+
+
+def rounded(n: int, lean: float, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """End points and axes of a ball-ended tool that slides on a tilted plane and leans up to an angle."""
+    random = np.random.default_rng(1)
+    touching, normal, _ = on_plane(n, 0.0)
+    turns = np.linspace(0.0, 40.0, n)
+    leaning = lean * np.column_stack([np.sin(turns), np.cos(1.7 * turns), np.zeros(n)])
+    axes = -normal + leaning
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    centers = touching + RADIUS * normal
+    return centers + RADIUS * axes + noise * random.standard_normal((n, 3)), axes, normal
+
+
+RADIUS = 0.02
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def test_a_rounded_tip_of_known_radius_touches_below_its_centre() -> None:
+    points, axes, normal = rounded(500, 0.4)
+    fit = surface_fit._plane("table", points, UP, Tip(axes, RADIUS))
+    assert isinstance(fit.surface, Plane) and fit.tip_radius == RADIUS
+    np.testing.assert_allclose(fit.surface.normal, normal, atol=1e-8)
+    assert fit.surface.offset == pytest.approx(0.2, abs=1e-8)
+    centers = points - RADIUS * axes
+    of_centers = surface_fit._plane("table", centers, UP, Tip(0.0 * axes, RADIUS))
+    assert isinstance(of_centers.surface, Plane)
+    assert of_centers.surface.offset == pytest.approx(0.2, abs=1e-8)
+    # A tip that is taken for a point seems to slide on another plane.
+    sharp = surface_fit._plane("table", points, UP)
+    assert isinstance(sharp.surface, Plane) and abs(sharp.surface.offset - 0.2) > 5e-4
+
+
+def test_the_radius_of_a_tip_that_leans_is_fitted() -> None:
+    points, axes, _ = rounded(800, 0.4, noise=1e-4)
+    fit = surface_fit._plane("table", points, UP, Tip(axes, None))
+    assert abs(fit.tip_radius - RADIUS) < 4.0 * fit.std["tip_radius"] < 1e-3
+    assert isinstance(fit.surface, Plane)
+    assert abs(fit.surface.offset - 0.2) < 4.0 * fit.std["offset"] + 0.6 * 4.0 * fit.std["tilt"]
+    upright, axes, _ = rounded(800, 0.01, noise=1e-4)
+    with pytest.raises(DataError, match="does not determine the radius of the tip"):
+        surface_fit._plane("table", upright, UP, Tip(axes, None))
+
+
+def test_a_ball_on_a_sphere() -> None:
+    random = np.random.default_rng(0)
+    angle, height = np.linspace(0.0, 30.0, 800), np.linspace(0.3, 1.2, 800)
+    out = np.column_stack([np.cos(angle) * np.cos(height), np.sin(angle) * np.cos(height), np.sin(height)])
+    axes = -out + 0.4 * random.standard_normal((800, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    center = np.array([0.6, 0.1, -0.2])
+    points = center + (0.3 + RADIUS) * out + RADIUS * axes
+    for tip in (Tip(axes, RADIUS), Tip(axes, None)):
+        fit = surface_fit._sphere("ball", points, UP, tip)
+        assert isinstance(fit.surface, Sphere)
+        np.testing.assert_allclose(fit.surface.center, center, atol=1e-6)
+        assert fit.surface.radius == pytest.approx(0.3, abs=1e-6)
+        assert fit.tip_radius == pytest.approx(RADIUS, abs=1e-6)
+
+
+def test_the_tip_is_that_of_the_scene_unless_it_is_a_point() -> None:
+    system = forcegp.load_scene("panda_sphere").system()
+    (ball,) = system.contacts
+    assert isinstance(ball, forcegp.SurfaceContact)
+    q = torch.zeros(3, 7, dtype=torch.float64)
+    assert tip_of(system, ball, q, None).radius == ball.radius
+    with pytest.raises(DataError, match="leave out the radius"):
+        tip_of(system, ball, q, 0.02)
+    table = forcegp.SurfaceContact("table", "panda_link8", (0.0, 0.0, 0.1), Plane())
+    tip = tip_of(system, table, q, "fit")
+    rotation, _ = forcegp.kinematics.frame_pose(system.robot, q, "panda_link8")
+    assert tip.radius is None
+    np.testing.assert_allclose(tip.axes, rotation[..., 2])

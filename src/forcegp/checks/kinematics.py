@@ -28,6 +28,8 @@ EXCHANGED = 0.9
 """Correlation with another joint's rate from which columns are exchanged."""
 CLEARLY = 5.0
 """Factor of unexplained variance by which that order must be better."""
+JUMPS = 0.05
+"""Largest share of windows that impacts cross: the velocity jumps there, which no acceleration holds."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
 """Seconds over the unit of a clock in ns, µs, ms or ks."""
 UNIT_TOLERANCE = 0.1
@@ -82,11 +84,12 @@ def match(log: Log, value: str, rate: str) -> Match | None:
 
 
 def _without_jumps(change: Array, integral: Array) -> tuple[Array, Array]:
-    """Windows without those that an impact crosses."""
+    """Zero in the windows of each joint that an impact crosses, `JUMPS` of them at most."""
     scale = np.sqrt((change**2).sum(axis=0) / np.maximum((integral**2).sum(axis=0), 1e-300))
     misfit = change - scale * integral
-    keep = (np.abs(misfit) <= 8.0 * robust_std(misfit) + 1e-12).all(axis=1)
-    return (change[keep], integral[keep]) if keep.mean() > 0.9 else (change, integral)
+    apart = np.abs(misfit) > 8.0 * robust_std(misfit) + 1e-12
+    jumps = apart & (np.abs(misfit) > np.quantile(np.abs(misfit), 1.0 - JUMPS, axis=0))
+    return np.where(jumps, 0.0, change), np.where(jumps, 0.0, integral)
 
 
 def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:

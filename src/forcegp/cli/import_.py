@@ -35,6 +35,13 @@ def import_(
         Literal["plane", "sphere"] | None,
         typer.Option(help="Fit a surface to the path of each contact, and propose it for the scene."),
     ] = None,
+    tip_radius: Annotated[
+        str | None,
+        typer.Option(
+            help="With --fit-surface: radius in metres of a ball that ends at the scene's point, or fit; "
+            "default: the scene's tip."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Import a log: CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bags, MCAP or LeRobot.
@@ -70,7 +77,7 @@ def import_(
     write_or_keep(imported.data.write, out)
     result = _json(imported) if as_json else _summary(imported)
     if fit_surface is not None:
-        result |= _surfaces(imported, system, fit_surface)
+        result |= _surfaces(imported, system, fit_surface, _tip_radius(tip_radius))
     show(result | {"file": str(out)}, as_json)
 
 
@@ -106,14 +113,37 @@ def _summary(imported: Imported) -> dict[str, object]:
     return result | {f"step_{i + 1}": step for i, step in enumerate(report.steps)}
 
 
+def _tip_radius(text: str | None) -> float | Literal["fit"] | None:
+    """The radius of the tip as it was given.
+
+    Raises:
+        ForceGPError: neither a length nor `fit`.
+    """
+    from forcegp.errors import ForceGPError
+
+    if text is None or text == "fit":
+        return text
+    try:
+        radius = float(text)
+    except ValueError:
+        radius = -1.0
+    if not 0.0 <= radius < float("inf"):
+        raise ForceGPError("no such radius of the tip", expected="a length in metres, or fit", got=text)
+    return radius
+
+
 def _surfaces(
-    imported: Imported, system: ConstrainedSystem, kind: Literal["plane", "sphere"]
+    imported: Imported,
+    system: ConstrainedSystem,
+    kind: Literal["plane", "sphere"],
+    tip_radius: float | Literal["fit"] | None,
 ) -> dict[str, object]:
     """The surface of each contact that was closed, as a line for the scene."""
     from forcegp.logs.surface_fit import fit_surface
 
     touched = [name for name, closed in imported.data.contact.items() if bool(closed.any())]
-    return {name: fit_surface(imported.data, system, name, kind).toml().strip() for name in touched}
+    fits = {name: fit_surface(imported.data, system, name, kind, tip_radius) for name in touched}
+    return {name: fit.toml().strip() for name, fit in fits.items()}
 
 
 def _json(imported: Imported) -> dict[str, object]:

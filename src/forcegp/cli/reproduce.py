@@ -12,8 +12,11 @@ from forcegp.cli.common import AsJson, progress_bar, show
 
 def reproduce(
     profile: Annotated[
-        Literal["quick", "paper", "large"],
-        typer.Option(help="A few minutes, the paper's sizes, or all samples of a ten-minute log."),
+        Literal["quick", "paper", "large", "real-contact"],
+        typer.Option(
+            help="A few minutes; the paper's sizes; all samples of a ten-minute log; or from a log in CSV to "
+            "the contact force, on scenes whose contact MuJoCo's solver makes."
+        ),
     ] = "quick",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the page and its data.")] = Path("out"),
     seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
@@ -32,12 +35,20 @@ def reproduce(
     forcegp reproduce --profile paper --out out/paper --seed 1
 
     forcegp reproduce --profile large --out out/large
+
+    forcegp reproduce --profile real-contact --out out/real-contact
     """
     from forcegp.paper.parallel import MOST_PROCESSES, available_processors
-    from forcegp.paper.reproduce import run
 
     def say(line: str) -> None:
         typer.echo(line, err=True)
+
+    if profile == "real-contact":
+        from forcegp.paper.real_contact_page import run_real_contact
+
+        show(run_real_contact(out, seed=seed, progress=progress_bar, say=say).summary(), as_json)
+        return
+    from forcegp.paper.reproduce import run
 
     processes = processes or min(available_processors(), MOST_PROCESSES)
     made = run(profile, out, seed=seed, processes=processes, progress=progress_bar, say=say)

@@ -32,6 +32,9 @@ def select(
     method: Annotated[
         Literal["farthest", "random"], typer.Option(help="How training points are chosen.")
     ] = "farthest",
+    keep_impacts: Annotated[
+        bool, typer.Option("--keep-impacts", help="Keep rows that the log marks as near an impact.")
+    ] = False,
     differentiate: Differentiate = None,
     seed: Annotated[int, typer.Option(help="Seed of the held-out stretches and of a random choice.")] = 0,
     as_json: AsJson = False,
@@ -47,13 +50,14 @@ def select(
 
     forcegp select run.csv -n 400 --split stretches --differentiate 11 -o train.parquet --rest test.parquet
     """
-    from forcegp.data import split_by_selection, split_by_stretches
+    from forcegp.data import split_by_selection, split_by_stretches, without_impacts
     from forcegp.destination import write_or_keep
 
     check_data_destination(out, log)
     if rest is not None:
         check_data_destination(rest, log, out)
-    data = read_data(log, differentiate)
+    whole = read_data(log, differentiate)
+    data = whole if keep_impacts else without_impacts(whole)
     with progress_bar("selecting points", count) as progress:
         if split == "selection":
             parts = split_by_selection(data, count, method=method, seed=seed, progress=progress)
@@ -71,6 +75,8 @@ def select(
     how = f"of {len(data)} rows by {method} points, split by {split}, seed {seed}"
     write_or_keep(data[parts.train].with_step(f"selected {count} training points {how}").write, out)
     result: dict[str, object] = {"training_points": count, "training_file": str(out)}
+    if len(data) < len(whole):
+        result["rows_at_impacts_left_out"] = len(whole) - len(data)
     if rest is not None:
         write_or_keep(data[parts.test].with_step(f"kept {len(parts.test)} test points {how}").write, rest)
         result |= {"test_points": len(parts.test), "test_file": str(rest)}

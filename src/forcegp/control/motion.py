@@ -23,6 +23,7 @@ class MotionConfig:
         lift_height: range of heights of such a waypoint [m].
         pressing_force: range of the force that presses on the surface, drawn for each line [N].
         elbow_swing: how far the posture in the null space varies from line to line [rad].
+        tool_turn: turn of the tool about the surface's normal, for arms that reach better so [rad].
         gains: gains of the controller.
         torque_limit: one per joint, or `None` for the robot's own limits [N m].
         frame, point: the tool where there is no contact; by default the last frame of the robot.
@@ -41,6 +42,7 @@ class MotionConfig:
     lift_height: tuple[float, float] = (0.02, 0.1)
     pressing_force: tuple[float, float] = (10.0, 15.0)
     elbow_swing: float = 0.15
+    tool_turn: float = 0.0
     gains: Gains = field(default_factory=Gains)
     torque_limit: tuple[float, ...] | None = None
     frame: str | None = None
@@ -50,6 +52,7 @@ class MotionConfig:
         for name in ("duration", "dt", "travel_time", "max_acceleration"):
             self._check(name, 0.0 < getattr(self, name) < float("inf"), "a positive finite number")
         self._check_not_negative("elbow_swing")
+        self._check("tool_turn", abs(self.tool_turn) < float("inf"), "a finite angle")
         for name in ("lift_height", "pressing_force"):
             low, high = getattr(self, name)
             self._check(name, 0.0 <= low <= high < float("inf"), "two finite numbers, 0 <= low <= high")

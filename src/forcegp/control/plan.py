@@ -20,7 +20,7 @@ from forcegp.control.trajectory import Chart, Reference, draw_waypoints, straigh
 from forcegp.robot.model import RobotModel
 
 STARTS = 64
-"""Random joint positions that inverse kinematics starts from; those near zero give the natural postures."""
+"""Random joint positions that inverse kinematics starts from, around the middle of the limits."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,10 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
     chart = Chart.about(center, contact.center_surface if contact else None)
     reference = _draw_reference(chart, config, generator)
     middle = torch.stack([kinematics.as_point(robot, x) for x in [c.point for c in own] or [point]]).mean(0)
-    rotation = tool_rotation(chart.axes[2], chart.axes[0], _tool_axis(middle))
+    rotation = tool_rotation(chart.axes[2], _ahead(chart, config.tool_turn), _tool_axis(middle))
     draws = 2.0 * torch.rand(STARTS, robot.nq, dtype=torch.float64, generator=generator) - 1.0
-    starts = (torch.linspace(0.0, math.pi, STARTS)[:, None] * draws).to(robot.dtype)
-    nearest = torch.zeros(robot.nq, dtype=robot.dtype)
+    nearest = _middle_of_limits(robot)
+    starts = nearest + (torch.linspace(0.0, math.pi, STARTS)[:, None] * draws).to(robot.dtype)
     home = inverse_kinematics(robot, frame, point, chart.center, rotation, starts, nearest)
     start = inverse_kinematics(robot, frame, point, reference.waypoints[0], rotation, home[None], home)
     postures = _draw_postures(robot, home, frame, point, len(reference.travel_time), config, generator)
@@ -100,6 +100,16 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
         _draw_push(reference, config, generator),
     )
     return Plan(tuple(c.name for c in own), frame, point, reference, targets, start)
+
+
+def _ahead(chart: Chart, turn: float) -> Tensor:
+    """The direction of u turned about the normal `(3,)`."""
+    return math.cos(turn) * chart.axes[0] + math.sin(turn) * chart.axes[1]
+
+
+def _middle_of_limits(robot: RobotModel) -> Tensor:
+    """`(nq,)` joint positions furthest from their limits; zero where there are none."""
+    return torch.nan_to_num(0.5 * (robot.lower + robot.upper), nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _tool_axis(point: Tensor) -> Tensor:

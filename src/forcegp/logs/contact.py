@@ -22,7 +22,11 @@ SEPARATION = 6.0
 RELEASE_STD = 4.0
 """A contact counts as closed from where the force leaves the open level by so many of its deviations."""
 TOUCHING = 1e-3
-"""How near the surface the touching point is in contact, unless the mapping says otherwise [m]."""
+"""How near the surface the touching point is in contact at most, unless the mapping says otherwise [m]."""
+DISTANCE_STD = 6.0
+"""A contact is closed up to so many deviations of the distances of the closed contact above their median."""
+SMALLEST_DISTANCE = 1e-6
+"""Least such distance [m]: rounding of a log of an exact simulation."""
 BINS = 512
 """Bins of the histogram that the two levels are told apart in."""
 
@@ -123,9 +127,10 @@ def _detect(
 ) -> tuple[NDArray[np.bool_], Evidence]:
     if section.source == "distance":
         values = evidence.distance(signals, system, contact)
-        high = section.threshold if section.threshold is not None else TOUCHING
+        high = section.threshold if section.threshold is not None else touching(values)
         low = section.release if section.release is not None else high
-        closed = hysteresis(-np.abs(values), -high, -low, signals.segment)
+        below = section.threshold if section.threshold is not None else TOUCHING
+        closed = hysteresis(-values, -high, -low, signals.segment) & (values >= -below)
     else:
         if section.source == "wrench":
             values = evidence.normal_force(signals, system, mapping, contact)
@@ -140,6 +145,22 @@ def _detect(
     return closed, Evidence(
         contact.name, section.source, high, low, *level[True], *level[False], times, merged
     )
+
+
+def touching(distance: Array) -> float:
+    """Distance up to which a contact is closed [m], at most `TOUCHING`.
+
+    Within `TOUCHING` of the surface most rows are those of the closed contact; the threshold is their median
+    and `DISTANCE_STD` of their deviations. It parts them from those of the tip coming near and leaving.
+
+    >>> touching(np.array([0.0, 0.001, -0.001, 0.0, 0.002, 0.9, 30.0]) * 1e-3) < 1e-5
+    True
+    """
+    near = distance[np.abs(distance) <= TOUCHING]
+    if not len(near):
+        return TOUCHING
+    level, spread = level_and_spread(near)
+    return min(TOUCHING, level + max(DISTANCE_STD * spread, SMALLEST_DISTANCE))
 
 
 def force_levels(values: Array, name: str, section: ContactSection) -> tuple[float, float]:

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, Plane, Sphere, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
+from forcegp.logs.robust_fit import LEAST_POINTS, Solution, robust_least_squares
 from forcegp.logs.signals import Array
+from forcegp.logs.tip import Tip, tip_of
 
-MAD_TO_STD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
 MOST_POINTS = 20_000
 """Points that are fitted; of a longer path, every k-th."""
-LEAST_POINTS = 20
-"""Points that a fit needs."""
-ROUNDING = 1e-9
-"""Smallest scale of the residuals [m], so that an exact path has one."""
-OUTLIER_STD = 4.0
-"""Rows further from the surface than so many deviations are not on it."""
 LEAST_WIDTH = 10.0
 """Least width of a path that determines a plane, in deviations of its residuals."""
 LARGEST_TILT = 0.2
@@ -39,10 +31,11 @@ class SurfaceFit:
         contact: name of the contact.
         surface: the plane or sphere.
         std: standard deviations: `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane;
-            `center` [m] (the largest of its three) and `radius` [m] of a sphere.
+            `center` [m] (the largest of its three) and `radius` [m] of a sphere; `tip_radius` [m] if fitted.
         residual: deviation of the path from the surface [m].
         points, outliers: rows that were fitted, and rows too far off to be on the surface.
         effective_points: how many independent rows the fitted ones are worth.
+        tip_radius: of the tip that touched [m].
     """
 
     contact: str
@@ -52,6 +45,7 @@ class SurfaceFit:
     points: int
     outliers: int
     effective_points: float
+    tip_radius: float = 0.0
 
     def toml(self) -> str:
         """The surface as a line of a scene file, with its error bars in a comment."""
@@ -65,26 +59,34 @@ class SurfaceFit:
         else:
             center = ", ".join(f"{x:.6f}" for x in self.surface.center)
             values = f'type = "sphere", center = [{center}], radius = {self.surface.radius:.6f}'
-        return f"surface = {{ {values} }}  # {self.contact}: {bars}\n"
+        tip = f"; tip of {1e3 * self.tip_radius:.3g} mm" if self.tip_radius else ""
+        return f"surface = {{ {values} }}  # {self.contact}: {bars}{tip}\n"
 
 
 def fit_surface(
-    data: Dataset, system: ConstrainedSystem, contact: str, kind: Literal["plane", "sphere"] = "plane"
+    data: Dataset,
+    system: ConstrainedSystem,
+    contact: str,
+    kind: Literal["plane", "sphere"] = "plane",
+    tip_radius: float | Literal["fit"] | None = None,
 ) -> SurfaceFit:
     """Fit a surface to the path of the touching point while a contact is closed.
 
-    Least squares of the signed distances; rows that a robust fit finds off the surface, such as those of
-    bouncing, are left out and counted. The error bars count residuals that are correlated in time as fewer
-    independent ones.
+    Least squares of the signed distances; a rounded tip touches its radius below its centre. Rows that a
+    robust fit finds off the surface, such as those of bouncing, are left out and counted. The error bars
+    count residuals that are correlated in time as fewer independent ones.
 
     Args:
         data: a log with the contact's state.
         system: the robot with its contacts; the point and the side of the surface are the scene's.
         contact: which contact.
         kind: the kind of surface.
+        tip_radius: of a ball that ends at the scene's point, on the line from the frame's origin to it
+            [m], or `"fit"`; by default the scene's tip.
 
     Raises:
-        DataError: the contact is closed in too few rows, or the path is too straight or too short.
+        DataError: the scene has another tip, the contact is closed in too few rows, or the path is too
+            straight or too short.
         UnknownNameError: the scene has no such contact.
     """
     known = system.contact(contact)
@@ -99,16 +101,18 @@ def fit_surface(
         )
     rows = rows[:: -(-len(rows) // MOST_POINTS)]
     q = data.select(system.robot.joint_names).q[rows]
-    points = kinematics.point_position(system.robot, q, known.frame, tuple(known.point)).numpy()
-    normal = known.surface.gradient(
-        kinematics.point_position(system.robot, q, known.frame, tuple(known.point))
-    )
+    points = kinematics.point_position(system.robot, q, known.frame, tuple(known.point))
+    normal = known.surface.gradient(points)
     fit = _plane if kind == "plane" else _sphere
-    return fit(contact, points, normal.mean(0).numpy())
+    return fit(contact, points.numpy(), normal.mean(0).numpy(), tip_of(system, known, q, tip_radius))
 
 
-def _plane(contact: str, points: Array, towards: Array) -> SurfaceFit:
-    """n = n₀ + a u + b v, scaled to one, through the middle of the path moved by e along n."""
+def _plane(contact: str, points: Array, towards: Array, tip: Tip | None = None) -> SurfaceFit:
+    """n = n₀ + a u + b v, scaled to one, through the middle of the path moved by e along n.
+
+    The ball's centre p − r a is at n·(p − r a) − r = offset.
+    """
+    tip = tip or Tip.sharp(points)
     middle = points.mean(axis=0)
     centered = points - middle
     u, v, n0 = np.linalg.svd(centered, full_matrices=False)[2]
@@ -118,7 +122,11 @@ def _plane(contact: str, points: Array, towards: Array) -> SurfaceFit:
         n = n0 + x[0] * u + x[1] * v
         return n / np.linalg.norm(n)
 
-    found = _least_squares(lambda x: centered @ normal(x) - x[2], np.zeros(3))
+    def residual(x: Array) -> Array:
+        n = normal(x)
+        return centered @ n - tip.of(x) * (tip.axes @ n + 1.0) - x[2]
+
+    found = robust_least_squares(residual, tip.start([0.0, 0.0, 0.0]))
     x, cov, across = found.x, found.covariance, float((centered @ v).std())
     tilt = float(np.sqrt(max(cov[0, 0], cov[1, 1])))
     if not (tilt < LARGEST_TILT and across > LEAST_WIDTH * found.residuals.std()):
@@ -130,12 +138,13 @@ def _plane(contact: str, points: Array, towards: Array) -> SurfaceFit:
         )
     n = normal(x)
     plane = Plane(tuple(float(c) for c in n), float(n @ middle + x[2]))
-    std = {"offset": float(np.sqrt(cov[2, 2])), "tilt": tilt}
-    return _result(contact, plane, std, found, len(points))
+    std = {"offset": float(np.sqrt(cov[2, 2])), "tilt": tilt} | tip.std(found)
+    return _result(contact, plane, std, found, len(points), tip.of(x))
 
 
-def _sphere(contact: str, points: Array, towards: Array) -> SurfaceFit:
-    """|p − center| = radius; starts from the linear fit |p|² = 2 p·center + const."""
+def _sphere(contact: str, points: Array, towards: Array, tip: Tip | None = None) -> SurfaceFit:
+    """|p − r a − center| = radius + r; starts from the linear fit |p|² = 2 p·center + const."""
+    tip = tip or Tip.sharp(points)
     middle = points.mean(axis=0)
     centered = points - middle
     design = np.column_stack([2.0 * centered, np.ones(len(points))])
@@ -147,12 +156,14 @@ def _sphere(contact: str, points: Array, towards: Array) -> SurfaceFit:
         )
 
     def residual(x: Array) -> Array:
-        return np.linalg.norm(centered - x[:3], axis=1) - x[3]
+        r = tip.of(x)
+        return np.linalg.norm(centered - r * tip.axes - x[:3], axis=1) - r - x[3]
 
-    found = _least_squares(residual, np.array([*start[:3], np.sqrt(squared)]))
+    found = robust_least_squares(residual, tip.start([*start[:3], np.sqrt(squared)]))
     x, cov = found.x, found.covariance
     center, radius = x[:3] + middle, float(x[3])
     std = {"center": float(np.sqrt(np.diag(cov)[:3].max())), "radius": float(np.sqrt(cov[3, 3]))}
+    std |= tip.std(found)
     if not (std["radius"] < 0.5 * radius and (middle - center) @ towards > 0.0):
         raise DataError(
             "the path does not determine a sphere that is touched from outside",
@@ -160,61 +171,11 @@ def _sphere(contact: str, points: Array, towards: Array) -> SurfaceFit:
             hint="fit a plane, or slide over a larger part of the sphere",
         )
     sphere = Sphere(tuple(float(c) for c in center), radius)
-    return _result(contact, sphere, std, found, len(points))
+    return _result(contact, sphere, std, found, len(points), tip.of(x))
 
 
 def _result(
-    contact: str, surface: Plane | Sphere, std: dict[str, float], found: _Solution, points: int
+    contact: str, surface: Plane | Sphere, std: dict[str, float], found: Solution, points: int, tip: float
 ) -> SurfaceFit:
-    used = len(found.residuals)
-    return SurfaceFit(
-        contact, surface, std, float(found.residuals.std()), used, points - used, found.effective
-    )
-
-
-@dataclass(frozen=True)
-class _Solution:
-    """Parameters, their covariance, residuals of the rows used, and how many of these are independent."""
-
-    x: Array
-    covariance: Array
-    residuals: Array
-    effective: float
-
-
-def _least_squares(residual: Callable[[Array], Array], start: Array) -> _Solution:
-    """A robust fit tells the outliers from the rest; least squares of the rest gives the error bars."""
-    robust = start
-    for _ in range(2):
-        scale = max(_spread(residual(robust)), ROUNDING)
-        found = least_squares(residual, robust, loss="soft_l1", f_scale=scale, x_scale="jac")
-        robust = found.x
-    first = residual(robust)
-    inside = np.abs(first - np.median(first)) <= OUTLIER_STD * max(_spread(first), ROUNDING)
-    final = least_squares(lambda x: residual(x)[inside], robust, x_scale="jac")
-    residuals = residual(final.x)[inside]
-    effective = len(residuals) / correlation_time(residuals)
-    information = final.jac.T @ final.jac * (effective / len(residuals))
-    scale = max(float(residuals.std()), ROUNDING)
-    return _Solution(final.x, scale**2 * np.linalg.pinv(information, hermitian=True), residuals, effective)
-
-
-def correlation_time(values: Array) -> float:
-    """1 + 2 Σ ρ_k up to the first negative ρ_k: the rows that count as one independent row (Sokal 1997).
-
-    >>> 0.8 < correlation_time(np.random.default_rng(0).standard_normal(4000)) < 1.2
-    True
-    """
-    x = values - values.mean()
-    n = len(x)
-    power = np.abs(np.fft.rfft(x, 2 * n)) ** 2
-    autocorrelation = np.fft.irfft(power)[:n]
-    if not autocorrelation[0] > 0.0:
-        return 1.0
-    rho = autocorrelation / autocorrelation[0]
-    first = int(np.argmax(rho < 0.0)) if (rho < 0.0).any() else n
-    return float(min(max(1.0 + 2.0 * rho[1:first].sum(), 1.0), n / LEAST_POINTS if n > LEAST_POINTS else n))
-
-
-def _spread(values: Array) -> float:
-    return MAD_TO_STD * float(np.median(np.abs(values - np.median(values))))
+    used, residual = len(found.residuals), float(found.residuals.std())
+    return SurfaceFit(contact, surface, std, residual, used, points - used, found.effective, tip)

@@ -20,6 +20,7 @@ from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import DEEP, SHALLOW, NeuralNetwork
 from forcegp.models.registry import MODELS, create
+from forcegp.models.sensed import with_sensor
 from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
 from forcegp.models.structured_spec import CLASSES
 from forcegp.robot.parameters import AnalyticalParameters
@@ -40,6 +41,7 @@ KEYS: dict[str, tuple[str, ...]] = {
         "learn_noise",
         "torque_noise",
         "state_noise",
+        "sensor_noise_std",
         "inference",
         "inducing_points",
         "analytical",
@@ -57,16 +59,21 @@ class Configured:
         name: of the model.
         model: the model.
         options: how it learns; `None` for its default.
+        sensor_noise_std: where the log's force sensor is a second measurement, the noise of its force [N].
     """
 
     name: str
     model: Model[Any]
     options: Options | None
+    sensor_noise_std: float | None = None
 
     def fit(self, data: Dataset, *, progress: FitProgress | None = None, **settings: Any) -> FittedModel:
-        """Fit the model to data with its options."""
+        """Fit the model to data with its options, and to the force sensor if asked for."""
         if self.options is not None:
             settings["options"] = self.options
+        if self.sensor_noise_std is not None and isinstance(self.model, StructuredGP):
+            both = with_sensor(data, self.model.specified, self.sensor_noise_std)
+            return self.model.fit(both, progress=progress, **settings)
         return self.model.fit(data, progress=progress, **settings)
 
 
@@ -104,7 +111,7 @@ def configured(
         raise unknown if name else SceneError.at(table.document.place(("model", "name")), unknown)
     arguments = _arguments(table, system, chosen)
     model = at(("model",), create, chosen, system, noise_std=noise, seed=start or 0, **arguments)
-    return Configured(chosen, model, _learning(table, model))
+    return Configured(chosen, model, _learning(table, model), section.sensor_noise_std)
 
 
 def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[str, Any]:

@@ -27,7 +27,13 @@ PACKAGE = Path(__file__).parents[1]
 """Folder of the library."""
 LIBRARIES = ("torch", "numpy", "scipy", "pybullet", "mujoco")
 """Libraries whose versions go into the keys."""
-PRESENTATION = ("cli/", "report/templates/", "paper/page.py", "paper/templates/")
+PRESENTATION = (
+    "cli/",
+    "report/templates/",
+    "paper/page.py",
+    "paper/real_contact_page.py",
+    "paper/templates/",
+)
 """Sources that only show what stages have computed."""
 H = TypeVar("H", bound=Header)
 

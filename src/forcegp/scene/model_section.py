@@ -61,6 +61,7 @@ class ModelSection(Section):
     learn_noise: bool = False
     torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["auto", "learn", "none"] = "auto"
     state_noise: tuple[State, State] | None = None
+    sensor_noise_std: PositiveFloat | None = None
     inference: Literal["auto", "exact", "sparse"] = "auto"
     inducing_points: PositiveInt = 100
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"

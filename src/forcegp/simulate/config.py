@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from forcegp.control.motion import MotionConfig
 from forcegp.errors import ForceGPError
 
 CONTACTS = ("rigid", "solver")
+LONGEST_STEP = 5e-4
+"""Of the contact solver [s]; a contact of the default stiffness takes eight such steps."""
+WHOLE = 1e-6
+"""Rounding of a ratio that is meant to be whole."""
 
 
 def _check(name: str, valid: bool, expected: str, got: object) -> None:
@@ -26,7 +31,8 @@ class ContactSolver:
         joint_friction: Coulomb friction of each joint, beyond the robot file; empty is none [N m].
         joint_damping: viscous friction of each joint, beyond the robot file; empty is none [N m s/rad].
         stiffness_time: time constant of the contact's restoring force [s]; shorter is stiffer.
-        step: step of the engine, a whole part of the sampling period [s].
+        step: step of the engine, a whole part of the sampling period [s]; by default the longest one up to
+            `LONGEST_STEP`.
 
     Raises:
         ForceGPError: a value is out of range; the message names it.
@@ -37,16 +43,30 @@ class ContactSolver:
     joint_friction: tuple[float, ...] = ()
     joint_damping: tuple[float, ...] = ()
     stiffness_time: float = 0.004
-    step: float = 0.0005
+    step: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("tip_radius", "stiffness_time", "step"):
             value = getattr(self, name)
-            _check(name, 0.0 < value < float("inf"), "a positive finite number", value)
+            if value is not None:
+                _check(name, 0.0 < value < float("inf"), "a positive finite number", value)
         for name in ("joint_friction", "joint_damping"):
             values = getattr(self, name)
             _check(name, all(0.0 <= x < float("inf") for x in values), "finite numbers, 0 or above", values)
         _check("friction", 0.0 <= self.friction < float("inf"), "a finite number, 0 or above", self.friction)
+
+    def substeps(self, dt: float) -> int:
+        """Steps of the engine in a sampling period.
+
+        Raises:
+            ForceGPError: `step` is no whole part of it.
+        """
+        if self.step is None:
+            return math.ceil(dt / LONGEST_STEP - WHOLE)
+        steps = dt / self.step
+        whole = steps > 0.5 and abs(steps - round(steps)) < WHOLE
+        _check("step", whole, f"a whole part of dt = {dt} s", self.step)
+        return round(steps)
 
 
 @dataclass(frozen=True)
@@ -111,6 +131,4 @@ class SimulationConfig(MotionConfig):
         _check("contact", self.contact in CONTACTS, "'rigid' or 'solver'", self.contact)
         if self.contact == "solver":
             _check("engine", self.engine in ("auto", "mujoco"), "'mujoco', whose solver it is", self.engine)
-            steps = self.dt / self.solver.step
-            whole = steps > 0.5 and abs(steps - round(steps)) < 1e-6
-            _check("step", whole, f"a whole part of dt = {self.dt} s", self.solver.step)
+            self.solver.substeps(self.dt)

@@ -74,12 +74,12 @@ class ContactSolverEngine:
         self._mujoco = mujoco = import_mujoco()
         self._system, robot = system, system.robot
         self._model = model = self._compile(system, solver)
-        model.opt.timestep = solver.step
+        self._substeps = solver.substeps(dt)
+        model.opt.timestep = dt / self._substeps
         model.opt.gravity[:] = robot.gravity.numpy()
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         model.opt.tolerance = SOLVED
-        self._substeps = round(dt / solver.step)
         self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
         model.dof_armature[self._dof] = robot.armature.numpy()
         model.dof_damping[self._dof] = robot.damping.numpy() + _per_joint(robot, solver, "joint_damping")

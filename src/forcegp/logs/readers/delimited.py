@@ -78,7 +78,7 @@ def _batches(
     reader = csv.open_csv(
         pa.PythonFile(source, mode="r"),
         read_options=csv.ReadOptions(
-            use_threads=False,
+            use_threads=True,
             block_size=BLOCK_BYTES,
             skip_rows=dialect.first_line,
             column_names=list(dialect.names),
