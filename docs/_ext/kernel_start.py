@@ -9,7 +9,7 @@ import subprocess
 
 from IPython import get_ipython
 
-PLAIN = {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "96"}
+PLAIN = {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "84"}
 NOISE = "pybullet build time"
 
 

@@ -1,21 +1,26 @@
-"""Cells that begin with `%%bash` are shown as the shell commands that they run."""
+"""Cells that begin with `%%bash` or `%%writefile` are shown as commands, or as the file that they write."""
 
 from __future__ import annotations
 
+from pathlib import PurePath
 from typing import Any
 
 from docutils import nodes
 from sphinx.application import Sphinx
 
-MAGIC = "%%bash"
+LANGUAGES = {".toml": "toml", ".py": "python"}
 
 
 def _show(app: Sphinx, doctree: nodes.document) -> None:
-    for node in doctree.findall(nodes.literal_block):
+    for node in list(doctree.findall(nodes.literal_block)):
         first, _, rest = node.astext().partition("\n")
-        if first.startswith(MAGIC):
-            shown = nodes.literal_block(rest, rest, language="bash", classes=list(node["classes"]))
-            node.replace_self(shown)
+        if first.startswith("%%bash"):
+            language = "bash"
+        elif first.startswith("%%writefile"):
+            language = LANGUAGES[PurePath(first.split()[-1]).suffix]
+        else:
+            continue
+        node.replace_self(nodes.literal_block(rest, rest, language=language, classes=list(node["classes"])))
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
