@@ -59,6 +59,8 @@ SMALL = Profile(
     paper_split_baselines=False,
 )
 """A reproduction that takes seconds; what it shows is not looked at."""
+PROCESSES = 2 if os.environ.get("FORCEGP_ATTACK") else 1
+"""Starting further processes takes longer than the small reproduction itself."""
 VARYING = ("seconds", "computing_time_s", "peak_memory", "sha256")
 """Ends of the keys of what differs between two runs: times, memory, and hashes of files that hold them."""
 
@@ -106,7 +108,12 @@ COMMANDS = {
             lambda i, o: ["-m", i / "model", "-d", i / "run.parquet", "--samples", 2, "-o", o / "rollout"],
             "rollout",
         ),
-        Command("reproduce", lambda i, o: ["--profile", "quick", "-o", o / "out"], "out", resumes=True),
+        Command(
+            "reproduce",
+            lambda i, o: ["--profile", "quick", "--processes", PROCESSES, "-o", o / "out"],
+            "out",
+            resumes=True,
+        ),
     )
 }
 
