@@ -4,9 +4,10 @@ OUT    ?= out
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 PROFILE ?= quick
+RESOLUTION ?= lowest-direct
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce test lint types package docs benchmark clean attack
+.PHONY: help setup reproduce test lint types package docs benchmark clean attack audit ends
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -20,7 +21,7 @@ $(READY): pyproject.toml constraints.txt
 	@echo "[setup] PyTorch"
 	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt torch
 	@echo "[setup] forcegp and the tools that test it"
-	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt -e ".[mujoco,pybullet,test,dev,docs]"
+	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt -e ".[mujoco,pybullet,view,sweep,test,dev,docs]"
 	@touch $(READY)
 	@echo "[setup] done"
 
@@ -52,6 +53,13 @@ benchmark: $(READY)  ## every benchmark, results as JSON under out/benchmarks
 	  echo "[benchmark] $$name"; $(BIN)/python benchmarks/$$name.py --json $(OUT)/benchmarks/$$name.json || exit 1; \
 	done
 	@echo "[benchmark] results are in $(OUT)/benchmarks"
+
+audit: $(READY)  ## known vulnerabilities of the installed packages, where the advisory service answers
+	@$(BIN)/python -m pip install --quiet -c constraints.txt pip-audit || echo "[audit] pip-audit cannot be installed"
+	@sh .ci/audit $(BIN)/python
+
+ends:            ## tests with the lowest versions allowed, or with RESOLUTION=highest the newest
+	sh .ci/ends $(PYTHON) $(RESOLUTION)
 
 attack: $(READY) ## 20,000 inputs per reader, faults at every step, 50 kills per command (hours)
 	@$(BIN)/python -m pip install --quiet "atheris>=3; python_version >= '3.11'" || echo "[attack] without atheris"

@@ -40,7 +40,7 @@ myst_links_external_new_tab = False
 def _code_key() -> str:
     """Hash of what the pages run: outputs are cached until the library or an example changes."""
     digest = hashlib.sha256()
-    for folder in ("src/forcegp", "examples"):
+    for folder in ("src/forcegp", "examples", "docs/_ext"):
         for path in sorted((HERE.parent / folder).rglob("*")):
             if path.is_file() and path.suffix in (".py", ".toml", ".urdf", ".csv", ".parquet"):
                 digest.update(path.read_bytes())
@@ -48,9 +48,9 @@ def _code_key() -> str:
 
 
 nb_execution_mode = os.environ.get("FORCEGP_DOCS_EXECUTE", "cache")
-nb_execution_cache_path = str(HERE / "_build" / "executed" / _code_key())
+nb_execution_cache_path = str(HERE.parent / "out" / "executed" / _code_key())
 nb_execution_in_temp = True
-nb_execution_timeout = 120
+nb_execution_timeout = 600  # of one cell; a busy machine is slow
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_merge_streams = True
@@ -58,6 +58,7 @@ nb_number_source_lines = False
 
 # What the pages find in their environment: the command, the example files, one thread, sharp plots.
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+os.environ["PYTHONSTARTUP"] = str(HERE / "_ext" / "kernel_start.py")
 os.environ["EXAMPLES"] = str(HERE.parent / "examples")
 os.environ["MATPLOTLIBRC"] = str(HERE / "_static" / "matplotlibrc")
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -46,7 +46,8 @@ LAYERS = (
     ("rollout",),
     ("models",),
     ("evaluation",),
-    ("report",),
+    ("view",),
+    ("report", "sweep"),
     ("paper",),
     ("cli",),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import stat
 import tempfile
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 from forcegp import destination
 from forcegp.destination import check_destination, write_or_keep
 from forcegp.errors import DestinationError, ModelError
+from forcegp.files import atomic_directory, write_text
 
 
 def test_a_place_that_can_be_written_is_left_as_it_was(tmp_path: Path) -> None:
@@ -38,7 +40,38 @@ def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DestinationError, match=r"other files(.|\n)*model\.json(.|\n)*thesis\.tex"):
         check_destination(tmp_path, folder=True, own_files=own)
     (tmp_path / "model.json").write_text("{}")
+    with pytest.raises(DestinationError, match=r"would be lost(.|\n)*got: thesis\.tex"):
+        check_destination(tmp_path, folder=True, own_files=own)
+    (tmp_path / "thesis.tex").unlink()
     check_destination(tmp_path, folder=True, own_files=own)
+    check_destination(tmp_path, folder=True, own_files=["*.json"])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes")
+def test_a_pipe_or_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path(os.devnull)):
+        with pytest.raises(DestinationError, match="is no regular file"):
+            check_destination(path)
+        with pytest.raises(DestinationError, match="is no regular file"):
+            write_text(path, "lost")
+        assert not stat.S_ISREG(path.stat().st_mode)
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_a_name_that_is_too_long_is_refused_and_the_longest_written(folder: bool, tmp_path: Path) -> None:
+    with pytest.raises(DestinationError, match="too long"):
+        check_destination(tmp_path / ("a" * 300), folder=folder)
+    longest = tmp_path / ("ä" * 123 + ".parquet")
+    check_destination(longest, folder=folder)
+    for text in ("one", "two"):
+        if folder:
+            with atomic_directory(longest) as temporary:
+                (temporary / "a").write_text(text)
+        else:
+            write_text(longest, text)
+    assert os.listdir(tmp_path) == [longest.name]
+    assert (longest / "a" if folder else longest).read_text() == "two"
 
 
 def test_a_full_disk_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,6 +81,39 @@ def test_threads_that_predict_get_the_same_numbers() -> None:
         assert torch.equal(prediction.covariance, alone.covariance)  # type: ignore[arg-type]
 
 
+CALLS = """
+import tempfile, torch, forcegp
+from pathlib import Path
+from threadpoolctl import threadpool_info
+from random_data import random_data, table_system
+torch.set_num_threads(2)
+system = table_system()
+def counts():
+    pools = sorted((p["filepath"], p["num_threads"]) for p in threadpool_info())
+    return torch.get_num_threads(), torch.get_num_interop_threads(), torch.get_default_dtype(), pools
+data, before = random_data(system, 12), counts()
+few = forcegp.LearningOptions(max_evaluations=2)
+for model in (forcegp.StructuredGP(system, noise_std=0.1), forcegp.IndependentGP(system, noise_std=0.1)):
+    model.fit(data, options=few)
+    model.predict(data.q, data.qd, data.tau)
+    path = Path(tempfile.mkdtemp()) / "model"
+    model.save(path)
+    loaded = forcegp.load_model(path)
+    options = forcegp.RolloutOptions(dt=0.01, on_divergence="keep")
+    loaded.rollout(data.q[0], 0.0 * data.qd[0], 0.0 * data.tau, duration=0.05, options=options)
+forcegp.NeuralNetwork(system).fit(data, options=forcegp.models.minibatch.BatchOptions(epochs=1))
+forcegp.evaluate(loaded, data)
+after = counts()
+assert [x for x in after[3] if x[0] in dict(before[3])] == before[3], (before, after)
+print(after[:3] == before[:3])
+"""
+
+
+def test_calls_of_the_library_leave_the_numbers_of_threads() -> None:
+    done = subprocess.run([sys.executable, "-c", CALLS], capture_output=True, text=True, check=False)
+    assert done.stdout.strip().endswith("True"), done.stderr[-2000:]
+
+
 def test_an_error_inside_restores_the_number() -> None:
     before = torch.get_num_threads()
     with pytest.raises(KeyError), one_thread():

@@ -9,14 +9,20 @@ from docutils.utils.math import latex2mathml
 from sphinx.application import Sphinx
 
 
+def _mathml(source: str, as_block: bool = False) -> str:
+    """Accents are written as limits: fonts without their own metrics would draw them across the letter."""
+    text = latex2mathml.tex2mathml(source.strip(), as_block=as_block)
+    return text.replace('<mover accent="true">', "<mover>").replace("ˉ", "¯")
+
+
 def _inline(self: Any, node: nodes.math) -> None:
-    self.body.append(latex2mathml.tex2mathml(node.astext()))
+    self.body.append(_mathml(node.astext()))
     raise nodes.SkipNode
 
 
 def _display(self: Any, node: nodes.math_block) -> None:
     self.body.append(self.starttag(node, "div", CLASS="math"))
-    self.body.append(latex2mathml.tex2mathml(node.astext().strip(), as_block=True))
+    self.body.append(_mathml(node.astext(), as_block=True))
     self.body.append("</div>\n")
     raise nodes.SkipNode
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from forcegp.forces.priors.joint_friction import JointFrictionPrior
     from forcegp.forces.priors.normal_force import NormalForcePrior
     from forcegp.forces.priors.operator import OperatorForcePrior
+    from forcegp.forces.priors.payload import PayloadPrior
     from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
     from forcegp.gp.optimise import LearningOptions
     from forcegp.logs import read_log
@@ -62,6 +63,7 @@ _HOME = {
     "NormalForcePrior": "forces.priors.normal_force",
     "Observation": "forces.measurements",
     "OperatorForcePrior": "forces.priors.operator",
+    "PayloadPrior": "forces.priors.payload",
     "Plane": "constraints",
     "PointConnection": "constraints",
     "RobotModel": "robot",
@@ -110,6 +112,7 @@ __all__ = [
     "NormalForcePrior",
     "Observation",
     "OperatorForcePrior",
+    "PayloadPrior",
     "Plane",
     "PointConnection",
     "RobotModel",

@@ -7,10 +7,11 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from forcegp.errors import DestinationError, ForceGPError
-from forcegp.exchange import is_other_than_folder
+from forcegp.exchange import is_other_than_file, is_other_than_folder, kind_of
 
 PROBE_BYTES = 1 << 16
 """Written and removed again to see whether there is room, and whether a quota allows it."""
@@ -25,8 +26,9 @@ def check_destination(
 
     Args:
         path: what will be written.
-        folder: whether that is a folder, which may replace one that is empty or holds one of `own_files`.
-        own_files: names by which a folder of ours is known; with none, any folder may be replaced.
+        folder: whether that is a folder, which may replace an empty one or one of nothing but `own_files`.
+        own_files: names of what such a folder holds, with `*` for any letters; with none, any folder may be
+            replaced.
         needed_bytes: room that the result takes on the disk [bytes].
 
     Raises:
@@ -40,12 +42,12 @@ def check_destination(
           ...
     """
     target = Path(path)
-    if target.is_dir() and not folder:
-        raise DestinationError(f"{target} is a folder, and a file is to be written there")
-    if folder and is_other_than_folder(target):
-        raise DestinationError(f"{target} is a file, and a folder is to be written there")
     try:
-        if target.is_dir():
+        if not folder and is_other_than_file(target):
+            raise DestinationError(f"{target} is {kind_of(target)}, and a file is to be written there")
+        if folder and is_other_than_folder(target):
+            raise DestinationError(f"{target} is a file, and a folder is to be written there")
+        if folder and target.is_dir():
             _check_own(target, tuple(own_files))
         parent = _existing_parent(target)
         _probe(parent, needed_bytes)
@@ -102,13 +104,14 @@ def _kept(write: Callable[[Path], object], name: str) -> Path | None:
 
 
 def _check_own(folder: Path, own_files: tuple[str, ...]) -> None:
-    names = {entry.name for entry in folder.iterdir()}
-    if own_files and names and names.isdisjoint(own_files):
+    names = sorted(entry.name for entry in folder.iterdir())
+    foreign = [name for name in names if not any(fnmatchcase(name, own) for own in own_files)]
+    if own_files and foreign:
         raise DestinationError(
-            f"{folder} holds other files than a result of this command",
-            expected="a folder that is new, empty, or holds " + " or ".join(own_files),
-            got=", ".join(sorted(names)[:5]),
-            hint="name another folder",
+            f"{folder} holds other files than a result of this command, which would be lost",
+            expected="a folder that is new, empty, or holds nothing but " + ", ".join(own_files),
+            got=", ".join(foreign[:5]),
+            hint="name another folder, or move these files",
         )
 
 

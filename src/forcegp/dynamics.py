@@ -124,6 +124,13 @@ def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
     Returns:
         `(*batch, nq, nq)` [kg m², kg m, kg].
 
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> mass_matrix(robot, q).shape
+        torch.Size([5, 2, 2])
+
     Raises:
         ShapeError: q does not fit the robot.
     """
@@ -133,6 +140,13 @@ def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
 
 def gravity_force(robot: RobotModel, q: JointVector) -> JointVector:
     """Generalized gravity force Q_G(q), `(*batch, nq)` [N m, N].
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> gravity_force(robot, q).shape
+        torch.Size([5, 2])
 
     Raises:
         ShapeError: q does not fit the robot.
@@ -144,6 +158,13 @@ def gravity_force(robot: RobotModel, q: JointVector) -> JointVector:
 def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVector:
     """Generalized Coriolis and centrifugal force Q_C(q, q̇) on the right-hand side, `(*batch, nq)` [N m, N].
 
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> bias_force(robot, q, torch.ones_like(q)).shape
+        torch.Size([5, 2])
+
     Raises:
         ShapeError: q or qd does not fit the robot.
     """
@@ -154,6 +175,13 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
 
 def damping_force(robot: RobotModel, qd: JointVector) -> JointVector:
     """Joint friction Q_D(q̇) of the robot: viscous, Coulomb and Stribeck, `(*batch, nq)` [N m, N].
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> damping_force(robot, torch.ones_like(q)).shape
+        torch.Size([5, 2])
 
     Raises:
         ShapeError: qd does not fit the robot.
@@ -171,6 +199,14 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
 
     Returns:
         `(*batch, nq)` [N m, N].
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> force = inverse_dynamics(robot, q, 0 * q, 0 * q)  # at rest, only gravity is left
+        >>> bool(torch.allclose(force, -gravity_force(robot, q)))
+        True
 
     Raises:
         ShapeError: an argument does not fit the robot.
@@ -196,6 +232,14 @@ def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: 
 
     Returns:
         q̈ `(*batch, nq)` [rad/s², m/s²].
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> qdd = forward_dynamics(robot, q, 0 * q, -gravity_force(robot, q))
+        >>> bool((qdd == 0.0).all())
+        True
 
     Raises:
         ShapeError: an argument does not fit the robot.

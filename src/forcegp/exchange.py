@@ -101,6 +101,19 @@ def is_other_than_folder(path: Path) -> bool:
         return False
 
 
+def is_other_than_file(path: Path) -> bool:
+    """Whether a path is taken by something that is not a regular file: a folder, a pipe, a device."""
+    try:
+        return not stat.S_ISREG(os.stat(path).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+
+
+def kind_of(path: Path) -> str:
+    """What is at a path, in words."""
+    return "a folder" if path.is_dir() else "no regular file"
+
+
 def _remove_asides(target: Path) -> None:
     for aside in left_beside(target, ASIDE):
         discard(aside)

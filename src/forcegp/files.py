@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from forcegp.errors import DestinationError, ForceGPError
-from forcegp.exchange import is_other_than_folder, place, recover
+from forcegp.exchange import is_other_than_file, is_other_than_folder, kind_of, place, recover
 from forcegp.limits import HEADER_BYTES, HEADER_DEPTH
 from forcegp.temporary import Temporary, sweep
 
@@ -72,7 +72,7 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
         Where to write. A reader of `path` sees the old file or the whole new one.
 
     Raises:
-        DestinationError: the place cannot be written, or `path` is a folder.
+        DestinationError: the place cannot be written, or `path` is a folder, a pipe or a device.
 
     Example:
         >>> import os, tempfile
@@ -83,8 +83,12 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
         ['a.txt']
     """
     target = Path(path)
-    if target.is_dir():
-        raise DestinationError(f"{target} is a folder, and a file is to be written there")
+    try:
+        taken = is_other_than_file(target)
+    except OSError as cause:
+        raise _refused(target, cause) from cause
+    if taken:
+        raise DestinationError(f"{target} is {kind_of(target)}, and a file is to be written there")
     with _temporary(target, folder=False, mode=mode) as temporary:
         yield temporary
         try:
@@ -124,7 +128,11 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
     target = Path(path)
     if target.is_symlink():
         target = target.resolve()
-    if is_other_than_folder(target):
+    try:
+        taken = is_other_than_folder(target)
+    except OSError as cause:
+        raise _refused(target, cause) from cause
+    if taken:
         raise DestinationError(f"{target} is a file, and a folder is to be written there")
     recover(target)
     with _temporary(target, folder=True, mode=0o777) as temporary:

@@ -50,6 +50,14 @@ def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVect
     Returns:
         `(*batch, nq, 10 nq)`.
 
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> Y = regressor(robot, q, q, q)
+        >>> Y.shape
+        torch.Size([5, 2, 20])
+
     Raises:
         ShapeError: an argument does not fit the robot.
     """
@@ -116,6 +124,13 @@ def base_parameters(robot: RobotModel, samples: int = 100, seed: int = 0) -> Bas
         robot: the robot; only its kinematics and gravity enter.
         samples: number of random states.
         seed: of the random states.
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> base = base_parameters(robot)
+        >>> base.rank, base.names[0]
+        (6, 'mcx[shoulder]')
     """
     # Kinematics in single precision break symmetries by its rounding, and so seem to have a higher rank.
     tolerance = max(RANK, 100.0 * torch.finfo(robot.dtype).eps)
@@ -190,6 +205,17 @@ def identify(
         q, qd, qdd: `(n, nq)` the motion.
         tau: `(n, nq)` measured joint force; without `friction`, less the dissipative part [N m, N].
         friction: identify viscous and Coulomb friction with the inertial parameters.
+
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> found = identify(system.robot, q, qd, qdd, tau, friction=True)
+        >>> found.damping.shape
+        (2,)
 
     Raises:
         ShapeError: an argument does not fit the robot.

@@ -211,6 +211,14 @@ def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation,
     Returns:
         Rotation `(*batch, 3, 3)` and position `(*batch, 3)` [m].
 
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> rotation, position = frame_pose(robot, q, robot.frame_names[-1])
+        >>> rotation.shape, position.shape
+        (torch.Size([5, 3, 3]), torch.Size([5, 3]))
+
     Raises:
         UnknownNameError: no such frame.
         ShapeError: q does not fit the robot.
@@ -221,7 +229,15 @@ def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation,
 
 
 def point_position(robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)) -> Vector3:
-    """World position `(*batch, 3)` [m] of a point fixed in a frame (coordinates in that frame)."""
+    """World position `(*batch, 3)` [m] of a point fixed in a frame (coordinates in that frame).
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> point_position(robot, q, robot.frame_names[-1], (0.0, 0.0, -0.5)).shape
+        torch.Size([5, 3])
+    """
     R, p = frame_pose(robot, q, frame)
     return p + (R @ as_point(robot, point)[..., None])[..., 0]
 
@@ -230,6 +246,13 @@ def point_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> PointJacobian:
     """J with ṗ = J q̇ for a point fixed in a frame, `(*batch, 3, nq)`, world axes.
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> point_jacobian(robot, q, robot.frame_names[-1]).shape
+        torch.Size([5, 3, 2])
 
     Raises:
         UnknownNameError: no such frame.

@@ -28,7 +28,14 @@ def free_memory() -> int | None:
     return min(known) if known else None
 
 
-def announce_memory(needed: int, what: str, say: Callable[[str], None] | None = None) -> None:
+def announce_memory(
+    needed: int,
+    what: str,
+    say: Callable[[str], None] | None = None,
+    *,
+    certain: int | None = None,
+    hint: str = "use less data or a smaller model, or free memory",
+) -> None:
     """Say how much memory work will need if that is more than half of what is free, and refuse what is more.
 
     Call it before the allocation, with an upper bound.
@@ -37,9 +44,11 @@ def announce_memory(needed: int, what: str, say: Callable[[str], None] | None = 
         needed: [bytes].
         what: the work, as the subject of a sentence: "the covariance of 20,000 points".
         say: what to do with the sentence, by default a `MemoryNeedWarning`.
+        certain: what it needs in any case [bytes], where `needed` is a rough bound; by default `needed`.
+        hint: what to do where there is too little.
 
     Raises:
-        MemoryLimitError: it needs more than is free.
+        MemoryLimitError: it certainly needs more than is free.
 
     Example:
         >>> announce_memory(1000, "a small matrix")
@@ -47,14 +56,16 @@ def announce_memory(needed: int, what: str, say: Callable[[str], None] | None = 
     free = free_memory()
     if free is None or needed <= LARGE * free:
         return
-    if needed > free:
+    least = needed if certain is None else certain
+    if least > free:
         raise MemoryLimitError(
             f"{what} needs more memory than is free",
             expected=f"at most {_gib(free)}",
-            got=_gib(needed),
-            hint="use less data or a smaller model, or free memory",
+            got=_gib(least),
+            hint=hint,
         )
-    sentence = f"{what} needs {_gib(needed)} of {_gib(free)} of free memory"
+    bound = "" if certain is None else "up to "
+    sentence = f"{what} needs {bound}{_gib(needed)} of {_gib(free)} of free memory"
     if say is not None:
         say(sentence)
     else:

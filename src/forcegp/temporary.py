@@ -7,6 +7,7 @@ Where there is no flock (Windows, some network file systems) litter stays; no re
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import secrets
@@ -19,18 +20,29 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
+LONGEST = 200
+"""Bytes of a target's name that its hidden names repeat; file systems allow 255 in all."""
 NEW, ASIDE = ".forcegp-new-", ".forcegp-aside-"
 """Prefixes of what is under construction, and of a folder that is moved aside to make room for another."""
 
 
 def hidden_name(target: Path, prefix: str) -> Path:
     """A hidden, unused path beside a target with the same ending, as some writers go by the ending."""
-    return target.with_name(f"{prefix}{secrets.token_hex(6)}-{target.name}")
+    return target.with_name(f"{prefix}{secrets.token_hex(6)}-{_short(target)}")
+
+
+def _short(target: Path) -> str:
+    """The name of a target, or a digest with the same ending in the place of a long one."""
+    name = os.fsencode(target.name)
+    if len(name) <= LONGEST:
+        return target.name
+    ending = target.suffix if len(os.fsencode(target.suffix)) <= LONGEST // 2 else ""
+    return hashlib.sha256(name).hexdigest() + ending
 
 
 def left_beside(target: Path, prefix: str) -> list[Path]:
     """Everything beside a target that has a hidden name of it, the latest first."""
-    form = re.compile(re.escape(prefix) + "[0-9a-f]{12}-" + re.escape(target.name))
+    form = re.compile(re.escape(prefix) + "[0-9a-f]{12}-" + re.escape(_short(target)))
     try:
         with os.scandir(target.parent) as entries:
             found = [entry for entry in entries if form.fullmatch(entry.name)]

@@ -29,7 +29,7 @@ frame = "lbr_iiwa_link_7"
 point = [0.0, 0.0, 0.1]
 surface = { type = "plane", normal = [0.0, 0.0, 1.0], offset = 0.055 }
 [simulation]
-duration = 0.3
+duration = 0.15
 """
 MAPPING = """
 time = { column = "t" }
@@ -41,20 +41,20 @@ contact.table = { source = "always" }
 """
 SMALL = Profile(
     "quick",
-    duration=3.0,
+    duration=2.0,
     seeds=1,
     sizes=(8,),
     paper_kernels_up_to=0,
     main=8,
     baseline_points=30,
     networks=(),
-    stretch=0.4,
+    stretch=0.3,
     test_samples=10,
     multiplier_seconds=0.5,
     identification_points=8,
     identification_evaluations=3,
     rollout_seconds=0.1,
-    rollout_starts=1,
+    rollout_starts=2,
     rollout_samples=2,
     paper_split_baselines=False,
 )

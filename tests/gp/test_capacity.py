@@ -5,9 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
+from forcegp import memory
 from forcegp.errors import ModelError
-from forcegp.gp.capacity import available_bytes, exact_bytes, require_exact_fits
+from forcegp.gp import capacity
+from forcegp.gp.capacity import exact_bytes, require_exact_fits
 from forcegp.gp.structured_covariance import Block
+from forcegp.memory import MemoryNeedWarning
 
 
 def wide(samples: int) -> Block:
@@ -24,6 +27,14 @@ def test_size_grows_with_the_square_of_the_rows() -> None:
     assert exact_bytes([wide(1000)], learning=False) < small
 
 
+def test_what_takes_most_of_the_memory_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    needed = exact_bytes([wide(100)])
+    for module in (memory, capacity):
+        monkeypatch.setattr(module, "free_memory", lambda: int(1.5 * needed))
+    with pytest.warns(MemoryNeedWarning, match=r"exact inference on 100 samples \(700 rows\) needs"):
+        require_exact_fits([wide(100)])
+
+
 def test_a_long_log_is_refused_with_its_size_and_the_way_out() -> None:
     with pytest.raises(ModelError, match=r"1000000 samples \(7000000 rows\)[\s\S]*GiB[\s\S]*sparse"):
         require_exact_fits([wide(1_000_000)])
@@ -32,7 +43,3 @@ def test_a_long_log_is_refused_with_its_size_and_the_way_out() -> None:
     require_exact_fits([wide(100)], available=needed)
     with pytest.raises(ModelError, match="does not fit"):
         require_exact_fits([wide(100)], available=needed - 1)
-
-
-def test_available_memory_is_plausible() -> None:
-    assert 2**26 < available_bytes() < 2**50

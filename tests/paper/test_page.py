@@ -134,3 +134,8 @@ def test_a_browser_shows_the_page_without_complaint(page: Path, tmp_path: Path) 
     # The page's own policy forbids requests, so that an attempt to fetch anything is a console message.
     assert "CONSOLE" not in done.stderr
     assert POLICY in page.read_text(encoding="utf-8")
+
+
+def test_the_view_is_linked_where_there_is_one() -> None:
+    assert '<a href="view.html">' in render_page(results(), figures(), "view.html")
+    assert "view.html" not in render_page(results(), figures())

@@ -25,8 +25,10 @@ def page(folder: Path, name: str = "model", log: str = "logs/test.parquet") -> s
 def test_the_page_opens_with_the_kind_of_model_the_data_and_the_verdict(tmp_path: Path) -> None:
     text = page(tmp_path)
     assert "<h1>Analytical model on test.parquet</h1>" in text
+    named = page(tmp_path / "named", name="models/arm-2")
+    assert "<h1>Analytical model “arm-2” on test.parquet</h1>" in named
     assert found.verdict in text and text.index(found.verdict) < text.index("<h2>")
-    names = {path.name for path in tmp_path.iterdir()}
+    names = {path.name for path in tmp_path.iterdir() if path.is_file()}
     assert names == {"evaluation.html", "window.json", "predictions.svg", "errors.svg"}
 
 

@@ -16,6 +16,8 @@ from forcegp.cli.reproduce import reproduce
 from forcegp.cli.rollout import rollout
 from forcegp.cli.select import select
 from forcegp.cli.simulate import simulate
+from forcegp.cli.sweep import sweep
+from forcegp.cli.view import view
 from forcegp.errors import ForceGPError
 
 USER_ERROR = 2
@@ -29,7 +31,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (reproduce, simulate, check, select, fit, predict, evaluate, rollout):
+for command in (reproduce, simulate, check, select, fit, predict, evaluate, rollout, sweep, view):
     app.command()(command)
 app.command("import")(import_)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, SceneName, progress_bar, show
+from forcegp.cli.common import AsJson, SceneName, check_apart, progress_bar, show
 
 if TYPE_CHECKING:
     from forcegp.checks import Report
@@ -45,6 +45,7 @@ def check(
 
     if out is not None:
         check_destination(out)
+        check_apart(out, data)
     system = load_scene(scene).system()
     log = read_log(data)
     with progress_bar("checking", 1) as progress:

@@ -76,18 +76,31 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
         typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
 
 
-def check_data_destination(path: Path) -> None:
-    """Check, before long work, that a data set can be written.
+def check_apart(out: Path, *inputs: Path) -> None:
+    """Refuse to write a result over a file that it is made from, or over another result.
+
+    Raises:
+        DestinationError: they are one file.
+    """
+    from forcegp.errors import DestinationError
+
+    if out.resolve() in (path.resolve() for path in inputs):
+        raise DestinationError(f"{out} would be overwritten", hint="name another file for the result")
+
+
+def check_data_destination(path: Path, *inputs: Path) -> None:
+    """Check, before long work, that a data set can be written without losing what it is made from.
 
     Raises:
         DataError: the name does not end in `.parquet`.
-        DestinationError: the place cannot be written.
+        DestinationError: the place cannot be written, or is one of the inputs.
     """
     from forcegp.data.table import check_ending
     from forcegp.destination import check_destination
 
     check_ending(path)
     check_destination(path)
+    check_apart(path, *inputs)
 
 
 def read_data(path: Path, differentiate: int | None = None) -> Dataset:

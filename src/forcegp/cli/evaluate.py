@@ -65,7 +65,7 @@ def evaluate(
     from forcegp.files import atomic_directory, write_json
 
     if out is not None:
-        check_destination(out, folder=True, own_files=["evaluation.json"])
+        check_destination(out, folder=True, own_files=["*.json", "*.html", "*.svg", "*.png"])
     regression = _model(model, scene, config, train)
     robot = regression.system.robot
     test = data_of_robot(read_data(data), robot)

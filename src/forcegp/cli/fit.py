@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,7 @@ from forcegp.cli.common import (
     DataFiles,
     Differentiate,
     SceneName,
+    check_apart,
     data_of_robot,
     model_table,
     progress_bar,
@@ -75,24 +76,34 @@ def fit(
     forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model/
     """
     from forcegp.destination import check_destination, write_or_keep
+    from forcegp.errors import DestinationError
     from forcegp.models.configured import configured
     from forcegp.scene import load_scene
-    from forcegp.storage.folder import HEADER_FILE
+    from forcegp.storage.folder import check_model_destination
     from forcegp.storage.sums import beside
 
-    check_destination(out, folder=True, own_files=[HEADER_FILE])
+    check_model_destination(out)
+    if checkpoint is not None:
+        check_destination(checkpoint)
+        check_apart(checkpoint, *data)
+        if out.resolve() in checkpoint.resolve().parents:
+            raise DestinationError(
+                "the checkpoint would lie in the folder of the model, which is written as a whole",
+                got=checkpoint,
+                hint="name a file outside of it",
+            )
     read = load_scene(scene)
     system = read.system()
     regression = configured(model_table(config, read), system, name=model, noise_std=noise_std, seed=seed)
     training = _training(regression.model, data, differentiate, system.robot)
-    settings: dict[str, Any] = {} if checkpoint is None else _resumable(regression.model, checkpoint)
     with progress_bar(f"fitting {regression.name}", 1) as progress:
         fitted = regression.fit(
             training,  # pyright: ignore[reportArgumentType]  # a stream for a structured GP only
             progress=lambda done, most, value: progress(
                 done, most, "" if math.isnan(value) else f"objective {value:.4g}"
             ),
-            **settings,
+            checkpoint=checkpoint,
+            keep_checkpoint=True,
         )
     write_or_keep(fitted.save, out)
     if checkpoint is not None:
@@ -128,20 +139,3 @@ def _warn(result: FitResult) -> None:
     doubts = () if result.converged else (f"the fit did not converge: {result.message}",)
     for doubt in (*doubts, *result.warnings):
         typer.secho(f"warning: {doubt}", fg="yellow", err=True)
-
-
-def _resumable(regression: Model, checkpoint: Path) -> dict[str, Any]:
-    """What makes the fit of a structured GP record itself.
-
-    Raises:
-        ModelError: the model has no checkpoints.
-    """
-    from forcegp.errors import ModelError
-    from forcegp.models.structured_gp import StructuredGP
-
-    if not isinstance(regression, StructuredGP):
-        raise ModelError(
-            f"a {regression.kind!r} model cannot be resumed",
-            hint="leave out --checkpoint, or use a structured GP",
-        )
-    return {"checkpoint": checkpoint, "keep_checkpoint": True}

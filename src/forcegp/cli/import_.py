@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from forcegp.cli.common import AsJson, progress_bar, show
+from forcegp.cli.common import AsJson, check_apart, progress_bar, show
 
 if TYPE_CHECKING:
     from forcegp.constraints import ConstrainedSystem
@@ -62,13 +62,16 @@ def import_(
 
     if (scene is None) == (robot is None):
         raise ForceGPError("nothing says which robot moved", hint="give either --scene or --robot")
-    system = _system(scene, robot)
     if guess is not None:
-        show(_guess(log, system, guess), as_json)
+        check_destination(guess)
+        check_apart(guess, log)
+        show(_guess(log, _system(scene, robot), guess), as_json)
         return
     if out is None or out.suffix.lower() != ".parquet":
         raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
     check_destination(out)
+    check_apart(out, log)
+    system = _system(scene, robot)
     with progress_bar(f"reading {log.name}", 1) as advance:
         imported = import_log(log, system, mapping, progress=advance)
     write_or_keep(imported.data.write, out)
@@ -87,11 +90,10 @@ def _system(scene: str | None, robot: str | None) -> ConstrainedSystem:
 
 
 def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]:
-    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.destination import write_or_keep
     from forcegp.files import write_text
     from forcegp.logs.guess import guess_mapping
 
-    check_destination(out)
     with progress_bar(f"looking at {log.name}", 1) as advance:
         guessed = guess_mapping(log, system, progress=lambda done, total: advance(done, total))
     write_or_keep(lambda path: write_text(path, guessed.toml), out)

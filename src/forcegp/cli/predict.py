@@ -61,7 +61,7 @@ def predict(
     from forcegp.destination import write_or_keep
     from forcegp.models.load import load_model
 
-    check_data_destination(out)
+    check_data_destination(out, data)
     regression = load_model(model)
     test = data_of_robot(read_data(data), regression.system.robot)
     active = test.active(regression.system.contact_names)

@@ -12,10 +12,10 @@ from forcegp.cli.common import AsJson, progress_bar, show
 
 def reproduce(
     profile: Annotated[
-        Literal["quick", "paper", "real-contact"],
+        Literal["quick", "paper", "large", "real-contact"],
         typer.Option(
-            help="A few minutes, or the paper's sizes; or from a log in CSV to the contact force, on scenes "
-            "whose contact MuJoCo's solver makes."
+            help="A few minutes; the paper's sizes; all samples of a ten-minute log; or from a log in CSV to "
+            "the contact force, on scenes whose contact MuJoCo's solver makes."
         ),
     ] = "quick",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the page and its data.")] = Path("out"),
@@ -33,6 +33,8 @@ def reproduce(
     forcegp reproduce
 
     forcegp reproduce --profile paper --out out/paper --seed 1
+
+    forcegp reproduce --profile large --out out/large
 
     forcegp reproduce --profile real-contact --out out/real-contact
     """

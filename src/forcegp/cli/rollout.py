@@ -60,7 +60,7 @@ def rollout(
     from forcegp.rollout import RolloutOptions
     from forcegp.rollout.inputs import sampling_period
 
-    check_destination(out, folder=True, own_files=["rollout.parquet"])
+    check_destination(out, folder=True, own_files=["rollout*", "*.svg", "*.png"])
     regression = load_model(model)
     log = _stretch(data_of_robot(read_data(data), regression.system.robot), start, duration)
     dt = sampling_period(log)

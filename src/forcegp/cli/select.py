@@ -53,8 +53,9 @@ def select(
     from forcegp.data import split_by_selection, split_by_stretches, without_impacts
     from forcegp.destination import write_or_keep
 
-    for path in (out, *([] if rest is None else [rest])):
-        check_data_destination(path)
+    check_data_destination(out, log)
+    if rest is not None:
+        check_data_destination(rest, log, out)
     whole = read_data(log, differentiate)
     data = whole if keep_impacts else without_impacts(whole)
     with progress_bar("selecting points", count) as progress:

@@ -146,6 +146,13 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
         A function of the states that the eager function takes. The derivatives come as one tensor
         `(*batch, 3, nq, nq)`: with respect to q, q̇ and force.
 
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> q = torch.zeros(5, 2, dtype=torch.float64)
+        >>> fast = compile_dynamics(robot, "forward_dynamics")  # doctest: +SKIP
+        >>> fast(q, 0 * q, 0 * q).shape  # doctest: +SKIP
+
     Raises:
         UnknownNameError: no such quantity.
         ModelError: a figure of the robot is being learned, or its precision has no kernel.

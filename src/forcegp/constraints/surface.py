@@ -95,6 +95,11 @@ class Plane(Surface):
         normal: direction out of the solid; scaled to unit length.
         offset: distance from the world origin along the normal [m].
 
+    Example:
+        >>> import torch
+        >>> float(Plane(normal=(0, 0, 1), offset=0.5).value(torch.tensor([0.0, 0.0, 0.75])))
+        0.25
+
     Raises:
         ParameterError: the normal has no direction, or the offset is not finite.
     """
@@ -130,6 +135,11 @@ class Sphere(Surface):
     Args:
         center: [m].
         radius: [m].
+
+    Example:
+        >>> import torch
+        >>> float(Sphere(center=(0, 0, 0), radius=1.0).value(torch.tensor([0.0, 0.0, 3.0])))
+        2.0
 
     Raises:
         ParameterError: the radius is not positive, or the center is not a point.
@@ -167,6 +177,11 @@ class Cylinder(Surface):
         center: a point of the axis [m].
         axis: direction a of the axis; scaled to unit length.
         radius: [m].
+
+    Example:
+        >>> import torch
+        >>> float(Cylinder(center=(0, 0, 0), axis=(0, 0, 1), radius=1.0).value(torch.tensor([3.0, 0.0, 7.0])))
+        2.0
 
     Raises:
         ParameterError: the axis has no direction, the radius is not positive, or the center is not a point.
@@ -214,6 +229,12 @@ class ImplicitSurface(Surface):
     Args:
         function: maps one point `(3,)` to a scalar tensor, positive outside the solid, in operations
             that PyTorch differentiates twice. The multiplier is in newtons where |∇c| = 1.
+
+    Example:
+        >>> import torch
+        >>> bowl = ImplicitSurface(lambda p: p[2] - 0.5 * (p[0] ** 2 + p[1] ** 2))
+        >>> bowl.gradient(torch.tensor([1.0, 0.0, 2.0]))
+        tensor([-1.,  0.,  1.])
     """
 
     function: Callable[[Tensor], Tensor]

@@ -65,6 +65,14 @@ class ConstrainedSystem:
         contacts: the constraints; an empty sequence is free motion.
         baumgarte: stabilization of the constraint error, or `None`.
 
+    Example:
+        >>> import forcegp
+        >>> robot = forcegp.load_robot("kuka_iiwa")
+        >>> floor = forcegp.Plane(offset=0.05)
+        >>> table = forcegp.SurfaceContact("table", "lbr_iiwa_link_7", (0.0, 0.0, 0.1), floor)
+        >>> ConstrainedSystem(robot, [table], Baumgarte()).m
+        1
+
     Raises:
         UnknownNameError: a contact is attached to an unknown frame.
         ParameterError: two contacts have the same name, or a point is not valid.
@@ -161,6 +169,14 @@ class ConstrainedSystem:
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
             active: `(*batch, n_contacts)` bool, which contacts are closed in each sample; default all.
+
+        Example:
+            >>> import torch, forcegp
+            >>> system = forcegp.load_scene("kuka_plane").system()
+            >>> q, qd = torch.zeros(2, 7, dtype=torch.float64)
+            >>> eom = system.equations(q, qd)
+            >>> eom.A.shape, eom.multiplier(eom.Q_K).shape
+            (torch.Size([1, 7]), torch.Size([1]))
 
         Raises:
             ShapeError: an argument does not fit.

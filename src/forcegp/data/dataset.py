@@ -47,6 +47,16 @@ class Dataset:
 
     Extras are attributes too: `data.Q_z`, `data.multiplier["table"]`.
 
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> data.nq, len(data[::2])
+        (2, 10)
+
     Raises:
         DataError: a shape, type, value or time does not fit; the message names column and row.
     """
@@ -222,6 +232,16 @@ class Dataset:
     def concatenate(parts: Sequence[Dataset]) -> Dataset:
         """Data sets one after another, each with segments of its own.
 
+        Example:
+            >>> import forcegp, torch
+            >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+            >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+            >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+            >>> t = torch.arange(20, dtype=torch.float64)
+            >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+            >>> len(Dataset.concatenate([data, data]))
+            40
+
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
         """
@@ -255,6 +275,19 @@ class Dataset:
 
     def write(self, path: str | Path) -> None:
         """Write to a Parquet file, whole or not at all.
+
+        Example:
+            >>> import forcegp, torch
+            >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+            >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+            >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+            >>> t = torch.arange(20, dtype=torch.float64)
+            >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+            >>> import tempfile
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     data.write(f"{folder}/log.parquet")
+            ...     len(Dataset.read(f"{folder}/log.parquet"))
+            20
 
         Raises:
             DataError: the name does not end in `.parquet`.

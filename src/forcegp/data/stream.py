@@ -54,27 +54,36 @@ class StreamedDataset:
         (10, [5, 5])
     """
 
-    paths: tuple[Path, ...]
+    paths: str | Path | Sequence[str | Path]
     differentiate: SavitzkyGolay | None = None
     joints: tuple[str, ...] | None = None
     dtype: torch.dtype = torch.float64
     device: torch.device | str = "cpu"
 
     def __post_init__(self) -> None:
-        given = (self.paths,) if isinstance(self.paths, str | Path) else tuple(self.paths)
-        if not given:
+        if not self.files:
             raise DataError("there are no files to read", expected="at least one Parquet file", got="none")
-        object.__setattr__(self, "paths", tuple(map(Path, given)))
         self._shapes  # noqa: B018  (damaged files are refused before any work)
+
+    @cached_property
+    def files(self) -> tuple[Path, ...]:
+        """The files as paths."""
+        given = (self.paths,) if isinstance(self.paths, str | Path) else self.paths
+        return tuple(map(Path, given))
 
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:
         """Rows and header of each file."""
-        return tuple(shape_of(path) for path in self.paths)
+        return tuple(shape_of(path) for path in self.files)
 
     def __len__(self) -> int:
         """Number of samples."""
         return sum(rows for rows, _ in self._shapes)
+
+    @property
+    def piece_count(self) -> int:
+        """Number of pieces."""
+        return sum(-(-rows // PIECE_ROWS) for rows, _ in self._shapes)
 
     @cached_property
     def header(self) -> DataHeader:
@@ -97,7 +106,7 @@ class StreamedDataset:
         """
         first, number, count = None, 0, 0
         window = self.differentiate.window if self.differentiate is not None else 0
-        for path in self.paths:
+        for path in self.files:
             for piece in pieces_of(path, PIECE_ROWS, window, number):
                 number = piece.last_segment
                 count += 1

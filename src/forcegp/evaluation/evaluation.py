@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.footprint import announce_states
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.evaluation.baselines import FEWEST, as_torque, baselines
@@ -135,6 +136,18 @@ def evaluate(
     Returns:
         Scores over all joints and by joint, and the verdict.
 
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> fit = forcegp.StructuredGP(system, mean="analytical", noise_std=0.1).fit(data[:10])
+        >>> evaluation = evaluate(fit, data[10:])
+        >>> evaluation.samples
+        10
+
     Raises:
         DataError: the data are empty, or their joints are not the robot's.
         ModelError: the model has not been fitted.
@@ -143,6 +156,7 @@ def evaluate(
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
     data.check_robot(model.system.robot)
+    announce_states(model.system, len(data), 2.0, f"an evaluation on {len(data):,} samples")
     before = system or getattr(model, "specified", model.system)
     predicted = predict_all(model, data, system or model.system, progress)
     clean, noise_std = data.extras.get("qdd_clean"), predicted.noise_std

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.models.base import Predictor
+from forcegp.models.structured_gp import StructuredGP
 
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Probabilities of the central intervals whose coverage is counted."""
@@ -72,7 +73,8 @@ class MultiplierScore:
         samples: in contact.
         bias, spread: mean and standard deviation of predicted less logged λ [N].
         correlation: of predicted and logged λ, `None` if either is constant.
-        coverage: share of logged values within ±2σ, `None` without a covariance.
+        coverage: share of logged values within ±2σ, noise of the torque included; `None` without a
+            covariance.
     """
 
     contact: str
@@ -103,7 +105,11 @@ def multiplier_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[Mult
         part, closed = data[i : i + chunk], active[i : i + chunk]
         predicted = model.predict(part.q, part.qd, part.tau, "multiplier", active=closed)
         means.append(predicted.mean)
-        stds += [] if predicted.std is None else [predicted.std]
+        variance = predicted.variance
+        if variance is not None and isinstance(model, StructuredGP):
+            states = part.q, part.qd, part.tau
+            variance = variance + model.fitted.noise_variance(*states, "multiplier", closed)
+        stds += [] if variance is None else [variance.clamp(min=0.0).sqrt()]
     mean, std = torch.cat(means), torch.cat(stds) if stds else None
     found = []
     for i, name in enumerate(names):

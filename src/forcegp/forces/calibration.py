@@ -11,11 +11,10 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 
+import scipy
 import torch
-from scipy.optimize import brentq
 from torch import Tensor
 
-from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Measurement, Training
@@ -94,7 +93,7 @@ def likelihood_power(
         m = m[_some(_free(m))]
         if len(m.q) < FEWEST:
             continue
-        residual = torch.cat([_residual(posterior, problem.system, part) for part in _chunks(m)])
+        residual = torch.cat([_residual(posterior, problem, hyperparameters, part) for part in _chunks(m)])
         logs.append(autocorrelation_time(residual, m.segment).log())
     return min(1.0, math.exp(-float(torch.stack(logs).mean()))) if logs else 1.0
 
@@ -113,11 +112,15 @@ def _chunks(m: Measurement) -> Iterator[Measurement]:
         yield m[torch.arange(i, min(i + CHUNK_STATES, len(m.q)), device=m.q.device)]
 
 
-def _residual(posterior: ForcePosterior, system: ConstrainedSystem, m: Measurement) -> Tensor:
-    """M q̈ − Q̄ of the posterior mean, `(n, nq)` [N m]."""
+def _residual(
+    posterior: ForcePosterior, problem: Problem, hyperparameters: Mapping[str, Tensor], m: Measurement
+) -> Tensor:
+    """M q̈ − Q̄ of the posterior mean over the noise of the force, `(n, nq)`: joints that stick count less."""
+    system, noise = problem.system, problem.force_noise(hyperparameters)
     at = m.at(system)
     z = affine_map(system, at, "total_force")
-    return (at.eom.M @ m.values[..., None])[..., 0] - posterior.read_mean(system, at, z)
+    residual = (at.eom.M @ m.values[..., None])[..., 0] - posterior.read_mean(system, at, z)
+    return residual if noise is None else residual / noise(at).sqrt()
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
@@ -135,7 +138,7 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
     residuals, variances = [], []
     for i in _motions(training):
         m = training.measurements[i]
-        group = _groups(m.segment)
+        group = stretches(m.segment)
         for g in group.unique().tolist():
             own = (group == g).nonzero()[:, 0]
             rest = dataclasses.replace(problem, training=training.without(i, own))
@@ -148,7 +151,7 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
     return torch.stack([_unit_scale(r2[:, j], V[:, j], least[j]) for j in range(len(least))])
 
 
-def _groups(segment: Tensor) -> Tensor:
+def stretches(segment: Tensor) -> Tensor:
     """Which stretch each sample belongs to: its segment, or an eighth of the log where segments are few."""
     _, own = segment.unique(return_inverse=True)
     if int(own.max()) + 1 >= 3:
@@ -181,4 +184,4 @@ def _unit_scale(r2: Tensor, V: Tensor, least: Tensor) -> Tensor:
 
     if excess(low) <= 0.0:
         return least
-    return torch.full_like(least, math.exp(0.5 * float(brentq(excess, low, high))))  # pyright: ignore[reportArgumentType]
+    return torch.full_like(least, math.exp(0.5 * float(scipy.optimize.brentq(excess, low, high))))  # pyright: ignore[reportArgumentType]

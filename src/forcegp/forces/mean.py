@@ -22,6 +22,10 @@ class AnalyticalMean:
     Args:
         terms: which of `bias`, `gravity`, `friction`, `actuation` are known; none is the zero mean.
 
+    Example:
+        >>> AnalyticalMean(("gravity", "actuation")).terms
+        ('gravity', 'actuation')
+
     Raises:
         UnknownNameError: a term does not exist.
         ModelError: a term is named twice.

@@ -32,6 +32,16 @@ class Observation:
             `constraint_force`, `joint_force`, `contact_friction` or `total_force`.
         noise_std: standard deviation of the measurement: one number, one per component, or `(n, d)`. For
             `qdd`, the default is that of the model, else the `qdd_std` of the log, else that of its header.
+
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> Observation(data, "qdd", noise_std=0.1).quantity
+        'qdd'
     """
 
     data: Dataset

@@ -14,7 +14,7 @@ from forcegp.forces.priors.base import CONTACT
 from forcegp.forces.quantities import States
 from forcegp.gp.pathwise import FEATURES, FunctionSamples
 
-CHUNK_STATES = 48
+CHUNK_STATES = 256
 """States at which samples are evaluated at once, so that intermediate arrays stay in the cache."""
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 
 from forcegp.errors import ModelError
 from forcegp.gp.structured_covariance import Block
+from forcegp.memory import announce_memory, free_memory
 
 MATRICES_TO_LEARN = 3.0
 """Square matrices of all rows that learning holds at once: the covariance, its factor and a copy."""
@@ -17,9 +16,6 @@ MATRICES_TO_CONDITION = 2.0
 
 SHARE = 0.8
 """Fraction of the free memory that exact inference may take."""
-
-CGROUP = Path("/sys/fs/cgroup")
-"""Where Linux says how much memory a container may use."""
 
 
 def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
@@ -37,24 +33,8 @@ def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
     return int(item * ((MATRICES_TO_LEARN if learning else MATRICES_TO_CONDITION) * rows**2 + kernels))
 
 
-def available_bytes() -> int:
-    """Memory that the process may still take: what the system has free, within a container's limit."""
-    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    information = Path("/proc/meminfo")
-    if information.is_file():
-        lines = dict(line.split(":", 1) for line in information.read_text().splitlines())
-        free = int(lines["MemAvailable"].split()[0]) * 1024
-    limit, used = (_number(CGROUP / name) for name in ("memory.max", "memory.current"))
-    return free if limit is None or used is None else min(free, max(limit - used, 0))
-
-
-def _number(path: Path) -> int | None:
-    text = path.read_text().strip() if path.is_file() else ""
-    return int(text) if text.isdigit() else None
-
-
 def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available: int | None = None) -> None:
-    """Refuse exact inference that would not fit into memory.
+    """Refuse exact inference that would not fit into memory, and announce what takes most of it.
 
     Args:
         blocks: whitened rows.
@@ -64,14 +44,16 @@ def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available
     Raises:
         ModelError: it takes more.
     """
-    allowed = int(SHARE * available_bytes()) if available is None else available
+    free = free_memory()
+    allowed = (None if free is None else int(SHARE * free)) if available is None else available
     needed = exact_bytes(blocks, learning)
-    if needed > allowed:
-        rows = sum(block.rows for block in blocks)
-        samples = sum(len(block.target) for block in blocks)
+    rows = sum(block.rows for block in blocks)
+    samples = sum(len(block.target) for block in blocks)
+    if allowed is not None and needed > allowed:
         raise ModelError(
             f"exact inference on {samples} samples ({rows} rows) does not fit into memory",
             expected=f"at most {allowed / 2**30:.1f} GiB",
             got=f"{needed / 2**30:.1f} GiB",
             hint='use inference="sparse", or fewer samples',
         )
+    announce_memory(needed, f"exact inference on {samples} samples ({rows} rows)")

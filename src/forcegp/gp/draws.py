@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -18,6 +19,11 @@ class FunctionDraw(ABC):
     @abstractmethod
     def basis(self, x: Features) -> Tensor:
         """φ(x) `(k, n, features)` with E[φ φ′ᵀ] = k(x, x′)."""
+
+    def common(self) -> tuple[FunctionDraw, Tensor] | None:
+        """One set of features for all components, `(1, n, features)`, and a factor for each component and
+        feature `(k, features)`; `None` where components differ by more than factors."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,12 @@ class FourierDraw(FunctionDraw):
         scale = self.std * math.sqrt(2.0 / self.phase.shape[-1])
         return scale[:, None, None] * torch.cos(angle)
 
+    def common(self) -> tuple[FunctionDraw, Tensor] | None:
+        if len(self.phase) > 1:
+            return None
+        unit = FourierDraw(self.inputs, self.omega, self.phase, torch.ones_like(self.std[:1]))
+        return unit, self.std[:, None].expand(-1, self.phase.shape[-1])
+
 
 @dataclass(frozen=True)
 class LinearDraw(FunctionDraw):
@@ -47,6 +59,10 @@ class LinearDraw(FunctionDraw):
         scaled = stacked(x, self.inputs) * self.slope[:, None, :]
         return torch.cat([scaled, self.bias[:, None, None].expand(-1, scaled.shape[1], 1)], dim=-1)
 
+    def common(self) -> tuple[FunctionDraw, Tensor]:
+        unit = LinearDraw(self.inputs, torch.ones_like(self.slope[:1]), torch.ones_like(self.bias[:1]))
+        return unit, torch.cat([self.slope, self.bias[:, None]], dim=-1)
+
 
 @dataclass(frozen=True)
 class ConstantDraw(FunctionDraw):
@@ -57,6 +73,9 @@ class ConstantDraw(FunctionDraw):
     def basis(self, x: Features) -> Tensor:
         n = stacked(x, None).shape[-2]
         return self.std[:, None, None].expand(-1, n, 1)
+
+    def common(self) -> tuple[FunctionDraw, Tensor]:
+        return ConstantDraw(torch.ones_like(self.std[:1])), self.std[:, None]
 
 
 @dataclass(frozen=True)
@@ -69,6 +88,12 @@ class SumDraw(FunctionDraw):
     def basis(self, x: Features) -> Tensor:
         return torch.cat([self.left.basis(x), self.right.basis(x)], dim=-1)
 
+    def common(self) -> tuple[FunctionDraw, Tensor] | None:
+        left, right = self.left.common(), self.right.common()
+        if left is None or right is None:
+            return None
+        return SumDraw(left[0], right[0]), torch.cat([left[1], right[1]], dim=-1)
+
 
 @dataclass(frozen=True)
 class OuterDraw(FunctionDraw):
@@ -79,6 +104,12 @@ class OuterDraw(FunctionDraw):
 
     def basis(self, x: Features) -> Tensor:
         return (self.left.basis(x)[..., :, None] * self.right.basis(x)[..., None, :]).flatten(-2)
+
+    def common(self) -> tuple[FunctionDraw, Tensor] | None:
+        left, right = self.left.common(), self.right.common()
+        if left is None or right is None:
+            return None
+        return OuterDraw(left[0], right[0]), (left[1][:, :, None] * right[1][:, None, :]).flatten(-2)
 
 
 @dataclass(frozen=True)
@@ -91,10 +122,28 @@ class ProductDraw(FunctionDraw):
     seed: int
 
     def basis(self, x: Features) -> Tensor:
-        left, right = self.left.basis(x), self.right.basis(x)
-        generator = torch.Generator().manual_seed(self.seed)
+        return self._paired(self.left.basis(x), self.right.basis(x))
+
+    def common(self) -> tuple[FunctionDraw, Tensor] | None:
+        left, right = self.left.common(), self.right.common()
+        if left is None or right is None:
+            return None
+        i, j = self._pairs(left[1].shape[-1], right[1].shape[-1])
+        factors = left[1][:, i.to(left[1].device)] * right[1][:, j.to(right[1].device)]
+        return ProductDraw(left[0], right[0], self.features, self.seed), factors
+
+    def _paired(self, left: Tensor, right: Tensor) -> Tensor:
         n_left, n_right = left.shape[-1], right.shape[-1]
-        i = torch.randint(n_left, (self.features,), generator=generator).to(left.device)
-        j = torch.randint(n_right, (self.features,), generator=generator).to(left.device)
-        scale = math.sqrt(n_left * n_right / self.features)
-        return scale * left[..., i] * right[..., j]
+        i, j = (pair.to(left.device) for pair in self._pairs(n_left, n_right))
+        return math.sqrt(n_left * n_right / self.features) * left[..., i] * right[..., j]
+
+    def _pairs(self, n_left: int, n_right: int) -> tuple[Tensor, Tensor]:
+        """Which features are multiplied."""
+        return _random_pairs(n_left, n_right, self.features, self.seed)
+
+
+@lru_cache(maxsize=64)
+def _random_pairs(n_left: int, n_right: int, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    i = torch.randint(n_left, (count,), generator=generator)
+    return i, torch.randint(n_right, (count,), generator=generator)

@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from forcegp.gp.capacity import require_exact_fits
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.likelihood import Conditioned, condition, target_of
@@ -47,6 +48,7 @@ class ExactPosterior:
     @cached_property
     def conditioned(self) -> Conditioned:
         """Factorisation of the covariance of the rows, computed when first needed after loading."""
+        require_exact_fits(self.blocks, learning=False)
         return condition(self.processes, self.params, self.blocks)
 
     def is_measured(self, p: int) -> bool:

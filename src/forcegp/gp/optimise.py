@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import scipy.optimize
+import scipy
 import torch
 from torch import Tensor
 
@@ -37,6 +37,10 @@ class LearningOptions:
             twice as many and so on, and at last on all; `None` learns on all from the start.
         restarts: further random starts, of which the best end is kept.
         seed: of the random starts.
+
+    Example:
+        >>> LearningOptions(max_evaluations=50).optimizer
+        'lbfgs'
     """
 
     optimizer: Literal["lbfgs", "adam"] = "lbfgs"

@@ -24,7 +24,7 @@ UNMEASURED = 4
 """A process that no row depends on gets this many times fewer features: no data correct its draws."""
 
 Basis = Callable[[Features], Tensor]
-"""x ↦ φ(x) `(components, n, terms)`."""
+"""x ↦ φ(x) `(components, n, terms)`, or `(1, n, terms)` where all components have the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,17 +63,20 @@ class FunctionSamples:
 
     @cached_property
     def _weights_by_sample(self) -> list[list[Tensor]]:
-        """By process and basis, `(components, samples, terms, 1)`."""
-        return [[w.mT.contiguous()[..., None] for w in own] for own in self.weights]
+        """By process and basis, `(samples, components, terms)`."""
+        return [[w.permute(2, 0, 1).contiguous() for w in own] for own in self.weights]
 
     def by_runs(self, p: int, features: Features, samples: range, runs: int) -> Tensor:
         """Values of process p from some samples, each at its own runs of states: `(samples · runs,
         components)`."""
-        parts = [
-            basis(features).unflatten(1, (len(samples), runs)) @ w[:, samples.start : samples.stop]
-            for basis, w in zip(self.bases[p], self._weights_by_sample[p], strict=True)
-        ]
-        return sum(parts[1:], start=parts[0])[..., 0].flatten(1).mT
+        parts = []
+        for basis, w in zip(self.bases[p], self._weights_by_sample[p], strict=True):
+            phi, own = basis(features).unflatten(1, (len(samples), runs)), w[samples.start : samples.stop]
+            if len(phi) == 1:
+                parts.append(phi[0] @ own.mT)
+            else:
+                parts.append(torch.einsum("ksrt,skt->srk", phi, own))
+        return sum(parts[1:], start=parts[0]).flatten(0, 1)
 
 
 @dataclass(frozen=True, eq=False)

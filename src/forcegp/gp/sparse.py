@@ -18,6 +18,7 @@ from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.blocks import chunked, components_of
 from forcegp.gp.diagnostics import Diagnostics
+from forcegp.gp.drift import drifted
 from forcegp.gp.factor import extended
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters
@@ -192,6 +193,16 @@ class SparsePosterior:
             ModelError: the factor is not between 0 and 1.
         """
         return SparsePosterior.of(self.basis, self.sums.scaled(factor))
+
+    def drifting(self, factor: float, processes: Sequence[int]) -> SparsePosterior:
+        """With the weights of some processes drifting towards their prior, the others as they are.
+
+        Raises:
+            ModelError: the factor is not between 0 and 1.
+        """
+        columns = torch.arange(self.basis.size, device=self.L.device)
+        own = torch.cat([columns[self.basis.of_process(p)] for p in processes])
+        return SparsePosterior.of(self.basis, drifted(self.sums, own, factor))
 
     def without(self, blocks: Sequence[Block]) -> SparsePosterior:
         """Without samples that it was conditioned on.

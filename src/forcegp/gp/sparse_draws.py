@@ -46,9 +46,10 @@ def _terms(
         count = draw.basis(part.inducing).shape[-1]
         shape = (part.components, count, weights.shape[1])
         u = torch.randn(shape, dtype=torch.float64, generator=generator).to(weights)
-        terms.append((draw.basis, u))
+        at_points = draw.basis(part.inducing) @ u
+        common = draw.common()
+        terms.append((draw.basis, u) if common is None else (common[0].basis, common[1][..., None] * u))
         if part.to_inducing is not None:
-            at_points = draw.basis(part.inducing) @ u
             # R Rᵀ f_prior(Z) are the weights of k(x, Z) that interpolate the prior function.
             terms.append((part.to_inducing, on_kernel - part.roots @ (part.roots.mT @ at_points)))
     if part.finite is not None:

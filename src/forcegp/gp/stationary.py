@@ -67,7 +67,8 @@ class _Stationary(Kernel):
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         lengthscale = params["log_lengthscale"].exp()
-        k, width = len(params["log_std"]), lengthscale.shape[-1]
+        # Components that share length-scales share frequencies too; their weights are independent.
+        k, width = lengthscale.shape
         omega = self.frequencies((k, features, width), generator).to(lengthscale) / lengthscale[:, None, :]
         phase = 2.0 * math.pi * torch.rand(k, features, dtype=torch.float64, generator=generator)
         return FourierDraw(self.inputs, omega, phase.to(lengthscale), params["log_std"].exp())

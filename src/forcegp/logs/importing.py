@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.footprint import announce_states
 from forcegp.data import DataHeader, Dataset
 from forcegp.errors import DataError
 from forcegp.logs import clock, smoothing, wrench
@@ -104,6 +105,7 @@ def import_log(
     report.did(f"read {Path(path).name} by mapping {Path(known.source).name}")
     try:
         signals = gather(path, known, robot.joint_names, report, progress)
+        announce_states(system, len(signals), 2.0, f"importing {len(signals):,} rows")
         smoothing.even_clock(signals, known.sections.time.period, report)
         found = _contacts(signals, system, known, report)
         std = smoothing.complete(signals, known.sections.derivatives, report)

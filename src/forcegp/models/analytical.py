@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -23,10 +24,13 @@ from forcegp.gp.optimise import Learned, LearningOptions, minimise
 from forcegp.models.base import FitProgress, FitResult, FittedModel, ForceField, Model, Prediction
 from forcegp.models.minibatch import BatchOptions, Loss, train
 from forcegp.robot.parameters import AnalyticalParameters
+from forcegp.storage.checkpoint import Checkpoint
+from forcegp.storage.epochs import EpochCheckpoint
 from forcegp.storage.folder import ModelHeader, Settings, settings_of
-from forcegp.storage.system import robot_tensors, take, take_robot
+from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
 
 KIND = "analytical"
+Tensors = dict[str, Tensor]
 LearnedParameters = Mapping[str, Sequence[str] | Literal["all"]]
 EVERY_LINK: LearnedParameters = {"inertia": "all", "damping": "all"}
 """Mass, centre of mass and rotational inertia of every link, and the viscous friction of every joint."""
@@ -73,6 +77,17 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         window: how far from the parameters of the file learning starts.
         seed: of the start.
 
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> fit = AnalyticalModel(system).fit(data)
+        >>> fit.predict(q, qd, tau).mean.shape
+        torch.Size([20, 2])
+
     Raises:
         UnknownNameError, ModelError, InertiaError: `learn` does not fit the robot.
     """
@@ -106,6 +121,8 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         *,
         options: BatchOptions | LearningOptions | None = None,
         progress: FitProgress | None = None,
+        checkpoint: str | Path | None = None,
+        keep_checkpoint: bool = False,
     ) -> AnalyticalFit:
         """Minimise the mean squared error of the accelerations, from a random start in the window.
 
@@ -114,6 +131,9 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             options: ADAM on batches with early stopping by default; `LearningOptions` minimise over all
                 samples at once, by L-BFGS or ADAM.
             progress: called after each epoch, or evaluation.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits, and
+                removes it at its end.
+            keep_checkpoint: leave the file, to be removed once the model is saved.
 
         Raises:
             ModelError, DataError: the data do not fit the model.
@@ -129,14 +149,20 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             robot = torch.func.functional_call(theta, dict(tensors), ())
             return _mean_squared_error(self.specified.with_robot(robot), measured, rows)
 
+        saved = None if checkpoint is None else Path(checkpoint)
+        key = "" if saved is None else _key(self.specified, measured, options, start, self.seed)
         if isinstance(options, BatchOptions):
-            learned = train(loss, start, len(measured.q), options, generator, progress)
+            kept = None if saved is None else EpochCheckpoint(saved, key)
+            learned = train(loss, start, len(measured.q), options, generator, progress, kept)
         else:
-            learned = _minimise(loss, start, len(measured.q), options, progress)
+            kept = None if saved is None else Checkpoint(saved, key)
+            learned = _minimise(loss, start, len(measured.q), options, progress, kept)
         theta.load_state_dict(learned.tensors)
         with torch.no_grad():
             system = self.specified.with_robot(theta())
         self._fitted = AnalyticalFit(system, theta, self.window, self.seed, FitResult.of(learned))
+        if kept is not None and not keep_checkpoint:
+            kept.remove()
         return self._fitted
 
     @property
@@ -254,6 +280,7 @@ def _minimise(
     samples: int,
     options: LearningOptions,
     progress: FitProgress | None,
+    saved: Checkpoint | None,
 ) -> Learned:
     """Minimise over all samples at once."""
     rows = torch.arange(samples, device=next(iter(start.values())).device)
@@ -262,7 +289,28 @@ def _minimise(
         if progress is not None:
             progress(evaluations, options.max_evaluations, value)
 
-    return minimise(lambda tensors: loss(tensors, rows), start, options, progress=report)
+    def objective(tensors: Tensors) -> Tensor:
+        return loss(tensors, rows)
+
+    if saved is None:
+        return minimise(objective, start, options, progress=report)
+    saved.read(start)
+    learned = minimise(saved.recorded(objective), start, options, progress=report)
+    saved.write()
+    return learned
+
+
+def _key(
+    system: ConstrainedSystem,
+    measured: Measurement,
+    options: BatchOptions | LearningOptions,
+    start: Mapping[str, Tensor],
+    seed: int,
+) -> str:
+    """Identifies learning from these measurements of this system, with these options."""
+    record, robot = pack_system(system)
+    begin = (part for pair in start.items() for part in pair)
+    return Checkpoint.key_of(options, seed, record, *robot.values(), *measured.tensors, *begin)
 
 
 def _mean_squared_error(system: ConstrainedSystem, measured: Measurement, rows: Tensor) -> Tensor:

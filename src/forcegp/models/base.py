@@ -272,8 +272,22 @@ class Model(Predictor, Generic[F]):
         """Arguments of the constructor: `type(model)(**model.get_params())` is an unfitted copy."""
 
     @abstractmethod
-    def fit(self, data: Dataset, *, progress: FitProgress | None = None) -> F:
+    def fit(
+        self,
+        data: Dataset,
+        *,
+        progress: FitProgress | None = None,
+        checkpoint: str | Path | None = None,
+        keep_checkpoint: bool = False,
+    ) -> F:
         """Learn from a data set.
+
+        Args:
+            data: states and measurements.
+            progress: called now and then.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits, and
+                removes it at its end.
+            keep_checkpoint: leave the file, to be removed once the model is saved.
 
         Returns:
             The fitted model, which is also kept as `fitted`.

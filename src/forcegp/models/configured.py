@@ -40,8 +40,10 @@ KEYS: dict[str, tuple[str, ...]] = {
         "priors",
         "learn_noise",
         "torque_noise",
+        "state_noise",
         "sensor_noise_std",
         "inference",
+        "inducing_points",
         "analytical",
     ),
 }
@@ -118,7 +120,8 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
     given = {key: value for key, value in table.section.given().items() if key not in COMMON}
     for key in given:
         _check_key(table, ("model", key), (*COMMON, *KEYS[kind]), f"the model {name!r}")
-    arguments = {key: given[key] for key in ("learn_noise", "inference", "hidden") if key in given}
+    plain = ("learn_noise", "state_noise", "inference", "inducing_points", "hidden")
+    arguments = {key: given[key] for key in plain if key in given}
     at = table.document.at
     if isinstance(mean := given.get("mean"), str):
         arguments["mean"] = mean

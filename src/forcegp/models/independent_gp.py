@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,6 +26,7 @@ from forcegp.gp.features import Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
 from forcegp.gp.structured_covariance import Block
+from forcegp.memory import announce_memory
 from forcegp.models.base import (
     FitProgress,
     FitResult,
@@ -33,10 +35,13 @@ from forcegp.models.base import (
     Prediction,
     check_acceleration_only,
 )
+from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.folder import ModelHeader, Settings, settings_of
 from forcegp.storage.system import take
 
 KIND = "independent_gp"
+LEARNING = 6
+"""Matrices over the samples that learning one joint holds besides the factors of all joints; measured."""
 CHUNK_STATES = 2000
 """States predicted at a time, which bounds the memory."""
 
@@ -83,6 +88,17 @@ class IndependentGP(Model["IndependentFit"]):
         system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states, else 0.1.
+
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> fit = IndependentGP(system, noise_std=0.1).fit(data)
+        >>> fit.predict(q, qd, tau).std.shape
+        torch.Size([20, 2])
     """
 
     kind = KIND
@@ -100,6 +116,8 @@ class IndependentGP(Model["IndependentFit"]):
         *,
         options: LearningOptions | None = None,
         progress: FitProgress | None = None,
+        checkpoint: str | Path | None = None,
+        keep_checkpoint: bool = False,
     ) -> IndependentFit:
         """Learn the hyperparameters of each joint by maximum a posteriori, one joint after the other.
 
@@ -107,6 +125,9 @@ class IndependentGP(Model["IndependentFit"]):
             data: states and measured accelerations.
             options: optimiser and its limits, for each joint.
             progress: called after each evaluation, with those of all joints.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits, and
+                removes it at its end.
+            keep_checkpoint: leave the file, to be removed once the model is saved.
 
         Raises:
             ModelError, DataError: the data do not fit the model.
@@ -117,6 +138,8 @@ class IndependentGP(Model["IndependentFit"]):
         features = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
         training = IndependentTraining(features, measured.values, noise_std, Standardization.of(features))
         priors = joint_processes(self.specified.robot.nq)
+        _announce(training, LEARNING)
+        saved = None if checkpoint is None else _record(Path(checkpoint), training, priors, options)
         parts: list[Learned] = []
         for joint, prior in enumerate(priors):
             before = sum(part.evaluations for part in parts)
@@ -125,9 +148,13 @@ class IndependentGP(Model["IndependentFit"]):
                 if progress is not None:
                     progress(before + evaluations, options.max_evaluations * len(priors), value)
 
-            parts.append(_learn(training, prior, joint, options, report))
+            parts.append(_learn(training, prior, joint, options, report, saved))
+        if saved is not None:
+            saved.write()
         hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
         self._fitted = fitted(self.specified, self.noise_std, training, hyperparameters, parts)
+        if saved is not None and not keep_checkpoint:
+            saved.remove()
         return self._fitted
 
     def log_marginal_likelihood(self) -> float:
@@ -152,8 +179,9 @@ def _learn(
     joint: int,
     options: LearningOptions,
     report: Progress,
+    saved: Checkpoint | None,
 ) -> Learned:
-    """Learn the process of one joint."""
+    """Learn the process of one joint; the record of one joint follows that of the one before."""
     blocks = [training.block(joint)]
     start = initial_hyperparameters([prior], blocks)
     constant = training.constant(joint)
@@ -162,7 +190,24 @@ def _learn(
         value, _ = negative_log_likelihood([prior], tensors, blocks)
         return value + constant + negative_log_prior(tensors, start)
 
-    return minimise(objective, start, options, bounds=bounds_of(start), progress=report)
+    recorded = objective if saved is None else saved.recorded(objective)
+    return minimise(recorded, start, options, bounds=bounds_of(start), progress=report)
+
+
+def _record(
+    path: Path, training: IndependentTraining, priors: Sequence[JointForcePrior], options: LearningOptions
+) -> Checkpoint:
+    """The record of an interrupted fit, or an empty one."""
+    data = (*training.features.values(), training.qdd, training.noise_std)
+    saved = Checkpoint(path, Checkpoint.key_of(KIND, options, len(priors), *data))
+    saved.read(initial_hyperparameters(priors[:1], [training.block(0)]))
+    return saved
+
+
+def _announce(training: IndependentTraining, copies: int) -> None:
+    """Announce the matrices of all joints, two each beside those that learning holds."""
+    n, nq = training.qdd.shape
+    announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
 
 
 def fitted(
@@ -301,6 +346,7 @@ def load_independent(
         for prior in joint_processes(nq)
         for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
     }
+    _announce(training, 0)
     try:
         model._fitted = fitted(system, settings.noise_std, training, hyperparameters)
     except ForceGPError as cause:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from forcegp.models.structured_load import load_structured
 from forcegp.storage.folder import HEADER_FILE, ModelHeader, own_tensors, read_model
 from forcegp.storage.system import unpack_system
 
-Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], Model]
+Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], Model[Any]]
 
 LOADERS: dict[str, Loader] = {
     AnalyticalModel.kind: load_analytical,
@@ -29,13 +30,27 @@ LOADERS: dict[str, Loader] = {
 """What reads each kind of models."""
 
 
-def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> Model:
+def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> Model[Any]:
     """Read a model that `Model.save` wrote; it predicts the same, bit for bit.
 
     Args:
         path: the folder.
         system: where to take constraints from that only Python code describes (an `ImplicitSurface`);
             robot and other constraints are those in the folder.
+
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> import tempfile
+        >>> fit = forcegp.AnalyticalModel(system).fit(data)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     fit.save(f"{folder}/model")
+        ...     load_model(f"{folder}/model").kind
+        'analytical'
 
     Raises:
         ModelError: no model is there, it is damaged, or a constraint is to be given.

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from torch import Tensor
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.optimise import Learned
 from forcegp.models.base import FitProgress
+from forcegp.storage.epochs import HISTORY, EpochCheckpoint
 
 Loss = Callable[[Mapping[str, Tensor], Tensor], Tensor]
 """Maps tensors and row numbers `(k,)` to the mean squared error of these rows."""
@@ -58,6 +60,7 @@ def train(
     options: BatchOptions,
     generator: torch.Generator,
     progress: FitProgress | None = None,
+    saved: EpochCheckpoint | None = None,
 ) -> Learned:
     """Minimise a mean over samples; the result is the best epoch on the held-out samples.
 
@@ -68,42 +71,115 @@ def train(
         options: how to train.
         generator: of the held-out part and the order of rows.
         progress: called after each epoch with its number, the most there will be, and the held-out loss.
+        saved: where the state is kept now and then, and where training resumes.
 
     Returns:
         The tensors, the held-out loss, and one entry an epoch as history.
 
     Raises:
-        ModelError: there are too few samples to hold any out.
+        ModelError: there are too few samples to hold any out, or the saved state belongs to another fit.
         NumericalError: the loss is not finite.
     """
     began = time.perf_counter()
     held, rows = _split(samples, options.held_out, generator, next(iter(start.values())).device)
-    tensors = {name: value.detach().clone().requires_grad_() for name, value in start.items()}
-    optimizer = torch.optim.Adam(tensors.values(), lr=options.learning_rate)
-    best, value, since, history = dict(start), math.inf, 0, []
-    for epoch in range(options.epochs):
-        for group in optimizer.param_groups:
+    state = _State.at(start, options.learning_rate, generator)
+    if saved is not None and (found := saved.read(state.tensors())) is not None:
+        state.restore(found, saved.path)
+    while len(state.history) < options.epochs and state.since < options.patience:
+        epoch = len(state.history)
+        for group in state.optimizer.param_groups:
             group["lr"] = 0.5 * options.learning_rate * (1.0 + math.cos(math.pi * epoch / options.epochs))
         for batch in rows[torch.randperm(len(rows), generator=generator)].split(options.batch):
-            optimizer.zero_grad()
-            loss(tensors, batch).backward()
-            optimizer.step()
+            state.optimizer.zero_grad()
+            loss(state.weights, batch).backward()
+            state.optimizer.step()
         with torch.no_grad():
-            history.append(float(loss(tensors, held)))
-        if not math.isfinite(history[-1]):
-            raise NumericalError(
-                f"training diverged in epoch {epoch + 1}", hint="lower the learning rate in the options"
-            )
-        since += 1
-        if history[-1] < value:
-            best, value, since = {k: x.detach().clone() for k, x in tensors.items()}, history[-1], 0
+            state.note(float(loss(state.weights, held)))
         if progress is not None:
-            progress(epoch + 1, options.epochs, history[-1])
-        if since >= options.patience:
-            break
+            progress(epoch + 1, options.epochs, state.history[-1])
+        if saved is not None:
+            saved.write_now_and_then(state.tensors)
+    if saved is not None:
+        saved.write(state.tensors())
+    history, since = state.history, state.since
     converged = since >= options.patience or _flat(history)
     message = f"{len(history)} epochs, the best on the held-out samples was {len(history) - since}"
-    return Learned(best, value, converged, len(history), time.perf_counter() - began, message, history)
+    seconds = time.perf_counter() - began
+    return Learned(state.best, state.value, converged, len(history), seconds, message, history)
+
+
+@dataclass
+class _State:
+    """Everything that decides how training goes on."""
+
+    weights: dict[str, Tensor]
+    optimizer: torch.optim.Adam
+    generator: torch.Generator
+    best: dict[str, Tensor]
+    history: list[float]
+
+    @classmethod
+    def at(cls, start: Mapping[str, Tensor], learning_rate: float, generator: torch.Generator) -> _State:
+        """The state before the first epoch."""
+        weights = {name: value.detach().clone().requires_grad_() for name, value in start.items()}
+        optimizer = torch.optim.Adam(weights.values(), lr=learning_rate)
+        return cls(weights, optimizer, generator, {k: x.detach().clone() for k, x in start.items()}, [])
+
+    @property
+    def value(self) -> float:
+        """The least held-out loss so far."""
+        return min(self.history, default=math.inf)
+
+    @property
+    def since(self) -> int:
+        """Epochs since the first one with the least held-out loss."""
+        return len(self.history) - 1 - self.history.index(self.value) if self.history else 0
+
+    def note(self, held_out: float) -> None:
+        """Take down the end of an epoch.
+
+        Raises:
+            NumericalError: the loss is not finite.
+        """
+        if not math.isfinite(held_out):
+            raise NumericalError(
+                f"training diverged in epoch {len(self.history) + 1}",
+                hint="lower the learning rate in the options",
+            )
+        if held_out < self.value:
+            self.best = {name: x.detach().clone() for name, x in self.weights.items()}
+        self.history.append(held_out)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The state by name."""
+        found = {HISTORY: torch.tensor(self.history, dtype=torch.float64)}
+        found["generator"] = self.generator.get_state()
+        for name, x in self.weights.items():
+            moments = self.optimizer.state.get(x, {})
+            found[f"weights.{name}"] = x.detach()
+            found[f"best.{name}"] = self.best[name]
+            found[f"step.{name}"] = moments.get("step", torch.zeros(()))
+            for moment in ("exp_avg", "exp_avg_sq"):
+                found[f"{moment}.{name}"] = moments.get(moment, torch.zeros_like(x.detach()))
+        return found
+
+    def restore(self, found: Mapping[str, Tensor], source: Path) -> None:
+        """Go on where a state was saved.
+
+        Raises:
+            ModelError: the state of the generator is damaged.
+        """
+        try:
+            self.generator.set_state(found["generator"])
+        except RuntimeError as cause:
+            raise ModelError(f"{source}: the checkpoint is damaged", got=str(cause)) from cause
+        self.history = found[HISTORY].tolist()
+        with torch.no_grad():
+            for name, x in self.weights.items():
+                x.copy_(found[f"weights.{name}"])
+                self.best[name] = found[f"best.{name}"].clone()
+                kept = {key: found[f"{key}.{name}"].clone() for key in ("step", "exp_avg", "exp_avg_sq")}
+                self.optimizer.state[x] = kept
 
 
 FLAT = 0.05

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,6 +26,8 @@ from forcegp.models.base import (
     check_acceleration_only,
 )
 from forcegp.models.minibatch import BatchOptions, train
+from forcegp.storage.checkpoint import Checkpoint
+from forcegp.storage.epochs import EpochCheckpoint
 from forcegp.storage.folder import ModelHeader, Settings, settings_of
 from forcegp.storage.system import take
 
@@ -54,6 +57,17 @@ class NeuralNetwork(Model["NetworkFit"]):
         hidden: widths of the hidden layers.
         seed: of the initial weights, the held-out samples and the order of the batches.
 
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> fit = NeuralNetwork(system, hidden=[8]).fit(data)
+        >>> fit.predict(q, qd, tau).mean.shape
+        torch.Size([20, 2])
+
     Raises:
         ModelError: a width is not positive.
     """
@@ -76,6 +90,8 @@ class NeuralNetwork(Model["NetworkFit"]):
         *,
         options: BatchOptions | None = None,
         progress: FitProgress | None = None,
+        checkpoint: str | Path | None = None,
+        keep_checkpoint: bool = False,
     ) -> NetworkFit:
         """Train with ADAM on batches; the weights of the best epoch on held-out samples are kept.
 
@@ -83,6 +99,9 @@ class NeuralNetwork(Model["NetworkFit"]):
             data: states and measured accelerations.
             options: how to train; `SHALLOW` or `DEEP` by default.
             progress: called after each epoch.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits, and
+                removes it at its end.
+            keep_checkpoint: leave the file, to be removed once the model is saved.
 
         Returns:
             The epochs as `evaluations`, and the held-out error of standardized accelerations.
@@ -105,11 +124,17 @@ class NeuralNetwork(Model["NetworkFit"]):
 
         options = options or (DEEP if len(self.hidden) > 2 else SHALLOW)
         start = dict(network.named_parameters())
-        learned = train(loss, start, len(x), options, generator, progress)
+        saved = None
+        if checkpoint is not None:
+            weights = (part for pair in start.items() for part in pair)
+            saved = EpochCheckpoint(Path(checkpoint), Checkpoint.key_of(options, self.seed, x, y, *weights))
+        learned = train(loss, start, len(x), options, generator, progress, saved)
         network.load_state_dict(learned.tensors)
         result = FitResult.of(learned, constant_inputs=inputs.constant)
         network.requires_grad_(False)
         self._fitted = NetworkFit(self.specified, self.hidden, self.seed, network, inputs, outputs, result)
+        if saved is not None and not keep_checkpoint:
+            saved.remove()
         return self._fitted
 
 

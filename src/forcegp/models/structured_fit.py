@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError
+from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.coulomb import coupled
 from forcegp.forces.inference import forces_and_constant, jitter_of, log_likelihood
 from forcegp.forces.learn import Problem, analytical_parameters
@@ -146,18 +146,53 @@ class StructuredFit(FittedModel):
         posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows), central=central)
         return dataclasses.replace(self, posterior=posterior)
 
-    def forgetting(self, factor: float) -> StructuredFit:
-        """The fit with the weight of all samples so far multiplied by a factor between 0 and 1.
+    def without(self, measurements: Training) -> StructuredFit:
+        """The fit without samples that it was conditioned on.
+
+        Raises:
+            ModelError: inference is exact, or there are more samples than it was conditioned on.
+            NumericalError: the samples were not among them.
+        """
+        problem = dataclasses.replace(self.problem, training=measurements)
+        latent, central = _sparse(self.posterior), self.posterior.central
+        if isinstance(central, SparsePosterior):
+            known = problem.of_means().rows(self.hyperparameters).blocks
+            central = central.without(problem.silenced(known))
+        latent = latent.without(problem.rows(self.hyperparameters).blocks)
+        posterior = dataclasses.replace(self.posterior, latent=latent, central=central)
+        return dataclasses.replace(self, posterior=posterior)
+
+    def forgetting(self, factor: float, priors: Sequence[str] | None = None) -> StructuredFit:
+        """The fit with all samples so far, or what they say about some priors, partly forgotten.
+
+        Args:
+            factor: weight of all samples; for given priors, correlation of their forces with what they were.
+            priors: names of the priors that forget; all samples by default.
 
         Raises:
             ModelError: inference is exact, or the factor is out of range.
+            UnknownNameError: no such prior.
         """
+        if priors is not None:
+            return self._drifting(factor, priors)
         if not 0.0 < factor <= 1.0:
             raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)
         latent, central = _sparse(self.posterior), self.posterior.central
         if isinstance(central, SparsePosterior):
             central = central.forgetting(factor)
         posterior = dataclasses.replace(self.posterior, latent=latent.forgetting(factor), central=central)
+        return dataclasses.replace(self, posterior=posterior)
+
+    def _drifting(self, factor: float, priors: Sequence[str]) -> StructuredFit:
+        names = [prior.name for prior in self.posterior.priors]
+        for name in priors:
+            if name not in names:
+                raise UnknownNameError("force prior to forget", name, names)
+        own = [names.index(name) for name in priors]
+        latent, central = _sparse(self.posterior), self.posterior.central
+        if isinstance(central, SparsePosterior):
+            central = central.drifting(factor, own)
+        posterior = dataclasses.replace(self.posterior, latent=latent.drifting(factor, own), central=central)
         return dataclasses.replace(self, posterior=posterior)
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:

@@ -13,6 +13,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.footprint import announce_states
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.inference import check_method
@@ -26,13 +27,16 @@ from forcegp.forces.state_noise import state_std_of
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions, Progress
 from forcegp.models.base import FitProgress, Model
+from forcegp.models.structured_choice import chosen_priors
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Lesson, in_motion, prepared, solve
 from forcegp.models.structured_spec import Specification, torque_noise_of
-from forcegp.models.structured_stream import Pass, sample_of
+from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
+FIT_COPIES = 3.0
+"""Memory of a fit besides the matrices of its inference, in that of the equations of motion."""
 WITH_PARAMETERS = LearningOptions(tolerance=1e-9)
 """Default options where θ_A is learned too: L-BFGS then stalls on its way for a step or two."""
 
@@ -60,6 +64,17 @@ class StructuredGP(Model[StructuredFit]):
             and the result of the fit says where more would help.
         state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
             or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
+
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> fit = StructuredGP(system, mean="analytical", noise_std=0.1).fit(data)
+        >>> fit.predict(q, qd, tau).std.shape
+        torch.Size([20, 2])
 
     Raises:
         ModelError, UnknownNameError: the priors do not fit the system.
@@ -175,20 +190,22 @@ class StructuredGP(Model[StructuredFit]):
             ModelError, DataError, UnknownNameError: the data, or the checkpoint, do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
-        sample, known = None, data
+        sample, neighbours, known = None, None, data
         if isinstance(known, StreamedDataset):
             sample = sample_of(self.specification, known)
             known = sample.data
         if self._fitted is None:
-            self.specification = self.specification.for_data(known)
+            self.specification = self._for_data(known, options)
         spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
         options = options or (LearningOptions() if spec.parameters is None else WITH_PARAMETERS)
         chosen = self._chosen(learn)
         training, doubts = in_motion(spec, self._training(known, chosen))
+        announce_states(spec.system, training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
         log = None
         if sample is not None:
             training = dataclasses.replace(training, part_of=sample.count)
             log = Pass(spec, sample, file, progress, distributed)
+            neighbours = neighbours_of(spec, sample, training)
         problem = spec.problem(training)
         search, saved = self._search(problem, chosen, options), None
         if search.start:
@@ -196,7 +213,7 @@ class StructuredGP(Model[StructuredFit]):
                 saved = Checkpoint(file, _key(spec, problem, search, begin))
                 saved.read(search.start)
                 search = dataclasses.replace(search, recorded=saved.recorded)
-            lesson = solve(spec, problem, search, _reported(progress, options), begin)
+            lesson = solve(spec, problem, search, _reported(progress, options), begin, neighbours)
             if saved is not None:
                 saved.write()
         else:
@@ -213,6 +230,15 @@ class StructuredGP(Model[StructuredFit]):
                 if kept is not None:
                     kept.remove()
         return fitted
+
+    def _for_data(
+        self, data: Dataset | Sequence[Observation], options: LearningOptions | None
+    ) -> Specification:
+        """The specification with what was left to the data filled in."""
+        spec = self.specification.for_data(data)
+        if not (self.specification.automatic and spec.learns_torque_noise and spec.parameters is None):
+            return spec
+        return chosen_priors(spec, data, lambda own, part: StructuredGP.of(own).fit(part, options=options))
 
     def _search(self, problem: Problem, chosen: Sequence[str], options: LearningOptions) -> Search:
         """What is learned of a problem, from where, and what keeps its values."""
@@ -274,16 +300,26 @@ class StructuredGP(Model[StructuredFit]):
             )
         return self.adopt(fitted.updated(training))
 
-    def forget(self, factor: float) -> StructuredFit:
-        """Multiply the weight of all samples so far by a factor, so that later ones count for more.
+    def forget(
+        self, what: float | Dataset | Sequence[Observation], priors: Sequence[str] | None = None
+    ) -> StructuredFit:
+        """Forget samples, so that later ones count for more.
 
         Args:
-            factor: between 0 and 1, such as exp(−Δt/T) for a memory of T seconds.
+            what: a factor between 0 and 1, such as exp(−Δt/T) for a memory of T seconds, which the weight of
+                all samples so far is multiplied by; or samples of the fit, which are removed.
+            priors: forget only what the samples say about the forces of these priors, such as a payload: they
+                drift towards their prior, and the factor is the correlation with what they were.
 
         Raises:
             ModelError: the model has not been fitted, its inference is exact, or the factor is out of range.
+            UnknownNameError: no such prior.
+            NumericalError: the samples to remove were not among those of the fit.
         """
-        return self.adopt(self.fitted.forgetting(factor))
+        if isinstance(what, int | float):
+            return self.adopt(self.fitted.forgetting(float(what), priors))
+        training, _ = in_motion(self.specification, self._training(what, learned=()))
+        return self.adopt(self.fitted.without(training))
 
     def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""
@@ -354,7 +390,8 @@ def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[s
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
     record, robot = pack_system(problem.system)
     named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
+    state = () if problem.state_std is None else (problem.state_std,)
     return Checkpoint.key_of(
         problem.mean, priors, spec.inference, search.options, training.quantities, *data, *training.noise_std,
-        record, *robot.values(), *(part for pair in named for part in pair),
+        record, *robot.values(), *(part for pair in named for part in pair), *state,
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """How a structured Gaussian process is learned: on which samples, with which inference, in which steps.
 
-1. Samples at rest say nothing but that friction is below a limit; robots that are measured learn from motion.
+1. Samples at rest say nothing but that friction is below a limit, and impacts break the equations of motion;
+   robots that are measured learn from motion without impacts.
 2. Hyperparameters are learned on a part of a long log, or on all of a short one.
 3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more.
 4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
@@ -11,13 +12,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from forcegp.dynamics import mass_matrix
 from forcegp.forces.calibration import held_out_torque_std, likelihood_power
+from forcegp.forces.impacts import without_impacts
 from forcegp.forces.inference import (
     force_posterior,
     is_finite,
@@ -44,6 +47,8 @@ REST_SPEED = 0.01
 """A sample is at rest where no joint moves faster [rad/s, m/s]."""
 FEWEST_MOVING = 20
 """With fewer samples in motion, samples at rest are kept."""
+VOLUME_STATES = 100
+"""States that the volume of the noise is averaged over."""
 FIRST_POWER = 0.25
 """Power of the likelihood before the correlation of its residuals is known."""
 
@@ -68,7 +73,7 @@ class Lesson:
 
 
 def in_motion(spec: Specification, training: Training) -> tuple[Training, tuple[str, ...]]:
-    """The samples in motion, for models that learn the torque noise of a measured robot."""
+    """The samples in motion, without impacts, for models that learn the torque noise of a measured robot."""
     if not spec.learns_torque_noise:
         return training, ()
     moving = training.moving(REST_SPEED)
@@ -76,7 +81,12 @@ def in_motion(spec: Specification, training: Training) -> tuple[Training, tuple[
         return training, (
             f"only {moving.samples} samples are in motion: friction cannot be told from noise at rest",
         )
-    return moving, ()
+    moving, impacts = without_impacts(moving, spec.system)
+    if not impacts:
+        return moving, ()
+    return moving, (
+        f"{impacts} samples in contact were left out as impacts: they accelerate off the surface or into it",
+    )
 
 
 def subset(spec: Specification, problem: Problem) -> Problem:
@@ -98,6 +108,7 @@ def solve(
     search: Search,
     progress: Progress | None = None,
     begin: Mapping[str, Tensor] | None = None,
+    neighbours: Training | None = None,
 ) -> Lesson:
     """Learn what is free in a search, then prepare the problem that is conditioned on.
 
@@ -107,6 +118,7 @@ def solve(
         search: what is learned and what is held.
         progress: called after each evaluation.
         begin: where to begin.
+        neighbours: samples as close in time as those of the log, where those of the problem are a part of it.
     """
     part = subset(spec, problem)
     if part.inducing is None:
@@ -122,7 +134,7 @@ def solve(
         values = {**search.held, **learned.tensors}
         part = with_updated_robot(part, values)
         values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
-        part = _at_the_rate_of_the_log(part, values, problem.training)
+        part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
     whole = dataclasses.replace(part, training=problem.training, inducing=None)
     return Lesson(prepared(spec, whole, values), values, learned, learned_on)
 
@@ -131,7 +143,7 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
     """The problem with the correlation of its residuals among all samples.
 
     Neighbours in the whole log are closer in time than in the part that was learned on. Of a log that is read
-    piece by piece, only the samples in memory are looked at, whose evidence is that of all samples.
+    piece by piece, a few contiguous stretches are looked at.
     """
     power = part.power if part.training is training else likelihood_power(part, values, training)
     share = training.samples / training.all_samples
@@ -155,9 +167,9 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
             posterior = force_posterior(problem, values)
             features = _one_row(posterior, problem)
             mean = posterior.latent.latent_mean(p, features[p])[0]
-            robot, moved = prior.updated(
-                problem.system.robot, mean, _precision(posterior, features, p, problem.system.robot)
-            )
+            precision = _precision(posterior, features, p, problem.system.robot)
+            volume = _log_volume(problem, values)
+            robot, moved = prior.updated(problem.system.robot, mean, precision, volume)
             # The prior keeps the scale of the file's parameters, not that of the updated ones.
             return dataclasses.replace(
                 problem,
@@ -167,6 +179,39 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
                 pinned=(prior.name,),
             )
     return problem
+
+
+def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor]:
+    """κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| at the samples in free motion, as a function of the robot.
+
+    With it, the density of the torque's error is that of the acceleration's. Without it, a robot that has
+    next to no inertia explains small torques best, whatever it does to the accelerations.
+    """
+    terms = []
+    std = problem.system.robot.mass.new_zeros(problem.system.robot.nq)
+    if TORQUE_NOISE in values:
+        std = values[TORQUE_NOISE].exp()
+    elif problem.torque_std is not None:
+        std = problem.torque_std
+    for i in (i for i, quantity in enumerate(problem.training.quantities) if quantity == "qdd"):
+        m = problem.training.measurements[i]
+        free = (~m.active.any(-1)).nonzero()[:, 0]
+        if not len(free):
+            continue
+        q = m.q[free[torch.linspace(0, len(free) - 1, min(VOLUME_STATES, len(free))).round().long()]]
+        noise = problem.noise_at(values, i)
+        spread = (noise if noise.ndim == 1 else noise.square().mean(0).sqrt()).detach() ** 2
+        terms.append((q, problem.power * len(free) / len(q), spread))
+
+    def volume(robot: RobotModel) -> Tensor:
+        total = robot.mass.new_zeros(())
+        for q, weight, spread in terms:
+            M = mass_matrix(robot, q)
+            C = torch.diag(std**2) + (M * spread) @ M.mT
+            total = total + weight * (torch.logdet(M) - 0.5 * torch.logdet(C)).sum()
+        return total
+
+    return volume
 
 
 def _one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:

@@ -25,6 +25,7 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.priors.normal_force import NormalForcePrior
+from forcegp.forces.priors.payload import PayloadPrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.state_noise import state_std_of
 from forcegp.gp import kernels, stationary
@@ -50,6 +51,7 @@ CLASSES: dict[str, type] = {
     "joint_friction": JointFrictionPrior,
     "inertial": InertialPrior,
     "normal": NormalForcePrior,
+    "payload": PayloadPrior,
     "contact": ContactForcePrior,
     "sliding_friction": SlidingFrictionPrior,
 }

@@ -7,7 +7,7 @@ second one adds up the sums over all samples.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -18,12 +18,15 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.data.stream import StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
+from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
 from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training, training_of
 from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.totals import Totals, basis_of, posterior_of, total_over
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.distributed import share_basis
+from forcegp.gp.features import Standardization
 from forcegp.gp.kernels import sub
 from forcegp.gp.sparse_tensors import basis_of_tensors, tensors_of_basis
 from forcegp.gp.sums import Sums
@@ -76,6 +79,33 @@ def sample_of(spec: Specification, stream: StreamedDataset) -> Sample:
             hint='use inference="sparse"',
         )
     return Sample(stream, data, count, moving=False)
+
+
+def neighbours_of(spec: Specification, sample: Sample, training: Training) -> Training | None:
+    """A few contiguous stretches of the log, which show how long residuals are correlated.
+
+    Args:
+        spec: the model.
+        sample: the log.
+        training: the sample, whose input scales are kept.
+
+    Returns:
+        `None` where the sample is the whole log, or the model does not ask for it.
+    """
+    if not spec.learns_torque_noise or len(sample.data) == sample.count:
+        return None
+    last, length = sample.log.piece_count - 1, MOST_RESIDUALS // STRETCHES
+    wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
+    parts = [piece for number, piece in enumerate(sample.log.pieces()) if number in wanted]
+    if sample.moving:
+        parts = [piece[moving_rows(piece)] for piece in parts]
+    data = Dataset.concatenate([piece[:length] for piece in parts])
+    return training_of(data, spec.system, spec.priors, spec.noise_std, kept_scales(spec.priors, training))
+
+
+def kept_scales(priors: Sequence[ForcePrior], training: Training) -> dict[str, Standardization]:
+    """The input scales of training data by prior."""
+    return {prior.name: scale for prior, scale in zip(priors, training.scales, strict=True)}
 
 
 def moving_rows(data: Dataset) -> Tensor:
@@ -140,8 +170,7 @@ class Pass:
     def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
         """The samples of this process, a piece at a time; a piece of another process has none."""
         rank, processes = (dist.get_rank(), dist.get_world_size()) if self.distributed else (0, 1)
-        scales = zip(problem.priors, problem.training.scales, strict=True)
-        kept = {prior.name: scale for prior, scale in scales}
+        kept = kept_scales(problem.priors, problem.training)
         for number, piece in enumerate(self.sample.log.pieces(start), start):
             if number % processes != rank:
                 piece = piece[:0]
@@ -165,7 +194,7 @@ class Pass:
     def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
         """Identifies the sums over a log, with a basis, a system and a noise."""
         training = problem.training
-        files = [(path.name, path.stat().st_size) for path in self.sample.log.paths]
+        files = [(path.name, path.stat().st_size) for path in self.sample.log.files]
         record, robot = pack_system(problem.system)
         data = [value for m in training.measurements for value in m.tensors]
         points = [x for Z in problem.inducing or () for x in Z.values()]

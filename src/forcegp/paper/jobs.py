@@ -33,6 +33,9 @@ def models_of(sizes: Profile, split: str) -> list[tuple[str, int]]:
     for points in sizes.sizes:
         papers = PAPER_KERNELS.values() if points <= sizes.paper_kernels_up_to else ()
         found += [(name, points) for name in (*GP_MODELS, *papers)]
+    if split == "stretches":
+        structured = [name for name in GP_MODELS if name != "gp"]
+        found += [(name, points) for points in sizes.sparse_sizes for name in structured]
     return found
 
 

@@ -24,6 +24,8 @@ FLOOR = (2.0 / torch.pi) ** 0.5
 PAPER_LINE, KERNEL_LINE = (0, (2, 1.5)), (0, (6, 1.5))
 UNKNOWN = "The paper does not fully state its task settings."
 """Part of every comparison with the paper, favourable or not."""
+WIDE = 5000
+"""Training points from which they are drawn on a logarithmic axis."""
 TASK = (
     "The paper does not state its rectangle, travel times, pressing force or test window, so the two tasks "
     "are "
@@ -120,6 +122,8 @@ def _curve(axes: Axes, results: Results, model: str, split: str, measure: str, s
 def _finish(figure: Figure, axes: Axes, name: str) -> None:
     axes.set_yscale("log")
     axes.set_xlabel("training points N")
+    if axes.get_xlim()[1] > WIDE:
+        axes.set_xscale("log")
     axes.set_ylabel(name)
     low, high = axes.get_ylim()
     if high / low < 1e3:

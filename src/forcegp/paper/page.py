@@ -52,14 +52,15 @@ def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list
     return [finding for finding in found if finding is not None]
 
 
-def render_page(results: Results, figures: FigureData) -> str:
-    """The page of a reproduction as HTML."""
+def render_page(results: Results, figures: FigureData, view: str | None = None) -> str:
+    """The page of a reproduction as HTML; `view` is the file with the motion in three dimensions."""
     paper = paper_numbers()
     return render(
         "page.html.j2",
         package="forcegp.paper",
         results=results,
         paper=paper,
+        view=view,
         task=TASK,
         opening=_opening(results, paper, figures),
         tables=_tables(results, paper),

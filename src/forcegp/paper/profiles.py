@@ -1,4 +1,4 @@
-"""Sizes of a reproduction: a few minutes, or those of the paper."""
+"""Sizes of a reproduction: a few minutes, those of the paper, or all samples of the log."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ class Profile:
         rollout_seconds: length of the trajectories that are predicted in open loop [s].
         rollout_starts: states of a further simulated run that they start from.
         rollout_samples: function samples of their bands.
+        sparse_sizes: training points of the structured models beyond those of the other GP models: rows
+            evenly spaced over all that are not held out.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Profile:
     rollout_seconds: float = 10.0
     rollout_starts: int = 16
     rollout_samples: int = 100
+    sparse_sizes: tuple[int, ...] = ()
 
 
 PROFILES = {
@@ -77,6 +80,22 @@ PROFILES = {
         1000,
         10_000,
         ("nn", "nn-30-20", "nn-200x4"),
+    ),
+    "large": Profile(
+        "large",
+        600.0,
+        1,
+        (100, 400, 1000),
+        0,
+        1000,
+        5000,
+        ("nn",),
+        paper_split_baselines=False,
+        identification_points=100,
+        rollout_seconds=1.0,
+        rollout_starts=8,
+        rollout_samples=20,
+        sparse_sizes=(4000, 20_000, 115_200),
     ),
 }
 

@@ -12,14 +12,18 @@ import torch
 
 from forcegp.destination import check_destination
 from forcegp.files import write_text
+from forcegp.gp.capacity import MATRICES_TO_LEARN
+from forcegp.memory import announce_memory
 from forcegp.paper.figures import all_figures
 from forcegp.paper.fits import Fit, noise_std_of, score_fit
 from forcegp.paper.jobs import fits_of, models_of, run_ahead, splits_of
+from forcegp.paper.motion import write_motion
 from forcegp.paper.page import render_markdown, render_page
 from forcegp.paper.profiles import Profile, profile_of
 from forcegp.paper.results import Results, Score
 from forcegp.paper.stages import Progress, Stages, silent
-from forcegp.paper.task import Task, make_task
+from forcegp.paper.task import SCENE, Task, make_task
+from forcegp.scene import load_scene
 
 PAGE, RESULTS, MARKDOWN = "report.html", "results.json", "results.md"
 PACKAGES = ("forcegp", "torch", "numpy", "scipy", "pybullet", "mujoco", "matplotlib")
@@ -80,10 +84,12 @@ def run(
     Raises:
         UnknownNameError: no such profile.
         DestinationError: the folder cannot be written.
+        MemoryLimitError: the largest fit needs more memory than is free.
     """
     sizes = profile_of(profile) if isinstance(profile, str) else profile
     root = Path(out)
     check_destination(root, folder=True)
+    _announce(sizes)
     folder = root / "stages"
     made = run_ahead(folder, sizes, seed, processes, progress, say) if processes > 1 else set()
     stages = Stages(folder, progress, say, made)
@@ -96,9 +102,16 @@ def run(
     results = _results(sizes, tasks, scores, stages)
     write_text(root / RESULTS, results.to_json())
     write_text(root / MARKDOWN, render_markdown(results, figures))
-    write_text(root / PAGE, render_page(results, figures))
+    write_text(root / PAGE, render_page(results, figures, write_motion(root, tasks[0], fits)))
     done = stages.done.values()
     return Reproduction(root / PAGE, results, sum(stage.reused for stage in done), len(done))
+
+
+def _announce(sizes: Profile) -> None:
+    """Announce the memory of the largest fit before anything is computed."""
+    system, points = load_scene(SCENE).system(), max(sizes.sizes)
+    needed = int(MATRICES_TO_LEARN * 8 * (points * system.robot.nq) ** 2)
+    announce_memory(needed, f"the largest fit, to {points} samples,")
 
 
 def _fits(stages: Stages, sizes: Profile, task: Task, splits: list[str]) -> list[Fit]:

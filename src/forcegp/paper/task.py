@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.data import Dataset, Split, split_by_selection, split_by_stretches
+from forcegp.data import Dataset, Split, complement, split_by_selection, split_by_stretches
 from forcegp.files import Header, write_json, write_text
 from forcegp.paper.profiles import Profile
 from forcegp.paper.stages import Advance, Stage, Stages
@@ -48,8 +48,13 @@ class Task:
     selected: Stage
 
     def train(self, split: str, points: int) -> Dataset:
-        """The first `points` training samples of a split."""
-        return self.data[self.splits[split].train[:points]]
+        """The first `points` training samples of a split; of more than were selected, evenly spaced ones."""
+        chosen = self.splits[split]
+        if points <= len(chosen.train):
+            return self.data[chosen.train[:points]]
+        rows = complement(chosen.test, len(self.data))
+        most = min(points, len(rows))
+        return self.data[rows[torch.linspace(0, len(rows) - 1, most).round().long()]]
 
     def test(self, split: str, most: int) -> Dataset:
         """At most `most` test samples of a split, spread evenly over all of them.

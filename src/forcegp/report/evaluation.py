@@ -56,7 +56,7 @@ def write_evaluation(
     write_text(folder / WINDOW, window.to_json())
     page = render(
         "evaluation.html.j2",
-        title=f"{label(found.kind)} on {Path(data).name}",
+        title=_title(found.kind, Path(model).name, Path(data).name),
         model=model,
         data=data,
         found=found,
@@ -66,6 +66,12 @@ def write_evaluation(
     )
     write_text(folder / PAGE, page)
     return folder / PAGE
+
+
+def _title(kind: str, model: str, data: str) -> str:
+    """Kind and name of the model, and the log; a folder that is called `model` adds nothing."""
+    name = "" if model.lower() in ("", "model") else f" “{model}”"
+    return f"{label(kind)}{name} on {data}"
 
 
 def _blocks(window: WindowData, pictures: list[Picture]) -> list[Block]:

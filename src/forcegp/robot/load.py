@@ -7,8 +7,8 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
-from scipy.spatial.transform import Rotation
 
 from forcegp.errors import RobotFileError, ShapeError, UnknownNameError
 from forcegp.robot.check import checked
@@ -16,7 +16,6 @@ from forcegp.robot.fold import Pose, build_robot
 from forcegp.robot.model import RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
 from forcegp.robot.tree import Tree, lock_joints
-from forcegp.robot.urdf import read_urdf
 
 BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa", "kuka_iiwa14", "ur5")
 
@@ -62,7 +61,9 @@ def load_robot(
         ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.
     """
     pose = Pose(
-        base_rotation=Rotation.from_euler("xyz", _vector(base_rpy, "base_rpy")).as_matrix(),
+        base_rotation=scipy.spatial.transform.Rotation.from_euler(
+            "xyz", _vector(base_rpy, "base_rpy")
+        ).as_matrix(),
         base_position=_vector(base_position, "base_position"),
         gravity=_vector(gravity, "gravity"),
         dtype=dtype,
@@ -85,6 +86,8 @@ def _read(source: str | Path) -> Tree:
 def _read_file(path: Path) -> Tree:
     root = parse_xml(read_bytes(path), str(path))
     if root.tag == "robot":
+        from forcegp.robot.urdf import read_urdf  # the parser is slow to import, and saved models need none
+
         return read_urdf(root, str(path))
     if root.tag == "mujoco":
         from forcegp.robot.mjcf import read_mjcf  # loads MuJoCo, which is optional

@@ -42,6 +42,14 @@ class AnalyticalParameters(nn.Module):
         learn: joint names by quantity, or `"all"` joints, such as `{"mass": ["joint_7"], "damping": "all"}`.
             The inertia, mass and centre of mass named by a joint are those of the link that it moves.
 
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> theta = AnalyticalParameters(robot, {"mass": [robot.joint_names[-1]]})
+        >>> learned = theta()  # differentiable in theta.parameters()
+        >>> learned.mass.requires_grad
+        True
+
     Raises:
         UnknownNameError: a quantity or a joint does not exist.
         ModelError: no parameter is selected, or the inertia of a link is selected twice.

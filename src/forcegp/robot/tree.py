@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from forcegp.errors import RobotFileError, UnknownNameError
 
@@ -90,7 +90,7 @@ def joint_motion(kind: JointKind, axis: np.ndarray, q: float) -> np.ndarray:
     """Pose of a link in its joint frame at joint position q."""
     if kind == "prismatic":
         return transform(np.eye(3), q * axis)
-    return transform(Rotation.from_rotvec(q * axis).as_matrix(), np.zeros(3))
+    return transform(scipy.spatial.transform.Rotation.from_rotvec(q * axis).as_matrix(), np.zeros(3))
 
 
 def unit_axis(axis: np.ndarray, where: str) -> np.ndarray:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.footprint import announce_states
 from forcegp.constraints.unilateral import any_row, can_open
 from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
@@ -22,6 +23,8 @@ STEP = 1.0 / 240.0
 CLOSED = 5e-4
 """A contact that can open is closed at the start if its error is below this [m]: more than the drift of a
 logged contact, less than a distance that would count as off the surface."""
+STEPS_PER_STATE = 4
+"""Recorded steps that take as much memory as the equations of motion of one state; measured, rounded down."""
 FEW = 8
 """Up to this number of trajectories one thread is used, as more only slow down work on small tensors."""
 
@@ -145,6 +148,8 @@ def _run(
     if noise is not None:
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
     problem = Problem(options.stabilized(system), law, inputs, unilateral)
+    steps = max(1, round(duration / dt))
+    announce_states(system, n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
     closed = _closed(problem, q, qd) if active is None else active.expand(*whole, -1).reshape(n, -1)
     with one_thread() if n <= FEW else nullcontext():

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 import torch
-from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from forcegp.constraints.projection import project_state
@@ -66,7 +66,7 @@ def adaptive(method: str) -> Step:
 
         start = torch.stack([state.q, state.qd]).flatten().cpu().double().numpy()
         with torch.no_grad():
-            solved = solve_ivp(
+            solved = scipy.integrate.solve_ivp(
                 rate, (0.0, 1.0), start, method=method, rtol=RELATIVE_TOLERANCE, atol=ABSOLUTE_TOLERANCE
             )
         if not solved.success:

@@ -32,6 +32,10 @@ class RolloutOptions:
             where the model has learned the noise of logged torques and its correlation in time.
         on_divergence: `raise` a `DivergedError` that holds the trajectories, or `keep` them.
 
+    Example:
+        >>> RolloutOptions(method="rk4", stabilization="projection", dt=0.002).method
+        'rk4'
+
     Raises:
         ForceGPError: a value is out of range.
         UnknownNameError: unknown method, stabilization or `on_divergence`.

@@ -21,6 +21,10 @@ class Section(BaseModel):
         return {name: getattr(self, name) for name in self.model_fields_set}
 
 
+State = NonNegativeFloat | tuple[NonNegativeFloat, ...]
+"""Noise of positions or velocities, as one number or one per joint."""
+
+
 class LearningSection(Section):
     """`[model.learning]`: fields of `LearningOptions`, or of `BatchOptions` for what learns on batches.
 
@@ -56,8 +60,10 @@ class ModelSection(Section):
     noise_std: NonNegativeFloat | tuple[NonNegativeFloat, ...] | None = None
     learn_noise: bool = False
     torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["auto", "learn", "none"] = "auto"
+    state_noise: tuple[State, State] | None = None
     sensor_noise_std: PositiveFloat | None = None
     inference: Literal["auto", "exact", "sparse"] = "auto"
+    inducing_points: PositiveInt = 100
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: tuple[dict[str, Any], ...] = ()
     analytical: dict[str, Literal["all"] | tuple[str, ...]] = {}

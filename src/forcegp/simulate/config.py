@@ -109,6 +109,10 @@ class SimulationConfig(MotionConfig):
         solver: friction and geometry, with `contact="solver"`.
         sensors: resolution, noise and delay of the measurements, with `contact="solver"`.
 
+    Example:
+        >>> SimulationConfig(duration=2.0).steps
+        480
+
     Raises:
         ForceGPError: a value is out of range; the message names it.
     """

@@ -63,6 +63,13 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
         dt: step [s].
         name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet where it is installed, else MuJoCo.
 
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> engine = make_engine(robot, dt=0.001, name="mujoco")
+        >>> engine.mass_matrix(torch.zeros(2, dtype=torch.float64)).shape
+        torch.Size([2, 2])
+
     Raises:
         UnknownNameError: no such engine.
         MissingDependencyError: the engine's package is not installed.

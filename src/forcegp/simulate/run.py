@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.footprint import announce_states
 from forcegp.constraints.unilateral import any_row, contact_forces, land
 from forcegp.control.plan import Plan, make_plan
 from forcegp.control.task_space import Target, control_torque
@@ -44,11 +45,21 @@ def simulate(
     Returns:
         The data set with the reference, the actual motion of the tool and statistics of the run.
 
+    Example:
+        >>> import forcegp
+        >>> from forcegp.simulate import SimulationConfig
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> result = simulate(system, SimulationConfig(duration=0.1, engine="mujoco"))
+        >>> len(result.data)
+        24
+
     Raises:
         NumericalError: the motion cannot be reached, or the run diverges (names time and state).
         MissingDependencyError: the engine is not installed.
+        MemoryLimitError: the log needs more memory than is free.
     """
     system = system.with_robot(system.robot.to(device="cpu"))
+    announce_states(system, config.steps, 1.0, f"a simulation of {config.steps:,} steps")
     generator = torch.Generator().manual_seed(config.seed)
     with torch.no_grad(), one_thread():
         plan = make_plan(system, config, generator)

@@ -74,12 +74,7 @@ class Checkpoint:
         shapes = {"positions": (n, size), "objectives": (n,), "gradients": (n, size)}
         found = {name: tuple(value.shape) for name, value in tensors.items()}
         if key != self.key or found != shapes or any(x.dtype != torch.float64 for x in tensors.values()):
-            raise ModelError(
-                f"{self.path}: the checkpoint belongs to another fit",
-                expected=f"data, settings and system with key {self.key}",
-                got=key,
-                hint="remove it, or name another file",
-            )
+            raise belongs_elsewhere(self.path, self.key, key)
         for name, value in tensors.items():
             most = CHECKPOINT_VALUE if name == "positions" else LOGGED_VALUE
             if not bool((value.abs() <= most).all()):
@@ -129,14 +124,33 @@ class Checkpoint:
             record.append(entry)
         if record:
             parts = (torch.stack(part) for part in zip(*record, strict=True))
-            data = safetensors.torch.save(dict(zip(NAMES, parts, strict=True)), {"key": self.key})
-            with atomic_file(self.path) as temporary:
-                temporary.write_bytes(data)
+            write_record(self.path, dict(zip(NAMES, parts, strict=True)), self.key)
         self._written = time.monotonic()
 
     def remove(self) -> None:
         """Remove the file of a fit that has ended; call it once the model is saved."""
         self.path.unlink(missing_ok=True)
+
+
+def write_record(path: Path, tensors: Mapping[str, Tensor], key: str) -> None:
+    """Write a checkpoint, whole or not at all.
+
+    Raises:
+        DestinationError: the place cannot be written.
+    """
+    data = safetensors.torch.save({name: x.contiguous() for name, x in tensors.items()}, {"key": key})
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def belongs_elsewhere(path: Path, key: str, found: str | None) -> ModelError:
+    """The error for a checkpoint of another fit."""
+    return ModelError(
+        f"{path}: the checkpoint belongs to another fit",
+        expected=f"data, settings and system with key {key}",
+        got=found,
+        hint="remove it, or name another file",
+    )
 
 
 def _flat(tensors: list[Tensor]) -> Tensor:

@@ -24,6 +24,7 @@ from forcegp.storage.validate import check_tensors
 
 HEADER_FILE = "model.json"
 TENSOR_FILE = "model.safetensors"
+OWN_FILES = (HEADER_FILE, TENSOR_FILE)
 COPIES = 3
 """A model is in memory as the bytes of its file, and as tensors before and after they are aligned."""
 
@@ -66,7 +67,7 @@ def write_model(
     """Write the folder of a model, whole or not at all.
 
     Args:
-        path: the folder; one that exists is replaced if it holds a model or nothing.
+        path: the folder; one that exists is replaced if it holds a model and nothing else, or nothing.
         kind: `Model.kind`.
         system: written beside the model.
         settings: of the kind.
@@ -77,9 +78,12 @@ def write_model(
         OSError: the place cannot be written.
     """
     folder = Path(path)
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / HEADER_FILE).is_file():
+    foreign = sorted({x.name for x in folder.iterdir()} - set(OWN_FILES)) if folder.is_dir() else []
+    if foreign:
         raise ModelError(
-            f"{folder} holds other files than a model", hint="name a folder that is new, empty or a model"
+            f"{folder} holds other files than a model, which would be lost",
+            got=", ".join(foreign[:5]),
+            hint="name a folder that is new, empty or a model",
         )
     json, robot = pack_system(system)
     own = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
@@ -150,7 +154,7 @@ def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:
     Raises:
         DestinationError: the folder holds other files than a model, or the place cannot be written.
     """
-    check_destination(path, folder=True, own_files=(HEADER_FILE,), needed_bytes=needed_bytes)
+    check_destination(path, folder=True, own_files=OWN_FILES, needed_bytes=needed_bytes)
 
 
 def own_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -102,6 +102,17 @@ def test_a_compressed_bomb_is_refused(tmp_path: Path) -> None:
         list(variables(header + struct.pack("<II", 15, len(body)) + body, "f"))
 
 
+def test_a_struct_of_very_many_fields_is_refused() -> None:
+    def element(kind: int, body: bytes) -> bytes:
+        return struct.pack("<II", kind, len(body)) + body.ljust(-(-len(body) // 8) * 8, b"\0")
+
+    count = limits.COLUMNS + 1
+    head = element(6, struct.pack("<II", 2, 0)) + element(5, struct.pack("<ii", 1, 1)) + element(1, b"s")
+    fields = element(5, struct.pack("<i", 2)) + element(1, b"f\0" * count) + element(MATRIX, b"") * count
+    with pytest.raises(DataError, match="variables and fields"):
+        list(variables(b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + element(MATRIX, head + fields), "f"))
+
+
 def test_a_file_of_another_kind_is_refused() -> None:
     with pytest.raises(DataError, match="not a MATLAB file"):
         variables(b"something else entirely", "f")

@@ -176,3 +176,29 @@ def test_formats_that_are_not_read(tmp_path: Path, name: str) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="not a log format"):
         read(tmp_path / "empty")
+
+
+def test_data_of_another_hdf5_file_are_left_out(tmp_path: Path) -> None:
+    """A virtual data set shows numbers of a file that its author chose on the reader's disk."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "private.h5", "w") as file:
+        file["q"] = np.arange(20.0)
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["t"] = np.arange(20.0)
+        layout = h5py.VirtualLayout((20,), "f8")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "private.h5"), "q", (20,))
+        file.create_virtual_dataset("virtual", layout)
+        file["link"] = h5py.ExternalLink(str(tmp_path / "private.h5"), "/q")
+    table = read(tmp_path / "log.h5")
+    assert [name for stream in table.streams for name in stream.columns] == ["t"]
+    assert any("'virtual' lies outside the file" in remark for remark in table.remarks)
+
+
+def test_small_files_that_claim_gigabytes_are_refused(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "bomb.h5", "w") as file:
+        file.create_dataset("q", (1 << 27,), dtype="f8", chunks=(1 << 20,), compression="gzip")
+    np.savez_compressed(tmp_path / "bomb.npz", q=np.zeros(20 << 20))
+    for name in ("bomb.h5", "bomb.npz"):
+        with pytest.raises(DataError, match="claims to be larger than what is read at once"):
+            read(tmp_path / name)

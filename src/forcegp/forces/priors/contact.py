@@ -26,6 +26,10 @@ class ContactForcePrior(SurfaceForcePrior):
             depends on.
         name: prefix of the hyperparameters; the contact's name by default.
 
+    Example:
+        >>> ContactForcePrior("table").target
+        'contact'
+
     Raises:
         UnknownNameError: an input is not one of the three.
     """

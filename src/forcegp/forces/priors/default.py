@@ -37,6 +37,12 @@ def default_priors(
         mean: the model's prior mean, which decides what is left to the prior.
         kernel: covariance of each joint force, without a prior on the contact's friction; by default
             `REMAINING` where the mean includes the motor torque, `WHOLE` elsewhere.
+
+    Example:
+        >>> import torch, forcegp
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> [type(prior).__name__ for prior in default_priors(system, "analytical")]
+        ['JointForcePrior', 'NormalForcePrior', 'SlidingFrictionPrior']
     """
     around = "actuation" in mean_of(mean).terms
     joint = JointForcePrior(kernel or (REMAINING if around else WHOLE))
@@ -53,8 +59,14 @@ def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
 
     Args:
         system: robot and contacts.
+
+    Example:
+        >>> import torch, forcegp
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> [type(prior).__name__ for prior in measured_priors(system)]
+        ['JointFrictionPrior', 'SlidingFrictionPrior']
     """
-    sliding = (SlidingFrictionPrior(name, coupled=True) for name in _surfaces(system))
+    sliding = (SlidingFrictionPrior(name, Linear(), coupled=True) for name in _surfaces(system))
     return (JointFrictionPrior(), *sliding)
 
 
@@ -65,6 +77,12 @@ def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> t
         system: robot and contacts.
         kernel: covariance of each Cartesian component of any tangential force; by default the force is
             friction that opposes sliding.
+
+    Example:
+        >>> import torch, forcegp
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> [type(prior).__name__ for prior in contact_priors(system)]
+        ['SlidingFrictionPrior']
     """
     names = _surfaces(system)
     if kernel is None:

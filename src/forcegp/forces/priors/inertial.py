@@ -10,6 +10,7 @@ predicted acceleration.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -45,6 +46,12 @@ class InertialPrior(ForcePrior):
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
         masses: of the links, which the scale is relative to; those of the robot by default [kg].
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> InertialPrior().outputs(robot)
+        20
     """
 
     mass: float = 0.3
@@ -78,10 +85,16 @@ class InertialPrior(ForcePrior):
         parts = [self.mass * m, *3 * [m * r], *6 * [m * r * r]]
         return torch.stack(parts, dim=-1).flatten().detach()
 
-    def updated(self, robot: RobotModel, mean: Tensor, precision: Tensor) -> tuple[RobotModel, Tensor]:
+    def updated(
+        self,
+        robot: RobotModel,
+        mean: Tensor,
+        precision: Tensor,
+        log_volume: Callable[[RobotModel], Tensor] = lambda _: torch.zeros(()),
+    ) -> tuple[RobotModel, Tensor]:
         """The physically consistent robot that is most probable given δ ~ N(mean, precision⁻¹).
 
-        It minimises ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] over the
+        It minimises ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] − V(δ) over the
         log-Cholesky coordinates of the pseudo-inertias J of the links; the second term (the divergence of
         Lee, Wensing and Park, 2019, with the weight γ = 0.01) keeps a link that the log does not determine
         from losing all its inertia.
@@ -90,6 +103,7 @@ class InertialPrior(ForcePrior):
             robot: with π₀.
             mean: of δ, `(10 nq,)`.
             precision: of δ, `(10 nq, 10 nq)`.
+            log_volume: V, what turns the density of a torque into that of an acceleration.
 
         Returns:
             The robot, and the δ that it contains `(10 nq,)`. Links that are not physically consistent in the
@@ -106,26 +120,30 @@ class InertialPrior(ForcePrior):
             delta = torch.zeros_like(pi0).index_put((sound.nonzero()[:, 0],), inertial_parameters(*bodies))
             return torch.where(sound[:, None], (delta - pi0) / scale, 0.0).flatten()
 
+        rows = (sound.nonzero()[:, 0],)
+
+        def robot_of(x: Tensor) -> RobotModel:
+            mass, com, inertia = from_pseudo_inertia(from_log_cholesky(x))
+            return robot.replace(
+                mass=robot.mass.index_put(rows, mass),
+                com=robot.com.index_put(rows, com),
+                inertia=robot.inertia.index_put(rows, inertia),
+            )
+
         def objective(tensors: dict[str, Tensor]) -> Tensor:
             x = tensors["x"]
             apart = delta_of(x) - mean
             ratio = inverse @ from_log_cholesky(x)
             log_det = 8.0 * x[:, 0] + 2.0 * x[:, 1:4].sum(-1)
             divergence = ratio.diagonal(dim1=-2, dim2=-1).sum(-1) - log_det
-            return 0.5 * apart @ (precision @ apart) + DIVERGENCE * divergence.sum()
+            fit = 0.5 * apart @ (precision @ apart) + DIVERGENCE * divergence.sum()
+            return fit - log_volume(robot_of(x))
 
         if not bool(sound.any()):
             return robot, torch.zeros_like(mean)
         with torch.enable_grad():
             found = minimise(objective, {"x": log_cholesky(J0[sound])}, CONSISTENT).tensors["x"]
-        rows = (sound.nonzero()[:, 0],)
-        mass, com, inertia = from_pseudo_inertia(from_log_cholesky(found))
-        moved = robot.replace(
-            mass=robot.mass.index_put(rows, mass),
-            com=robot.com.index_put(rows, com),
-            inertia=robot.inertia.index_put(rows, inertia),
-        )
-        return moved, delta_of(found).detach()
+        return robot_of(found), delta_of(found).detach()
 
 
 DIVERGENCE = 0.01

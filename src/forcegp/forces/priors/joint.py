@@ -25,6 +25,11 @@ class JointForcePrior(ForcePrior):
         periodic: replace the angle of each revolute joint by its sine and cosine.
         name: prefix of the hyperparameters.
 
+    Example:
+        >>> from forcegp.gp.stationary import SquaredExponential
+        >>> JointForcePrior(SquaredExponential(("q", "qd"))).name
+        'joint'
+
     Raises:
         UnknownNameError: an input is not one of the three.
     """

@@ -41,6 +41,13 @@ class JointFrictionPrior(ForcePrior):
         load: whether friction proportional to the load |Q_G,i| is a feature.
         name: prefix of the hyperparameters.
 
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> prior = JointFrictionPrior()
+        >>> prior.outputs(robot), prior.target
+        (2, 'joint')
+
     Raises:
         ModelError: a speed is not positive and finite.
     """

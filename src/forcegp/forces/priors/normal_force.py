@@ -24,6 +24,11 @@ class NormalForcePrior(ForcePrior):
 
     Args:
         like: the joint force prior whose kernel, inputs and hyperparameters it shares.
+
+    Example:
+        >>> from forcegp import JointForcePrior
+        >>> NormalForcePrior(JointForcePrior()).target
+        'constraint'
     """
 
     like: JointForcePrior = field(default_factory=JointForcePrior)

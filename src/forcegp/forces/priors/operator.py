@@ -28,6 +28,17 @@ class OperatorForcePrior(ForcePrior):
         kernel: covariance of each component.
         target: `joint`, `contact` or `constraint`: whether the force is part of Q, Q_z or Q along the
             constraint.
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> system = forcegp.ConstrainedSystem(robot)
+        >>> frame = robot.frame_names[-1]
+        >>> def at_end(system, at):
+        ...     return forcegp.kinematics.point_jacobian(system.robot, at.q, frame).mT
+        >>> wind = OperatorForcePrior("wind", 3, at_end)
+        >>> wind.outputs(robot), wind.target
+        (3, 'joint')
     """
 
     name: str

@@ -74,9 +74,10 @@ def _take(item: Any, name: str, arrays: Arrays, remarks: list[str]) -> None:
     text = item.attrs.get("MATLAB_class", b"") in (b"char", b"cell", b"struct", b"function_handle")
     if item.dtype.kind not in "fiub" or item.ndim not in (1, 2) or text:
         remarks.append(f"{name!r} of shape {item.shape} and type {item.dtype} was left out")
-    elif item.external:
+    elif item.external or item.is_virtual:
         remarks.append(f"{name!r} lies outside the file and was left out")
     else:
-        taken = sum(array.size for array in arrays.values())
-        bounds.check_count(item.file.filename, "numbers", taken + item.size, limits.LOG_VALUES)
+        source, taken = item.file.filename, sum(array.size for array in arrays.values()) + item.size
+        bounds.check_count(source, "numbers", taken, limits.LOG_VALUES)
+        bounds.check_expansion(source, 8 * taken, Path(source).stat().st_size)
         arrays[name] = item[()]

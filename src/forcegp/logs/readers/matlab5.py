@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from forcegp import limits
 from forcegp.errors import DataError
+from forcegp.logs import bounds
 
 HEADER_BYTES = 128
 MATRIX, COMPRESSED, INT8, UTF8 = 14, 15, 1, 16
@@ -57,7 +58,7 @@ def variables(content: bytes, source: str) -> Iterator[Variable]:
 
 class _Reader:
     def __init__(self, source: str, order: str) -> None:
-        self.source, self.order = source, order
+        self.source, self.order, self.count = source, order, 0
 
     def variables(self, content: memoryview) -> Iterator[Variable]:
         for element in self.elements(content[HEADER_BYTES:]):
@@ -105,6 +106,8 @@ class _Reader:
         """A variable, or a field of a struct."""
         if depth > limits.GROUP_DEPTH:
             raise DataError(f"{self.source}: structs are nested more than {limits.GROUP_DEPTH} levels deep")
+        self.count += 1
+        bounds.check_count(self.source, "variables and fields", self.count, limits.COLUMNS)
         if not len(body):
             return Variable("", "holds nothing")
         parts = self.elements(body)

@@ -32,9 +32,9 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
             with zipfile.ZipFile(path) as archive:
                 members = archive.infolist()
                 bounds.check_count(str(path), "arrays", len(members), MAX_ARRAYS)
-                bounds.check_count(
-                    str(path), "bytes", sum(m.file_size for m in members), 8 * limits.LOG_VALUES
-                )
+                size = sum(member.file_size for member in members)
+                bounds.check_count(str(path), "bytes", size, 8 * limits.LOG_VALUES)
+                bounds.check_expansion(str(path), size, path.stat().st_size)
                 for member in members:
                     with archive.open(member) as file:
                         name = member.filename.removesuffix(".npy")

@@ -51,6 +51,7 @@ def read_columns(
         with pq.ParquetFile(path) as file:
             total += _check(str(path), file)
             bounds.check_values(str(path), total, 1)
+    length = sum(path.stat().st_size for path in paths)
     done = 0
     for path in paths:
         with pq.ParquetFile(path, pre_buffer=False) as file:
@@ -62,6 +63,7 @@ def read_columns(
                             chunks.setdefault(part, []).append(values)
                 done += len(batch)
                 bounds.check_values(str(path), done, max(len(chunks), 1))
+                bounds.check_expansion(str(path), 8 * done * len(chunks), length)
                 if progress is not None:
                     progress(done, total)
                 if rows is not None and done >= rows:

@@ -1,0 +1,139 @@
+"""Fits of several models to several robots and seeds, on the workers of a Dask cluster.
+
+Each fit is one task that leaves a folder, so that a sweep which was interrupted goes on with what is missing.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from forcegp.data import split_by_stretches
+from forcegp.data.split import complement
+from forcegp.evaluation import evaluate
+from forcegp.files import atomic_directory, write_json
+from forcegp.models.configured import configured
+from forcegp.optional import optional_module
+from forcegp.scene import load_scene
+from forcegp.simulate import simulate
+
+SCORE, MODEL = "score.json", "model"
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One fit of a sweep.
+
+    Attributes:
+        scene: scene file or name of a bundled one: the robot, its contacts and its simulated motion.
+        model: name of the model.
+        seed: of the simulated motion, its noise, the held-out stretches, and random initial values.
+        duration: simulated time [s]; `None` for the scene's.
+    """
+
+    scene: str
+    model: str
+    seed: int
+    duration: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Folder of the fit."""
+        return f"{Path(self.scene).stem}/{self.model}/seed-{self.seed}"
+
+
+def fits_of(
+    scenes: Sequence[str], models: Sequence[str], seeds: Sequence[int], duration: float | None = None
+) -> list[Fit]:
+    """Every model on every robot with every seed.
+
+    Example:
+        >>> [fit.name for fit in fits_of(["kuka_plane"], ["sgp-mean", "gp"], [0])]
+        ['kuka_plane/sgp-mean/seed-0', 'kuka_plane/gp/seed-0']
+    """
+    return [Fit(*chosen, duration) for chosen in product(scenes, models, seeds)]
+
+
+def run_fit(fit: Fit, out: str) -> dict[str, Any]:
+    """Simulate, fit and score, unless that has been done; runs on a worker, in one thread.
+
+    Args:
+        fit: what is fitted.
+        out: folder of the sweep, which all workers see.
+
+    Returns:
+        The scores on held-out stretches by name, and how long the fit took.
+    """
+    folder = Path(out) / fit.name
+    if (folder / SCORE).is_file():
+        return json.loads((folder / SCORE).read_text(encoding="utf-8"))
+    torch.set_num_threads(1)
+    scene = load_scene(fit.scene)
+    system, config = scene.system(), replace(scene.simulation, seed=fit.seed)
+    if fit.duration is not None:
+        config = replace(config, duration=fit.duration)
+    data = simulate(system, config).data
+    split = split_by_stretches(data, 1, seed=fit.seed)
+    model = configured(scene.model, system, name=fit.model, seed=fit.seed)
+    fitted = model.fit(data[complement(split.test, len(data))])
+    found = evaluate(fitted, data[split.test], compare=False)
+    score = {
+        **asdict(fit),
+        "noisy_mae": found.noisy_mae,
+        "clean_mae": found.clean_mae,
+        "coverage_noisy": found.coverage_noisy,
+        "samples": fitted.result.samples,
+        "seconds": fitted.seconds,
+        "converged": fitted.converged,
+    }
+    with atomic_directory(folder) as temporary:
+        fitted.save(temporary / MODEL)
+        write_json(temporary / SCORE, score)
+    return score
+
+
+def sweep(
+    fits: Sequence[Fit],
+    out: str | Path,
+    *,
+    processes: int = 2,
+    address: str | None = None,
+    say: Callable[[int, dict[str, Any]], None] = lambda _, __: None,
+) -> list[dict[str, Any]]:
+    """Run fits on a Dask cluster: one of this machine, or one that is running.
+
+    Args:
+        fits: what is fitted.
+        out: folder for the fits, which all workers see.
+        processes: workers of one thread each on this machine.
+        address: of the scheduler of a running cluster, such as `tcp://host:8786`.
+        say: called with the number of fits that have ended and the score of the last one.
+
+    Returns:
+        The scores, in the order of the fits.
+
+    Raises:
+        MissingDependencyError: Dask is not installed.
+    """
+    dask = optional_module("distributed", "A sweep", "sweep")
+    root, scores = str(Path(out).resolve()), {}
+    with ExitStack() as stack:
+        if address is None:
+            cluster = stack.enter_context(
+                dask.LocalCluster(n_workers=processes, threads_per_worker=1, dashboard_address=None)
+            )
+            address = cluster.scheduler_address
+        client = stack.enter_context(dask.Client(address))
+        futures = client.map(run_fit, fits, out=root, pure=False)
+        place = {future.key: i for i, future in enumerate(futures)}
+        for future in dask.as_completed(futures):
+            scores[place[future.key]] = future.result()
+            say(len(scores), scores[place[future.key]])
+    return [scores[i] for i in range(len(fits))]

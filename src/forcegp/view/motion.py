@@ -1,0 +1,186 @@
+"""A motion to look at: joint positions over time, forces of contacts, and paths of the tip."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from forcegp import kinematics
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.data import Dataset
+from forcegp.errors import DataError
+from forcegp.models.base import Predictor
+from forcegp.rollout import Rollout, RolloutOptions
+from forcegp.rollout.inputs import sampling_period
+
+Array = NDArray[np.float64]
+RATE = 20.0
+"""Pictures per second."""
+LOGGED, MEAN, SAMPLE = "logged", "predicted", "sampled"
+
+
+@dataclass(frozen=True)
+class Force:
+    """The normal force of a contact with a surface, in each picture.
+
+    Attributes:
+        contact: its name.
+        point, normal: `(k, 3)` where it acts, and the normal there [m].
+        value: `(k,)` [N]; NaN where the contact is open.
+        std: `(k,)` standard deviation [N]; 0 where it is not known.
+    """
+
+    contact: str
+    point: Array
+    normal: Array
+    value: Array
+    std: Array
+
+
+@dataclass(frozen=True)
+class Path3D:
+    """The path of the tip.
+
+    Attributes:
+        kind: `logged`, `predicted` or `sampled`.
+        points: `(n, 3)` [m].
+    """
+
+    kind: str
+    points: Array
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion to look at.
+
+    Attributes:
+        system: robot and contacts.
+        t: `(k,)` time of each picture [s].
+        q: `(k, nq)` joint positions.
+        forces: of the contacts with a surface.
+        paths: of the tip.
+    """
+
+    system: ConstrainedSystem
+    t: Array
+    q: Tensor
+    forces: Sequence[Force] = ()
+    paths: Sequence[Path3D] = ()
+
+
+def at_rest(system: ConstrainedSystem) -> Motion:
+    """The robot at q = 0, or the nearest position within its limits."""
+    robot = system.robot
+    q = torch.zeros(1, robot.nq, dtype=robot.dtype).clamp(robot.lower.cpu(), robot.upper.cpu())
+    return Motion(system, np.zeros(1), q)
+
+
+def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = None) -> Motion:
+    """The logged motion of one trajectory, with the contact force.
+
+    Args:
+        system: robot and contacts.
+        data: rows of one trajectory in the order of time.
+        model: predicts the force with its uncertainty; without one it is the logged multiplier, if any.
+
+    Raises:
+        DataError: no rows, or they do not fit the robot.
+    """
+    data = data.select(system.robot.joint_names)
+    if not len(data):
+        raise DataError("there is no motion to look at", expected="one row or more", got="none")
+    rows = pictures(data.t)
+    shown = data[rows]
+    return Motion(
+        system,
+        _array(shown.t - data.t[0]),
+        shown.q,
+        _forces(system, shown, model),
+        [Path3D(LOGGED, tip_path(system, data.q))],
+    )
+
+
+def with_rollout(motion: Motion, path: Rollout) -> Motion:
+    """The motion with the paths of a rollout: the mean, and one of each function sample."""
+    found = [Path3D(MEAN, tip_path(motion.system, path.q.reshape(-1, path.q.shape[-1])))]
+    if path.samples is not None:
+        sampled = path.samples.q.reshape(-1, *path.samples.q.shape[-2:])
+        found += [Path3D(SAMPLE, tip_path(motion.system, q)) for q in sampled]
+    return Motion(motion.system, motion.t, motion.q, motion.forces, [*motion.paths, *found])
+
+
+def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float, seed: int = 0) -> Rollout:
+    """A model rolled out from the first state of a log under the logged torques.
+
+    Args:
+        model: a fitted model.
+        data: one trajectory.
+        samples: function samples; 0 for a model that has none.
+        seconds: how far ahead, at most to the end of the log.
+        seed: of the samples.
+    """
+    dt = sampling_period(data)
+    return model.rollout(
+        data.q[0],
+        data.qd[0],
+        data,
+        duration=min(seconds, float(data.t[-1] - data.t[0])),
+        samples=samples if model.has_function_samples else 0,
+        seed=seed,
+        active=data.active(model.system.contact_names)[0],
+        options=RolloutOptions(dt, on_divergence="keep"),
+    )
+
+
+def tip_of(system: ConstrainedSystem) -> tuple[str, tuple[float, ...]]:
+    """Frame and point of the first contact with a surface, or else the last frame of the robot."""
+    for contact in system.contacts:
+        if isinstance(contact, SurfaceContact):
+            return contact.frame, tuple(contact.point)
+    return system.robot.frame_names[-1], (0.0, 0.0, 0.0)
+
+
+def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:
+    """Positions of the tip `(n, 3)`, up to where a trajectory diverged [m]."""
+    sound = int(torch.isfinite(q).all(-1).long().cumprod(0).sum())
+    return _array(kinematics.point_position(system.robot, q[:sound], *tip_of(system)))
+
+
+def pictures(t: Tensor) -> Tensor:
+    """The rows that are shown: the last one before each picture's time."""
+    times = torch.arange(float(t[0]), float(t[-1]) + 0.5 / RATE, 1.0 / RATE, dtype=t.dtype)
+    return torch.unique((torch.searchsorted(t.contiguous(), times, right=True) - 1).clamp(0, len(t) - 1))
+
+
+def _forces(system: ConstrainedSystem, data: Dataset, model: Predictor | None) -> list[Force]:
+    """The normal force of each contact with a surface."""
+    if not system.contacts:
+        return []
+    active = data.active(system.contact_names)
+    with torch.no_grad():
+        eom = system.equations(data.q, data.qd, active)
+    value = std = None
+    if model is not None and model.force_field() is not None:
+        found = model.predict(data.q, data.qd, data.tau, "multiplier", active=active)
+        value, std = found.mean, found.std
+    forces, row = [], 0
+    for i, contact in enumerate(system.contacts):
+        point = eom.contact_points.get(contact.name)
+        own = data.contact_extras.get("multiplier", {}).get(contact.name) if value is None else value[:, row]
+        if point is not None and own is not None:
+            spread = torch.zeros_like(own) if std is None else std[:, row]
+            shown = torch.where(active[:, i], own, torch.nan)
+            parts = (point.position, point.normal, shown, spread)
+            forces.append(Force(contact.name, *(_array(x) for x in parts)))
+        row += contact.rows
+    return forces
+
+
+def _array(values: Tensor) -> Array:
+    return values.detach().to("cpu", torch.float64).numpy()

@@ -1,0 +1,165 @@
+"""What a robot looks like: the shapes of its URDF file, or else rods between its joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from forcegp.robot import RobotModel
+from forcegp.robot.load import BUNDLED
+from forcegp.robot.model import BASE
+from forcegp.robot.safety import parse_numbers, parse_xml, read_bytes
+
+Array = NDArray[np.float64]
+MESHES = (".stl", ".obj", ".ply", ".glb")
+"""Formats of meshes that are read; parts in another format are left out."""
+MESH_BYTES = 1 << 25
+LEAST = 1e-3
+"""Rods shorter than this are left out [m]."""
+SIZES = {"box": ("size", 3), "cylinder": ("radius", 1), "sphere": ("radius", 1)}
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A rigid part of a link.
+
+    Attributes:
+        link: index of the joint that moves it, −1 for the base.
+        kind: `box`, `cylinder` (along its z axis), `sphere` or `mesh`.
+        size: sides of a box, radius and length of a cylinder, radius of a sphere, or scale of a mesh [m].
+        rotation, position: `(3, 3)`, `(3,)` pose in the link frame [m].
+        mesh: file of a mesh.
+    """
+
+    link: int
+    kind: str
+    size: tuple[float, ...]
+    rotation: Array
+    position: Array
+    mesh: Path | None = None
+
+
+def shapes_of(robot: RobotModel, source: str | Path | None = None) -> list[Shape]:
+    """The parts of a robot.
+
+    Args:
+        robot: the robot.
+        source: its file, or the name of a bundled robot; by default a bundled robot of the same name and
+            frames is recognised. Without a URDF file the robot is made of rods between its joints.
+
+    Raises:
+        RobotFileError: the shapes of the file are not valid.
+    """
+    own = str(source) if source is not None else robot.name
+    if own in BUNDLED:
+        path = Path(str(files("forcegp.robot") / "bundled" / f"{own}.urdf"))
+    elif source is None:
+        return rods(robot)
+    else:
+        path = Path(source)
+    root = parse_xml(read_bytes(path), str(path))
+    found = _visuals(root, path, robot) if root.tag == "robot" else []
+    return found or rods(robot)
+
+
+def rods(robot: RobotModel) -> list[Shape]:
+    """A rod to each joint and to the last frame of each link, and a ball at each joint."""
+    place, at = robot.placement_position.detach().cpu().numpy(), robot.frame_position.detach().cpu().numpy()
+    ends = list(zip(robot.parents, place, strict=True))
+    for link in range(robot.nq):
+        own = [at[i] for i, parent in enumerate(robot.frame_parents) if parent == link]
+        if link not in robot.parents and own:
+            ends.append((link, max(own, key=lambda x: float(np.linalg.norm(x)))))
+    radius = 0.02 * sum(float(np.linalg.norm(end)) for _, end in ends)
+    parts = [Shape(i, "sphere", (1.4 * radius,), np.eye(3), np.zeros(3)) for i in range(robot.nq)]
+    for link, end in ends:
+        length = float(np.linalg.norm(end))
+        if length > LEAST:
+            parts.append(Shape(link, "cylinder", (radius, length), turn_z(end / length), 0.5 * end))
+    return parts
+
+
+def turn_z(direction: Array) -> Array:
+    """A rotation that turns the z axis to a unit direction, `(3, 3)`."""
+    axis = np.cross([0.0, 0.0, 1.0], direction)
+    sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
+    if sine < 1e-12:
+        return np.diag([1.0, np.sign(cosine), np.sign(cosine)])
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
+
+
+def _visuals(root: Element, path: Path, robot: RobotModel) -> list[Shape]:
+    """The visual elements of the links of a URDF document that are frames of the robot."""
+    parts = []
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        if name not in robot.frame_names:
+            continue
+        index = robot.frame_index(name)
+        R = robot.frame_rotation[index].detach().cpu().numpy()
+        p = robot.frame_position[index].detach().cpu().numpy()
+        for visual in link.findall("visual"):
+            shape = _shape(visual, f"{path}: link {name!r}", path.parent)
+            if shape is not None:
+                parts.append(
+                    Shape(
+                        robot.frame_parents[index],
+                        shape.kind,
+                        shape.size,
+                        R @ shape.rotation,
+                        p + R @ shape.position,
+                        shape.mesh,
+                    )
+                )
+    return parts
+
+
+def _shape(visual: Element, where: str, folder: Path) -> Shape | None:
+    """One visual element, in the frame of its link; `None` for what cannot be shown."""
+    origin, geometry = visual.find("origin"), visual.find("geometry")
+    if geometry is None or not len(geometry):
+        return None
+    place = {} if origin is None else origin.attrib
+    position = np.array(parse_numbers(place.get("xyz", "0 0 0"), f"{where}: origin xyz", 3))
+    rpy = parse_numbers(place.get("rpy", "0 0 0"), f"{where}: origin rpy", 3)
+    rotation, body = Rotation.from_euler("xyz", rpy).as_matrix(), geometry[0]
+    if body.tag == "mesh":
+        mesh = _mesh_file(body.get("filename", ""), folder)
+        scale = parse_numbers(body.get("scale", "1 1 1"), f"{where}: mesh scale", 3)
+        return None if mesh is None else Shape(BASE, "mesh", tuple(scale), rotation, position, mesh)
+    if body.tag not in SIZES:
+        return None
+    attribute, count = SIZES[body.tag]
+    size = parse_numbers(body.get(attribute, ""), f"{where}: {body.tag} {attribute}", count)
+    if body.tag == "cylinder":
+        size += parse_numbers(body.get("length", ""), f"{where}: cylinder length", 1)
+    return Shape(BASE, body.tag, tuple(size), rotation, position)
+
+
+def _mesh_file(name: str, folder: Path) -> Path | None:
+    """A mesh that a robot file names, below its folder or the package that it names; `None` if none is found.
+
+    A name never leads out of these folders.
+    """
+    package, _, rest = name.removeprefix("package://").partition("/")
+    if name.startswith("package://"):
+        roots = [parent / package for parent in (folder, *folder.resolve().parents)] + [folder]
+    elif "://" in name:
+        return None
+    else:
+        roots, rest = [folder], name
+    for root in roots:
+        try:
+            path = (root / rest).resolve()
+            usable = path.is_file() and path.is_relative_to(root.resolve())
+        except (OSError, ValueError):
+            continue
+        if usable and path.suffix.lower() in MESHES and path.stat().st_size <= MESH_BYTES:
+            return path
+    return None

@@ -1,0 +1,50 @@
+"""Models and their errors travel to the workers of a process pool and back."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+
+import pytest
+import torch
+
+import forcegp
+from forcegp.errors import ForceGPError, ModelError
+from random_data import random_data, table_system
+
+DATA = random_data(table_system(), 12)
+FEW = forcegp.LearningOptions(max_evaluations=2)
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[ProcessPoolExecutor]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")
+        patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as workers:
+            yield workers
+
+
+def predicted(model: forcegp.StructuredGP, quantity: str) -> torch.Tensor:
+    """What a worker predicts, as a tensor that is sent back by value."""
+    return model.predict(DATA.q, DATA.qd, DATA.tau, quantity).mean.clone()
+
+
+def test_a_worker_predicts_the_same_bits_and_raises_the_same_error(pool: ProcessPoolExecutor) -> None:
+    model = forcegp.StructuredGP(table_system(), noise_std=0.1)
+    model.fit(DATA, options=FEW)
+    here = predicted(model, "qdd")
+    assert pool.submit(predicted, model, "qdd").result(timeout=120).tolist() == here.tolist()
+    with pytest.raises(ForceGPError, match="unknown quantity") as there:
+        pool.submit(predicted, model, "gdd").result(timeout=120)
+    with pytest.raises(ForceGPError) as error:
+        predicted(model, "gdd")
+    assert str(there.value) == str(error.value) and type(there.value) is type(error.value)
+
+
+def test_a_model_without_a_fit_says_so_before_it_is_sent(pool: ProcessPoolExecutor) -> None:
+    with pytest.raises(ModelError, match="has not been fitted"):
+        pool.submit(predicted, forcegp.StructuredGP(table_system()), "qdd").result(timeout=120)
