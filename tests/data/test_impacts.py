@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import torch
 
-from forcegp.data import without_impacts
+from forcegp.data import without_marked_impacts
 from logs import random_log
 
 
 def test_rows_that_a_mask_marks_are_left_out() -> None:
     data = random_log(60)
-    assert without_impacts(data) is data
+    assert without_marked_impacts(data) is data
     mask = torch.zeros(60, dtype=torch.float64)
     mask[10:14] = 1.0
     marked = data.replace(contact_extras={**data.contact_extras, "impact": {"table": mask}})
-    clear = without_impacts(marked)
+    clear = without_marked_impacts(marked)
     assert clear.t.tolist() == [*data.t[:10].tolist(), *data.t[14:].tolist()]
     assert clear.header.provenance[-1] == "left out 4 rows at impacts"
     assert clear.header.ordered

@@ -50,14 +50,14 @@ def select(
 
     forcegp select run.csv -n 400 --split stretches --differentiate 11 -o train.parquet --rest test.parquet
     """
-    from forcegp.data import split_by_selection, split_by_stretches, without_impacts
+    from forcegp.data import split_by_selection, split_by_stretches, without_marked_impacts
     from forcegp.destination import write_or_keep
 
     check_data_destination(out, log)
     if rest is not None:
         check_data_destination(rest, log, out)
     whole = read_data(log, differentiate)
-    data = whole if keep_impacts else without_impacts(whole)
+    data = whole if keep_impacts else without_marked_impacts(whole)
     with progress_bar("selecting points", count) as progress:
         if split == "selection":
             parts = split_by_selection(data, count, method=method, seed=seed, progress=progress)

@@ -4,7 +4,7 @@ from forcegp.data.compatible import RobotMismatchWarning
 from forcegp.data.dataset import Dataset, NotLoggedError
 from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.header import DataHeader
-from forcegp.data.impacts import without_impacts
+from forcegp.data.impacts import without_marked_impacts
 from forcegp.data.noise import with_noise
 from forcegp.data.selection import farthest_points, select_points, standardized, standardized_inputs
 from forcegp.data.split import Split, complement, split_by_selection, split_by_stretches
@@ -26,5 +26,5 @@ __all__ = [
     "standardized",
     "standardized_inputs",
     "with_noise",
-    "without_impacts",
+    "without_marked_impacts",
 ]

@@ -10,7 +10,7 @@ IMPACT = "impact"
 """Mask by contact, 1 near a switch, as `forcegp import` writes it."""
 
 
-def without_impacts(data: Dataset) -> Dataset:
+def without_marked_impacts(data: Dataset) -> Dataset:
     """The rows that no mask `impact.<contact>` marks; all rows of a log without masks.
 
     Args:

@@ -19,7 +19,7 @@ from forcegp import kinematics
 from forcegp.checks import Report, check
 from forcegp.checks import read_log as read_checked
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
-from forcegp.data import Dataset, split_by_stretches, without_impacts
+from forcegp.data import Dataset, split_by_stretches, without_marked_impacts
 from forcegp.errors import DataError
 from forcegp.evaluation import evaluate
 from forcegp.files import write_json, write_text
@@ -129,7 +129,7 @@ def selected(log: Dataset, truth: Dataset, system: ConstrainedSystem) -> tuple[D
 
     Rows at impacts are left out, as by `forcegp select`: no smooth acceleration describes them.
     """
-    log = without_impacts(log)
+    log = without_marked_impacts(log)
     split = split_by_stretches(log, POINTS)
     name, rows = system.contact_names[0], rows_of(log, truth)
     force = {name: truth.contact_extras["multiplier"][name][rows]}
