@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.footprint import announce_states
 from forcegp.data import DataHeader, Dataset
 from forcegp.errors import DataError
 from forcegp.logs import clock, smoothing, wrench
@@ -20,8 +19,13 @@ from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, load_mapping
 from forcegp.logs.report import Report
 from forcegp.logs.signals import Signals
+from forcegp.memory import announce_memory
 from forcegp.robot import RobotModel
 from forcegp.scene import Scene, load_scene
+
+
+NUMBERS = 16
+"""Upper bound on the numbers of one joint in one row that are held at a time; ten were measured."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,7 @@ def import_log(
     report.did(f"read {Path(path).name} by mapping {Path(known.source).name}")
     try:
         signals = gather(path, known, robot.joint_names, report, progress)
-        announce_states(system, len(signals), 2.0, f"importing {len(signals):,} rows")
+        announce_memory(_bytes(signals), f"importing {len(signals):,} rows")
         smoothing.even_clock(signals, known.sections.time.period, report)
         found = _contacts(signals, system, known, report)
         std = smoothing.complete(signals, known.sections.derivatives, report)
@@ -122,6 +126,10 @@ def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> Con
     if isinstance(scene, RobotModel):
         return ConstrainedSystem(scene)
     return (scene if isinstance(scene, Scene) else load_scene(scene)).system()
+
+
+def _bytes(signals: Signals) -> int:
+    return 8 * NUMBERS * len(signals.joint_names) * len(signals)
 
 
 def _contacts(
