@@ -23,7 +23,6 @@ from forcegp.memory import announce_memory
 from forcegp.robot import RobotModel
 from forcegp.scene import Scene, load_scene
 
-
 NUMBERS = 16
 """Upper bound on the numbers of one joint in one row that are held at a time; ten were measured."""
 
