@@ -160,7 +160,7 @@ def markdown(result: dict) -> str:
 def rollouts(found: dict) -> str:
     """The table of open-loop trajectories."""
     columns = ["model", *(f"joint angles after {h:g} s, RMSE [rad]" for h in found["horizons_s"])]
-    names = ("least squares", "structured GP, defaults")
+    names = ("least squares", "structured GP, friction and inertia")
     rows = [[name, *(f"{error:.3f}" for error in found[name])] for name in names]
     share = found["coverage_of_90_%_bands"]
     text = f"{found['starts']} starts; the 90 % bands of {found['samples']} samples hold {share:.1%}."

@@ -11,11 +11,14 @@ from torch import Tensor
 import forcegp
 from forcegp.constraints import ConstrainedSystem
 from forcegp.evaluation.least_squares import LeastSquares, identify_rigid
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.quantities import States
 from forcegp.rollout import ForceField, compare
 
 HORIZONS = (0.5, 1.0)
 """Times at which joint angles are compared [s]."""
+NAME = "structured GP, friction and inertia"
 STARTS, SAMPLES = 40, 50
 LEAST_SPEED = 0.5
 """The log is used up to the last sample in which a joint is faster [rad/s]."""
@@ -51,7 +54,9 @@ def run_rollouts(case: Case) -> dict:
     """Root-mean-square errors of joint angles [rad] by model and horizon, and coverage of the 90 % bands."""
     models = {
         "least squares": Rigid(identify_rigid(case.system, case.train)),
-        "structured GP, defaults": forcegp.StructuredGP(case.system, "analytical").fit(case.train),
+        NAME: forcegp.StructuredGP(
+            case.system, "analytical", force_priors=[JointFrictionPrior(), InertialPrior()]
+        ).fit(case.train),
     }
     log = next(iter(case.tests.values()))
     log = log[: int((log.qd.abs().amax(-1) > LEAST_SPEED).nonzero().max())]
@@ -61,7 +66,7 @@ def run_rollouts(case: Case) -> dict:
         error = path.q - found.q
         at = [int((found.t - horizon).abs().argmin()) for horizon in HORIZONS]
         result[name] = [float(error[:, i].square().mean().sqrt()) for i in at]
-    samples = found.predicted["structured GP, defaults"].samples
+    samples = found.predicted[NAME].samples
     assert samples is not None
     low, high = samples.q.quantile(0.05, 0), samples.q.quantile(0.95, 0)
     result["coverage_of_90_%_bands"] = float(((found.q >= low) & (found.q <= high)).double().mean())

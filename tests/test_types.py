@@ -40,9 +40,10 @@ print(forcegp.StreamedDataset(("a.parquet", "b.parquet")).header.dt, forcegp.Dat
 """
 
 
-@pytest.mark.skipif(
-    shutil.which("pyright", path=str(Path(sys.executable).parent)) is None, reason="no pyright"
-)
+PYRIGHT = shutil.which("pyright", path=str(Path(sys.executable).parent))
+
+
+@pytest.mark.skipif(PYRIGHT is None, reason="no pyright")
 def test_strict_type_checker_accepts_code_that_uses_the_interface(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
     (tmp_path / "forcegp").symlink_to(Path(str(forcegp.__file__)).parent, target_is_directory=True)

@@ -141,7 +141,6 @@ def test_what_the_solver_cannot_do_is_named() -> None:
     [
         ({"contact": "soft"}, "contact"),
         ({"contact": "solver", "engine": "pybullet"}, "engine"),
-        ({"contact": "solver", "dt": 0.0033}, "step"),
     ],
 )
 def test_settings_that_do_not_fit_are_named(settings: dict, name: str) -> None:

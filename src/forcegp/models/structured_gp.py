@@ -27,7 +27,6 @@ from forcegp.forces.state_noise import state_std_of
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions, Progress
 from forcegp.models.base import FitProgress, Model
-from forcegp.models.structured_choice import chosen_priors
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Lesson, in_motion, prepared, solve
 from forcegp.models.structured_spec import Specification, torque_noise_of
@@ -195,7 +194,7 @@ class StructuredGP(Model[StructuredFit]):
             sample = sample_of(self.specification, known)
             known = sample.data
         if self._fitted is None:
-            self.specification = self._for_data(known, options)
+            self.specification = self.specification.for_data(known)
         spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
         options = options or (LearningOptions() if spec.parameters is None else WITH_PARAMETERS)
         chosen = self._chosen(learn)
@@ -230,15 +229,6 @@ class StructuredGP(Model[StructuredFit]):
                 if kept is not None:
                     kept.remove()
         return fitted
-
-    def _for_data(
-        self, data: Dataset | Sequence[Observation], options: LearningOptions | None
-    ) -> Specification:
-        """The specification with what was left to the data filled in."""
-        spec = self.specification.for_data(data)
-        if not (self.specification.automatic and spec.learns_torque_noise and spec.parameters is None):
-            return spec
-        return chosen_priors(spec, data, lambda own, part: StructuredGP.of(own).fit(part, options=options))
 
     def _search(self, problem: Problem, chosen: Sequence[str], options: LearningOptions) -> Search:
         """What is learned of a problem, from where, and what keeps its values."""

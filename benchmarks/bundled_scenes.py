@@ -1,7 +1,7 @@
 """Every bundled scene: simulate it, fit a model to a part of the log, and test it on the rest.
 
-    python examples/bundled_scenes.py
-    python examples/bundled_scenes.py panda_sphere ur5_wiping --duration 30 --points 200
+    python benchmarks/bundled_scenes.py
+    python benchmarks/bundled_scenes.py panda_sphere ur5_wiping --duration 30 --points 200
 
 Scenes whose forces are this library's own train `sgp-mean`; scenes in which MuJoCo's solver makes contact
 and friction train `sgp-real`, the model for measured robots. Printed by scene: the error of the predicted
