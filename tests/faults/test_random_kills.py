@@ -21,6 +21,11 @@ import pytest
 from faults.commands import COMMANDS, Command, child, numbers, prepare, stages
 
 KILLS = 50 if os.environ.get("FORCEGP_ATTACK") else 3
+PRELOADED = [
+    *("faults.commands", "forcegp.simulate", "forcegp.logs", "forcegp.paper.reproduce"),
+    *("forcegp.report.rollouts", "scipy.signal", "matplotlib.pyplot", "pybullet"),
+]
+"""What the commands import on their way; a module that is not installed is passed over."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="SIGKILL")
@@ -33,7 +38,7 @@ def context() -> Iterator[ForkServerContext]:
             patch.setenv(name, "1")
         patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
         found = multiprocessing.get_context("forkserver")
-        found.set_forkserver_preload(["faults.commands"])
+        found.set_forkserver_preload(PRELOADED)
         yield found
 
 
