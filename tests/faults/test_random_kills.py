@@ -39,6 +39,9 @@ def context() -> Iterator[ForkServerContext]:
         patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
         found = multiprocessing.get_context("forkserver")
         found.set_forkserver_preload(PRELOADED)
+        first = found.Process(target=time.sleep, args=(0.0,))
+        first.start()  # starts the server, which takes longer than a command
+        first.join()
         yield found
 
 
