@@ -146,3 +146,33 @@ def test_reading_mjcf_leaves_the_warning_handler_of_mujoco(tmp_path) -> None:
         assert mujoco.get_mju_user_warning() is handler
     finally:
         mujoco.set_mju_user_warning(before)
+
+
+INVERSES = """
+import torch
+from threadpoolctl import ThreadpoolController
+from forcegp.linalg import cholesky_inverse_
+from forcegp.threads import threads_of_pytorch
+torch.set_num_threads(1)
+libraries = ThreadpoolController().select(internal_api="openblas").lib_controllers
+before = [x.num_threads for x in libraries]
+with threads_of_pytorch():
+    inside = [x.num_threads for x in libraries]
+cholesky_inverse_(torch.eye(300, dtype=torch.float64))
+print(dict(before=before, inside=inside, after=[x.num_threads for x in libraries]))
+"""
+
+
+def test_the_blas_of_scipy_takes_the_threads_of_pytorch() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", INVERSES],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "2"},
+    )
+    seen = ast.literal_eval(done.stdout)
+    if 2 not in seen["before"]:
+        pytest.skip("NumPy and SciPy come without OpenBLAS, or there is one processor")
+    assert seen["inside"] == [1] * len(seen["before"])
+    assert seen["after"] == seen["before"]

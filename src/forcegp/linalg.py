@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
+from forcegp.threads import threads_of_pytorch
 
 JITTER_STEPS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)
 """Fractions of the mean diagonal that are tried, in order, until the factorisation succeeds."""
@@ -54,7 +55,8 @@ def cholesky_inverse_(L: Tensor) -> Tensor:
     # A row-major lower triangle is the upper triangle in LAPACK's column-major order.
     array = L.numpy().T
     (potri,) = scipy.linalg.lapack.get_lapack_funcs(("potri",), (array,))
-    inverse, info = potri(array, lower=0, overwrite_c=1)
+    with threads_of_pytorch():
+        inverse, info = potri(array, lower=0, overwrite_c=1)
     if info != 0:
         raise NumericalError("a Cholesky factor is singular", got=f"zero pivot in row {info}")
     if not np.shares_memory(inverse, array):

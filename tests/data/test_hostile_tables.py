@@ -28,6 +28,7 @@ import re, sys, warnings
 from pathlib import Path
 from forcegp.data import Dataset
 from forcegp.errors import DataError
+import pyarrow.csv, pyarrow.parquet # what is measured is the file, not the libraries
 warnings.simplefilter("ignore")
 def peak(): # not ru_maxrss, which a child inherits from the process that started it
     return int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])

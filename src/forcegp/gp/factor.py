@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
+from forcegp.threads import threads_of_pytorch
 
 PANEL = 16
 """Columns that LAPACK's triangular-pentagonal QR takes at a time."""
@@ -27,7 +28,8 @@ def extended(L: Tensor, rows: Tensor) -> Tensor:
     """
     upper, below = np.array(L.numpy().T, order="F"), np.array(rows.numpy(), order="F")
     (tpqrt,) = scipy.linalg.lapack.get_lapack_funcs(("tpqrt",), (upper,))
-    R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below, overwrite_a=1, overwrite_b=1)
+    with threads_of_pytorch():
+        R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below, overwrite_a=1, overwrite_b=1)
     if info != 0:
         raise NumericalError("a Cholesky factor could not be updated", got=f"LAPACK tpqrt info {info}")
     return torch.from_numpy(R).mT
