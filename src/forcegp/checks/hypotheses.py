@@ -64,17 +64,19 @@ def problem_of(system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Arr
 
 
 def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Viscous friction, Coulomb friction and a constant, one of each per joint, `(n, nq, 3 nq)`.
-
-    Where only the normal force of contacts is taken out, viscous and dry friction of each contact follow.
-    """
+    """Viscous friction, Coulomb friction and a constant, one of each per joint, `(n, nq, 3 nq)`."""
     qd = log.qd[rows]
     smooth = np.tanh(qd / system.robot.friction_velocity.numpy())
-    columns = [_diagonal(x) for x in (qd, smooth, np.ones_like(qd))]
+    return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
+
+
+def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
+    """Viscous and dry friction of each contact of which only the normal force is taken out, `(n, nq, p)`."""
     touching = [c for c in known_contacts(system, log) if isinstance(c, SurfaceContact)]
-    if touching and not takes_friction_out(system, log):
-        columns += [_sliding_columns(system, c, log, rows) for c in touching]
-    return np.concatenate(columns, axis=-1)
+    if takes_friction_out(system, log):
+        touching = []
+    empty = np.zeros((len(rows), log.nq, 0))
+    return np.concatenate([empty, *(_sliding_columns(system, c, log, rows) for c in touching)], axis=-1)
 
 
 def _sliding_columns(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> Array:
