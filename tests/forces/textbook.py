@@ -32,9 +32,13 @@ def covariance(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict) ->
         ]
         return torch.cat(one)
     if isinstance(kernel, Linear):
-        slopes, bias = params["log_slope_std"].exp() ** 2, params["log_bias_std"].exp() ** 2
+        slopes = params["log_slope_std"].exp() ** 2
         if kernel.shared:
             slopes = params["log_std"].exp()[:, None] ** 2 * slopes
+        if kernel.offset is None:
+            bias = params["log_bias_std"].exp() ** 2
+        else:
+            bias = params["log_offset"].exp() ** 2 * slopes.mean(-1)
         return torch.einsum("kd,nd,md->knm", slopes.expand(-1, a.shape[-1]), a, b) + bias[:, None, None]
     assert isinstance(kernel, SquaredExponential)
     return squared_exponential(params, a, b)
