@@ -196,8 +196,7 @@ class ConstrainedSystem:
             M=dynamics.mass_matrix_of_poses(robot, poses, links),
             Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
             Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
-            poses=poses,
-            motion=motion,
+            links=lambda: (poses, motion),
         )
 
     def _assembled(

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.compiled_system import compiled_system
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.coulomb import coupled
 from forcegp.forces.inference import forces_and_constant, jitter_of, log_likelihood
@@ -20,6 +21,7 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states, stack
 from forcegp.forces.samples import draw_samples
 from forcegp.forces.torque_noise import TORQUE_NOISE, stick_variance
+from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
@@ -132,19 +134,31 @@ class StructuredFit(FittedModel):
         return draw_samples(self.posterior, samples, generator, FEATURES).total_force
 
     def updated(self, measurements: Training) -> StructuredFit:
-        """The fit with more samples, at a cost that does not depend on how many it has seen.
+        """The fit with more samples.
 
-        Raises:
-            ModelError: inference is exact.
+        The cost of a sparse fit does not depend on how many it has seen; that of an exact one grows with the
+        square of their number.
         """
-        problem = dataclasses.replace(self.problem, training=measurements)
+        problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
-        latent, central = _sparse(self.posterior), self.posterior.central
-        if isinstance(central, SparsePosterior):
+        latent, central = self.posterior.latent, self.posterior.central
+        assert isinstance(latent, SparsePosterior | ExactPosterior)
+        if isinstance(central, SparsePosterior | ExactPosterior):
             known = problem.of_means().rows(self.hyperparameters).blocks
             central = central.updated(problem.silenced(known))
         posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows), central=central)
-        return dataclasses.replace(self, posterior=posterior)
+        if isinstance(latent, SparsePosterior):
+            return dataclasses.replace(self, posterior=posterior)
+        noise = [problem.noise_at(self.hyperparameters, i) for i in range(len(measurements.measurements))]
+        whole = dataclasses.replace(
+            self.problem, training=self.training.joined(measurements.measurements, noise)
+        )
+        return dataclasses.replace(self, problem=whole, posterior=posterior)
+
+    def _problem_of(self, measurements: Training) -> Problem:
+        """The problem with other measurements and the learned robot, whose mechanics are compiled."""
+        system = compiled_system(self.system)
+        return dataclasses.replace(self.problem, training=measurements, system=system, parameters=None)
 
     def without(self, measurements: Training) -> StructuredFit:
         """The fit without samples that it was conditioned on.
@@ -153,7 +167,7 @@ class StructuredFit(FittedModel):
             ModelError: inference is exact, or there are more samples than it was conditioned on.
             NumericalError: the samples were not among them.
         """
-        problem = dataclasses.replace(self.problem, training=measurements)
+        problem = self._problem_of(measurements)
         latent, central = _sparse(self.posterior), self.posterior.central
         if isinstance(central, SparsePosterior):
             known = problem.of_means().rows(self.hyperparameters).blocks
@@ -233,7 +247,14 @@ class StructuredFit(FittedModel):
 
     @torch.no_grad()
     def noise_variance(
-        self, q: Tensor, qd: Tensor, tau: Tensor, quantity: str = "qdd", active: Tensor | None = None
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str = "qdd",
+        active: Tensor | None = None,
+        *,
+        sensor: bool = True,
     ) -> Tensor:
         """Variance that a measurement of a quantity adds to its prediction, `(*batch, d)`.
 
@@ -242,12 +263,13 @@ class StructuredFit(FittedModel):
             quantity: what is measured; the noise of the torque reaches every quantity, that of the sensor is
                 known for quantities that the model was fitted to.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            sensor: whether the noise of the quantity's own sensor counts beside that of the torque.
         """
         flat = flat_states(self.system, q, qd, tau, active)
         at = flat.at(self.system)
         z, parts = stack(affine_maps(self.system, at, quantity))
         z = coupled(self.system, at, z, self.posterior.coulomb)
-        noise = self._noise_covariance(z, parts).diagonal(dim1=-2, dim2=-1)
+        noise = self._noise_covariance(z, parts if sensor else {}).diagonal(dim1=-2, dim2=-1)
         return noise.reshape(*flat.batch, z.o.shape[-1])
 
 
@@ -259,8 +281,8 @@ def _carried(z: AffineMap, variance: Tensor) -> Tensor:
 def _sparse(posterior: ForcePosterior) -> SparsePosterior:
     if not isinstance(posterior.latent, SparsePosterior):
         raise ModelError(
-            "a fit with exact inference cannot be updated",
-            hint='make the model with inference="sparse", or condition it on all data',
+            "a fit with exact inference cannot forget",
+            hint='make the model with inference="sparse", or condition it on the data that count',
         )
     return posterior.latent
 

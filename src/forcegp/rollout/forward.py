@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.compiled_system import compiled_system
 from forcegp.constraints.footprint import announce_states
 from forcegp.constraints.unilateral import any_row, can_open
 from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
@@ -27,6 +28,9 @@ STEPS_PER_STATE = 4
 """Recorded steps that take as much memory as the equations of motion of one state; measured, rounded down."""
 FEW = 8
 """Up to this number of trajectories one thread is used, as more only slow down work on small tensors."""
+
+COMPILED_STEPS = 1000
+"""Steps from which compiled mechanics save more time than compiling takes."""
 
 
 def rollout(
@@ -147,8 +151,8 @@ def _run(
     steps = max(1, round(duration / dt))
     if noise is not None:
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
-    problem = Problem(options.stabilized(system), law, inputs, unilateral)
-    steps = max(1, round(duration / dt))
+    mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
+    problem = Problem(options.stabilized(mechanics), law, inputs, unilateral)
     announce_states(system, n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
     closed = _closed(problem, q, qd) if active is None else active.expand(*whole, -1).reshape(n, -1)
@@ -167,7 +171,7 @@ def _run(
         name: getattr(found, name).unflatten(0, whole) if whole else getattr(found, name)[0]
         for name in FIELDS
     }
-    return dataclasses.replace(found, **shaped)
+    return dataclasses.replace(found, system=options.stabilized(system), **shaped)
 
 
 def _closed(problem: Problem, q: Tensor, qd: Tensor) -> Tensor:
