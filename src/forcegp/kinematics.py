@@ -100,7 +100,7 @@ def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
 
     With K = [a]× and the placement P: R = P a aᵀ + sin(q) P K + cos(q) (P − P a aᵀ).
     """
-    P, a = robot.placement_rotation, robot.axis[:, None, :]
+    q, P, a = batch_last(q, 1), robot.placement_rotation, robot.axis[:, None, :]
     slide = (P * a).sum(-1)
     along = slide[..., None] * a
     # The fourth column holds the placement and takes no part in the turn.
@@ -117,8 +117,9 @@ def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
     return torch.addcmul(turned, slides, q * (1.0 - turns))
 
 
-def _chain(robot: RobotModel, local: Tensor) -> Tensor:
+def _chain(robot: RobotModel, q: JointVector) -> Tensor:
     """R_parent [R p]_local of every link, `(3, 4, nq, B)`, level by level of the tree."""
+    local = _local_poses(robot, q)
     turned, parents = robot.base_rotation[..., None, None], [BASE]
     blocks, order = [], []
     for level in robot.levels:
@@ -142,7 +143,7 @@ def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
         ShapeError: q does not fit the robot.
     """
     robot.check_state(q=q)
-    T = _chain(robot, _local_poses(robot, batch_last(q, 1)))
+    T = _chain(robot, q)
     R, p = T[:, :3], sum_over(robot.ancestors, T[:, 3])
     z = batchlast.apply(R, robot.axis.T[..., None])
     if "prismatic" not in robot.joint_types:

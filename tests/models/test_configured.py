@@ -9,7 +9,7 @@ import pytest
 
 from forcegp import LearningOptions
 from forcegp.errors import SceneError, UnknownNameError
-from forcegp.forces.mean import AnalyticalMean
+from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior

@@ -8,6 +8,8 @@ separation: at −1 only the sum is identifiable, at 0 each is known as well as 
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
@@ -29,7 +31,10 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
         at: n states.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
-    covariance = posterior.read_covariance(system, at, z, without=(CONSTRAINT,))
+    rows = posterior.rows(system, at, z)
+    hidden = [prior.target == CONSTRAINT for prior in posterior.priors]
+    operators = (torch.zeros_like(W) if own else W for own, W in zip(hidden, rows.operators, strict=True))
+    covariance = posterior.covariance_of(dataclasses.replace(rows, operators=tuple(operators)))
     nq = system.robot.nq
     cross = covariance[:, :nq, nq:].diagonal(dim1=-2, dim2=-1)
     own = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)

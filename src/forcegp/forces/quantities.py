@@ -6,7 +6,7 @@ from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -203,8 +203,10 @@ QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {
 """The quantities that can be measured and predicted, by name."""
 
 
-def affine_maps(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> dict[str, AffineMap]:
-    """The affine map of a quantity, or of each of several, by name.
+def affine_maps(
+    system: ConstrainedSystem, at: States, quantity: str | Sequence[str]
+) -> tuple[AffineMap, dict[str, slice]]:
+    """The affine map of a quantity, or of several one above the other, and the rows of each.
 
     Raises:
         UnknownNameError: no such quantity.
@@ -216,11 +218,7 @@ def affine_maps(system: ConstrainedSystem, at: States, quantity: str | Sequence[
     for name in names:
         if not isinstance(name, str) or name not in QUANTITIES:
             raise UnknownNameError("quantity", name, QUANTITIES)
-    return {name: QUANTITIES[name](system, at) for name in names}
-
-
-def stack(maps: Mapping[str, AffineMap]) -> tuple[AffineMap, dict[str, slice]]:
-    """Several affine maps one above the other, and the rows of each."""
+    maps = {name: QUANTITIES[name](system, at) for name in names}
     rows, first = {}, 0
     for name, z in maps.items():
         rows[name] = slice(first, first + z.o.shape[-1])
@@ -232,4 +230,4 @@ def stack(maps: Mapping[str, AffineMap]) -> tuple[AffineMap, dict[str, slice]]:
 
 def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:
     """The affine map of a quantity, or of several one above the other; errors as of `affine_maps`."""
-    return stack(affine_maps(system, at, quantity))[0]
+    return affine_maps(system, at, quantity)[0]

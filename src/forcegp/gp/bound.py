@@ -15,12 +15,11 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.basis import ProcessBasis, latent_basis
-from forcegp.gp.blocks import components_of, rows_of
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.places import Gradient, Place, from_tensors, tensors_of
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.structured_covariance import Block, Process
+from forcegp.gp.structured_covariance import Block, Process, components_of, rows_of
 from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
 
 

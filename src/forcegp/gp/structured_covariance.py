@@ -7,7 +7,7 @@ form of H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by bl
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -53,6 +53,32 @@ class Block:
     def rows(self) -> int:
         """Number of rows, n r."""
         return self.target.numel()
+
+
+def points(features: Features) -> int:
+    """Number of inputs in a dictionary of features."""
+    return len(next(iter(features.values())))
+
+
+def components_of(block: Block) -> list[int]:
+    """Number of components of each process."""
+    return [W.shape[-1] for W in block.operators]
+
+
+def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
+    """The samples of blocks in blocks of at most so many."""
+    for block in blocks:
+        for first in range(0, len(block.target), samples):
+            yield rows_of(block, slice(first, first + samples))
+
+
+def rows_of(block: Block, own: slice | Tensor) -> Block:
+    """Some of the samples of a block."""
+    return Block(
+        tuple({name: x[own] for name, x in f.items()} for f in block.features),
+        tuple(W[own] for W in block.operators),
+        block.target[own],
+    )
 
 
 def offsets(blocks: Sequence[Block]) -> list[int]:

@@ -17,9 +17,9 @@ from forcegp.forces.learn import Problem, analytical_parameters
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states, stack
+from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states
 from forcegp.forces.samples import draw_samples
-from forcegp.forces.torque_noise import TORQUE_NOISE, stick_variance
+from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
@@ -101,13 +101,17 @@ class StructuredFit(FittedModel):
         """
         system = system or self.system
         flat = flat_states(system, q, qd, tau, active)
-        at = self._with_acceleration(system, flat.at(system)) if covariance else flat.at(system)
-        z, parts = stack(affine_maps(system, at, quantity))
-        mean = self.posterior.read_mean(system, at, z)
-        spread = self.posterior.read_covariance(system, at, z) if covariance else None
-        if spread is not None:
-            z = coupled(system, at, z, self.posterior.coulomb)
-            spread = spread + _carried(z, stick_variance(self.hyperparameters, at))
+        at = flat.at(system)
+        if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
+            at = self._with_acceleration(system, at)
+        z, parts = affine_maps(system, at, quantity)
+        rows = self.posterior.rows(system, at, z)
+        mean, spread = self.posterior.mean_of(rows), None
+        if covariance:
+            spread = self.posterior.covariance_of(rows)
+            z = coupled(system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
+            if STICK_NOISE in self.hyperparameters:
+                spread = spread + _carried(z, stick_variance(self.hyperparameters, at))
             if noise:
                 spread = spread + self._noise_covariance(z, parts)
         return Prediction(
@@ -118,8 +122,6 @@ class StructuredFit(FittedModel):
 
     def _with_acceleration(self, system: ConstrainedSystem, at: States) -> States:
         """The states with the predicted acceleration, which errors of the inertia are multiplied by."""
-        if not any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
-            return at
         qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
         return dataclasses.replace(at, qdd=qdd)
 
@@ -245,7 +247,7 @@ class StructuredFit(FittedModel):
         """
         flat = flat_states(self.system, q, qd, tau, active)
         at = flat.at(self.system)
-        z, parts = stack(affine_maps(self.system, at, quantity))
+        z, parts = affine_maps(self.system, at, quantity)
         z = coupled(self.system, at, z, self.posterior.coulomb)
         noise = self._noise_covariance(z, parts).diagonal(dim1=-2, dim2=-1)
         return noise.reshape(*flat.batch, z.o.shape[-1])

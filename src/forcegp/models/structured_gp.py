@@ -18,10 +18,17 @@ from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.inference import check_method
 from forcegp.forces.learn import Problem, Search
-from forcegp.forces.mean import AnalyticalMean, mean_of
 from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior, check_priors
+from forcegp.forces.priors.base import (
+    ANALYTICAL,
+    COULOMB,
+    NOISE,
+    AnalyticalMean,
+    ForcePrior,
+    check_priors,
+    mean_of,
+)
 from forcegp.forces.priors.default import default_priors
 from forcegp.forces.state_noise import state_std_of
 from forcegp.gp.inducing import LIMIT, check_limit

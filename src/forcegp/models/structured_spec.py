@@ -15,10 +15,9 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.learn import Problem, analytical_parameters
-from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import NoiseStd, Observation, Training, is_simulated, states_noise
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.default import measured_priors
 from forcegp.forces.priors.inertial import InertialPrior

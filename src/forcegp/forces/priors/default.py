@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.forces.mean import AnalyticalMean, mean_of
-from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.base import AnalyticalMean, ForcePrior, mean_of
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
