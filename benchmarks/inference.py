@@ -68,7 +68,7 @@ def projected(data: forcegp.Dataset) -> Callable[[], float]:
 
     def evaluate() -> float:
         leaves = {key: value.clone().requires_grad_() for key, value in kernel_parameters(start).items()}
-        value, _ = negative_log_likelihood(model.force_priors, leaves, blocks)
+        value = negative_log_likelihood(model.force_priors, leaves, blocks)
         torch.autograd.grad(value, list(leaves.values()))
         return float(value.detach()) + constant
 

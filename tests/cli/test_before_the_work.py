@@ -17,7 +17,7 @@ from forcegp import memory
 from forcegp.cli import app
 from forcegp.data import Dataset
 from forcegp.errors import DataError, DestinationError, ForceGPError, MemoryLimitError
-from forcegp.gp import capacity
+from forcegp.gp import likelihood
 from forcegp.memory import MemoryNeedWarning
 
 PLENTY = 1 << 60
@@ -169,7 +169,7 @@ def test_work_that_takes_most_of_the_memory_is_announced(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "LARGE", 0.0)
-    for module in (memory, capacity):
+    for module in (memory, likelihood):
         monkeypatch.setattr(module, "free_memory", lambda: PLENTY)
     sentences = " ".join(said(command, made, tmp_path))
     for sentence in WORK[command].split("|"):
@@ -180,7 +180,7 @@ def test_work_that_takes_most_of_the_memory_is_announced(
 def test_work_that_cannot_fit_is_refused(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (memory, capacity):
+    for module in (memory, likelihood):
         monkeypatch.setattr(module, "free_memory", lambda: 1)
     if command != "select":
         monkeypatch.setattr("forcegp.data.table.announce_memory", lambda *_, **__: None)

@@ -186,7 +186,7 @@ class Problem:
         """Of the rows, exact or as the collapsed bound, with their constant."""
         if self.inducing is not None:
             return negative_bound(self.priors, params, rows.blocks, self.inducing) + rows.constant
-        return negative_log_likelihood(self.priors, params, rows.blocks)[0] + rows.constant
+        return negative_log_likelihood(self.priors, params, rows.blocks) + rows.constant
 
     def objective(self, tensors: Tensors, held: Tensors, center: Tensors) -> Tensor:
         """Negative log posterior: the likelihood of the rows, and weak priors around `center`."""

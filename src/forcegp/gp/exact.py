@@ -9,10 +9,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from forcegp.gp.capacity import require_exact_fits
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters, sub
-from forcegp.gp.likelihood import Conditioned, condition, target_of
+from forcegp.gp.likelihood import Conditioned, condition, require_exact_fits, target_of
 from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors
 from forcegp.gp.structured_covariance import Block, Process, cross_gram
 

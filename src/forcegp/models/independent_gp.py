@@ -187,7 +187,7 @@ def _learn(
     constant = training.constant(joint)
 
     def objective(tensors: dict[str, Tensor]) -> Tensor:
-        value, _ = negative_log_likelihood([prior], tensors, blocks)
+        value = negative_log_likelihood([prior], tensors, blocks)
         return value + constant + negative_log_prior(tensors, start)
 
     recorded = objective if saved is None else saved.recorded(objective)
@@ -308,7 +308,9 @@ class IndependentFit(FittedModel):
         return Prediction(mean, torch.diag_embed(torch.cat(variances).reshape(mean.shape)), parts)
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
-        noise = None if self.noise_std is None else torch.as_tensor(self.noise_std).tolist()
+        noise = (
+            None if self.noise_std is None else torch.as_tensor(self.noise_std, dtype=torch.float64).tolist()
+        )
         settings = IndependentSettings(noise_std=tuple(noise) if isinstance(noise, list) else noise)
         tensors = {f"training.{name}": value for name, value in self.training.features.items()}
         tensors |= {"training.qdd": self.training.qdd, "training.noise_std": self.training.noise_std}

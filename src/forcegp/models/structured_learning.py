@@ -33,7 +33,7 @@ from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.torque_noise import TORQUE_NOISE
-from forcegp.gp.capacity import require_exact_fits
+from forcegp.gp.likelihood import require_exact_fits
 from forcegp.gp.optimise import Learned, Progress
 from forcegp.gp.structured_covariance import Block
 from forcegp.models.structured_spec import Specification

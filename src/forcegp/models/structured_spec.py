@@ -27,7 +27,7 @@ from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.payload import PayloadPrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.state_noise import state_std_of
-from forcegp.gp import kernels, stationary
+from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.inducing import LIMIT
 from forcegp.gp.sparse import SparsePosterior
@@ -39,9 +39,9 @@ from forcegp.storage.folder import Settings
 from forcegp.storage.system import robot_tensors
 
 CLASSES: dict[str, type] = {
-    "squared_exponential": stationary.SquaredExponential,
-    "matern32": stationary.Matern32,
-    "matern52": stationary.Matern52,
+    "squared_exponential": kernels.SquaredExponential,
+    "matern32": kernels.Matern32,
+    "matern52": kernels.Matern52,
     "linear": kernels.Linear,
     "sum": kernels.Sum,
     "product": kernels.Product,
@@ -254,7 +254,7 @@ def _plain(noise: Any) -> Any:
     """A noise as what JSON can hold."""
     if noise is None or isinstance(noise, str):
         return noise
-    values = torch.as_tensor(noise).tolist()
+    values = torch.as_tensor(noise, dtype=torch.float64).tolist()
     return tuple(values) if isinstance(values, list) else values
 
 

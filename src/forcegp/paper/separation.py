@@ -21,8 +21,7 @@ from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import States, states
-from forcegp.gp.kernels import Linear
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Linear, SquaredExponential
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.simulate import SimulationConfig, simulate
 

@@ -19,8 +19,7 @@ from forcegp.constraints.contact import ContactPoint, SurfaceContact
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import CONTACT, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
-from forcegp.gp.kernels import Kernel
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
 
 WIDTHS = {"position": 2, "velocity": 2, "speed": 1}

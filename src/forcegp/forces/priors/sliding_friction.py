@@ -20,8 +20,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.priors.base import check_inputs
 from forcegp.forces.priors.contact import SurfaceForcePrior, sliding
 from forcegp.forces.quantities import States
-from forcegp.gp.kernels import Kernel
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
 
 TERMS = ("viscous", "dry", "coulomb", "stribeck", "torsion")
