@@ -201,7 +201,7 @@ def test_the_bound_on_the_equations_of_motion_is_one() -> None:
     script = """
 import re, torch, forcegp
 from pathlib import Path
-from forcegp.constraints.footprint import CERTAIN, state_bytes
+from forcegp.constraints.system import CERTAIN
 system = forcegp.load_scene("kuka_plane").system()
 def peak(): return 1024 * int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 def work(n):
@@ -211,7 +211,7 @@ def work(n):
 work(10)
 before = peak()
 work(20_000)
-print((peak() - before) / 20_000 / state_bytes(system), CERTAIN)
+print((peak() - before) / 20_000 / system.state_bytes, CERTAIN)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     share, certain = map(float, done.stdout.split())

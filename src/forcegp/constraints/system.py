@@ -14,9 +14,18 @@ from forcegp.constraints.contact import Constraint, ConstraintTerms
 from forcegp.constraints.gauss import Equations
 from forcegp.constraints.linearization import Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
+from forcegp.memory import announce_memory
 from forcegp.notebook import html_table
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintVector, JointVector
+
+SQUARE, LINEAR = 20, 60
+"""Matrices over joints and constraint rows, and vectors over them, that the equations of one state hold at
+their peak; measured, and rounded up."""
+CERTAIN = 0.25
+"""Part of the bound below which no measured work stays."""
+ITEM = 8
+"""Bytes of a float64."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +141,26 @@ class ConstrainedSystem:
             if contact.name == name:
                 return contact
         raise UnknownNameError("contact", name, self.contact_names)
+
+    @property
+    def state_bytes(self) -> int:
+        """Upper bound on the memory that the equations of motion of one state take [bytes]."""
+        width = self.robot.nq + self.m
+        return ITEM * (SQUARE * width**2 + LINEAR * width)
+
+    def announce_states(self, states: int, copies: float, what: str) -> None:
+        """Announce, or refuse, work on many states; see `announce_memory`.
+
+        Args:
+            states: how many are worked on at once.
+            copies: how many times the memory of the equations of motion a state takes at the peak.
+            what: the work, as the subject of a sentence.
+
+        Raises:
+            MemoryLimitError: it certainly needs more than is free.
+        """
+        needed = int(copies * states * self.state_bytes)
+        announce_memory(needed, what, certain=int(CERTAIN * needed))
 
     def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
         """The same constraints on a robot with other parameters."""

@@ -117,9 +117,3 @@ def log_likelihood(posterior: ForcePosterior) -> float:
         return float(latent.log_likelihood())
     assert isinstance(latent, SparsePosterior)
     return -float(bound_of(latent.sums, latent))
-
-
-def jitter_of(posterior: ForcePosterior) -> float:
-    """Added to the diagonal to factorise, relative to unit noise."""
-    latent = posterior.latent
-    return latent.conditioned.jitter if isinstance(latent, ExactPosterior) else getattr(latent, "jitter", 0.0)

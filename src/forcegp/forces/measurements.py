@@ -146,11 +146,11 @@ def measurement_of(
     if quantity not in QUANTITIES or quantity not in COLUMNS:
         raise UnknownNameError("measured quantity", quantity, COLUMNS)
     data.check_robot(system.robot)
-    if len(data) == 0:
+    active = data.active(system.contact_names)
+    if not len(data.q):
         raise ModelError("there are no samples to learn from", expected="at least one sample", got="none")
     values = COLUMNS[quantity](data, system)
     std = _checked_noise(_noise_of(observation, default_noise), quantity, values)
-    active = data.active(system.contact_names)
     return Measurement(quantity, data.q, data.qd, data.tau, active, values, data.segment), std
 
 

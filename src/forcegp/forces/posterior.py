@@ -25,6 +25,11 @@ CHUNK_COLUMNS = 700
 class LatentPosterior(Protocol):
     """Latent processes conditioned on rows, exactly or through inducing points."""
 
+    @property
+    def jitter(self) -> float:
+        """Added to the diagonal to factorise, relative to unit noise."""
+        ...
+
     def is_measured(self, p: int) -> bool:
         """Whether any row depends on process p; where none does, its posterior is its prior."""
         ...

@@ -135,6 +135,9 @@ def whiten(
     z = affine_map(system, at, measurement.quantity)
     if coulomb:
         z = coupled(system, at, z, coulomb)
+    # Noise of the state reaches the directions that the constraint fixes too, so their rows tell of it.
+    has_fixed = measurement.quantity == "qdd" and system.m > 0 and state_std is None
+    rank = at.eom.rank if has_fixed else None
     std = noise_std.expand_as(measurement.values)
     rows = prior_rows(priors, scales, mean, system, at, z)
     expected = rows.target
@@ -148,11 +151,10 @@ def whiten(
         _noise_factor(system, at, measurement, z, force_noise, state_std, std),
     )
     constant = std.log().sum()
-    # Noise of the state reaches the directions that the constraint fixes too, so these tell of it.
-    if measurement.quantity != "qdd" or system.m == 0 or state_std is not None:
+    if rank is None:
         block, log_det = everything.whitened()
         return WhitenedRows([block], constant + log_det)
-    A, rank = at.eom.A * std[:, None, :], at.eom.rank
+    A = at.eom.A * std[:, None, :]
     violated = (at.eom.A @ measurement.values[..., None])[..., 0] - at.eom.b
     blocks = []
     for value in rank.unique().tolist():

@@ -50,6 +50,11 @@ class ExactPosterior:
         require_exact_fits(self.blocks, learning=False)
         return condition(self.processes, self.params, self.blocks)
 
+    @property
+    def jitter(self) -> float:
+        """Added to the diagonal to factorise, relative to unit noise."""
+        return self.conditioned.jitter
+
     def is_measured(self, p: int) -> bool:
         """Whether any row depends on process p; where none does, its posterior is its prior."""
         return self.measured[p]
@@ -101,18 +106,16 @@ class ExactPosterior:
         """Posterior covariance of the rows of each sample of a block, `(n, r, r)`."""
         n, d = block.target.shape
         prior = sum(
-            torch.einsum("nak,kn,nbk->nab", W, self._prior_variance(p, block.features[p]), W)
-            for p, W in enumerate(block.operators)
+            torch.einsum(
+                "nak,kn,nbk->nab", W, process.kernel.diagonal(sub(self.params, process.prefix), x), W
+            )
+            for process, x, W in zip(self.processes, block.features, block.operators, strict=True)
         )
         cross = cross_gram(self.processes, self.params, self.blocks, [block])
         V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
         V = V.reshape(len(V), n, d).transpose(0, 1)
         covariance = prior - V.mT @ V
         return 0.5 * (covariance + covariance.mT)
-
-    def _prior_variance(self, p: int, features: Features) -> Tensor:
-        process = self.processes[p]
-        return process.kernel.diagonal(sub(self.params, process.prefix), features)
 
     def log_likelihood(self) -> Tensor:
         """log p(y) of the rows without their constant, −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π."""

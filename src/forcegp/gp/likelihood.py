@@ -57,8 +57,9 @@ def condition(priors: Sequence[Process], params: Parameters, blocks: Sequence[Bl
     Raises:
         NumericalError: the covariance is not positive definite.
     """
+    y = target_of(blocks)
     L, jitter = cholesky(gram(priors, params, blocks))
-    alpha = torch.cholesky_solve(target_of(blocks)[:, None], L)[:, 0]
+    alpha = torch.cholesky_solve(y[:, None], L)[:, 0]
     return Conditioned(L, alpha, jitter)
 
 
@@ -166,7 +167,7 @@ def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
         blocks: whitened rows.
         learning: whether hyperparameters are learned, or the rows conditioned on only.
     """
-    rows = sum(block.rows for block in blocks)
+    rows = sum(block.target.numel() for block in blocks)
     components = sum(W.shape[-1] for W in blocks[0].operators) if blocks else 0
     samples = [len(block.target) for block in blocks]
     kernels = max((n * n for n in samples), default=0) * components
@@ -188,7 +189,7 @@ def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available
     free = free_memory()
     allowed = (None if free is None else int(SHARE * free)) if available is None else available
     needed = exact_bytes(blocks, learning)
-    rows = sum(block.rows for block in blocks)
+    rows = sum(block.target.numel() for block in blocks)
     samples = sum(len(block.target) for block in blocks)
     if allowed is not None and needed > allowed:
         raise ModelError(

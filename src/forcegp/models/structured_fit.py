@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,8 +13,9 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.coulomb import coupled
-from forcegp.forces.inference import forces_and_constant, jitter_of, log_likelihood
-from forcegp.forces.learn import Problem, analytical_parameters
+from forcegp.forces.identifiability import doubts_of
+from forcegp.forces.inference import forces_and_constant, log_likelihood
+from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
@@ -24,7 +26,6 @@ from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
-from forcegp.models.doubts import constant_inputs, doubts, inference_of, mean_correlation
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
 
@@ -267,14 +268,6 @@ def _sparse(posterior: ForcePosterior) -> SparsePosterior:
     return posterior.latent
 
 
-def learned_system(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> ConstrainedSystem:
-    """The system with the learned robot, detached."""
-    if not analytical_parameters(hyperparameters):
-        return problem.system
-    with torch.no_grad():
-        return problem.system_at(hyperparameters)
-
-
 @torch.no_grad()
 def conditioned(
     specification: Specification,
@@ -300,30 +293,51 @@ def conditioned(
         NumericalError: the covariance of the data is not positive definite.
     """
     posterior, constant = forces or forces_and_constant(problem, hyperparameters)
-    system = learned_system(problem, hyperparameters)
     likelihood = log_likelihood(posterior) - float(constant)
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
-    jitter = jitter_of(posterior)
+    training, system = problem.training, problem.system_at(hyperparameters)
+    noise = {
+        m.quantity: typical(problem.noise_at(hyperparameters, i)) for i, m in enumerate(training.measurements)
+    }
+    doubts, lost = doubts_of(posterior, system, training), _lost(posterior)
     result = FitResult.of(
         learned,
         log_marginal_likelihood=likelihood,
-        jitter=jitter,
-        constant_inputs=constant_inputs(problem.priors, problem.training),
-        force_correlation=mean_correlation(posterior, system, problem.training),
-        warnings=(*warnings, *doubts(posterior, system, problem.training, jitter)),
-        samples=problem.training.all_samples,
+        jitter=posterior.latent.jitter,
+        constant_inputs=tuple(
+            f"{prior.name}.{name}"
+            for prior, scale in zip(problem.priors, training.scales, strict=True)
+            for name in scale.constant
+        ),
+        force_correlation=doubts.correlation,
+        warnings=(*warnings, *doubts.warnings, *_more_points(lost)),
+        samples=training.all_samples,
         learned_on=learned_on,
-        **inference_of(posterior),
+        **lost,
     )
-    noise = typical_noise(problem, hyperparameters)
     return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)
 
 
-def typical_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Standard deviation of a measurement of each measured quantity, `(d,)`; the last one where two measure
-    it."""
-    found = {}
-    for i, quantity in enumerate(problem.training.quantities):
-        std = problem.noise_at(hyperparameters, i)
-        found[quantity] = std if std.ndim == 1 else std.square().mean(0).sqrt()
-    return found
+def _lost(posterior: ForcePosterior) -> dict[str, Any]:
+    """Which inference a posterior has, and what a sparse one loses by its inducing points."""
+    if not isinstance(posterior.latent, SparsePosterior):
+        return {"inference": "exact"}
+    found = posterior.latent.diagnostics
+    return {
+        "inference": "sparse",
+        "basis_functions": found.size,
+        "determined": found.learned,
+        "missed": found.missed,
+        "more_points_would_help": found.more_points_would_help,
+    }
+
+
+def _more_points(lost: Mapping[str, Any]) -> tuple[str, ...]:
+    """A warning where inducing points miss much of what the data could tell."""
+    if not lost.get("more_points_would_help"):
+        return ()
+    return (
+        f"more inducing points would help: {lost['basis_functions']} basis functions miss a variance of "
+        f"{lost['missed']:.3g} in units of the noise, where noise leaves {lost['determined']:.3g}; raise "
+        "inducing_points",
+    )

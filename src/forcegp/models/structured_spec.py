@@ -100,7 +100,8 @@ class Specification:
         spec = self
         if spec.automatic and not is_simulated(data):
             spec = dataclasses.replace(spec, priors=measured_priors(spec.system), torque_noise="learn")
-        if spec.learns_torque_noise and spec.noise_std is None and not states_noise(data):
+        learns = isinstance(spec.torque_noise, str)
+        if learns and spec.noise_std is None and not states_noise(data):
             spec = dataclasses.replace(spec, learn_noise=True)
         return dataclasses.replace(spec, automatic=False)
 
@@ -115,7 +116,7 @@ class Specification:
         std = None
         if noise is not None and not isinstance(noise, str):
             std = torch.as_tensor(noise, dtype=robot.dtype, device=robot.device).expand(robot.nq)
-        state_std = state_std_of(self.state_noise, robot)
+        state_std = None if self.state_noise is None else state_std_of(self.state_noise, robot)
         return Problem(
             self.system, self.priors, self.mean, training, self.parameters, std, state_std=state_std
         )

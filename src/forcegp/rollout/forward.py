@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.footprint import announce_states
 from forcegp.constraints.unilateral import any_row, can_open
 from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
@@ -149,7 +148,7 @@ def _run(
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
     problem = Problem(options.stabilized(system), law, inputs, unilateral)
     steps = max(1, round(duration / dt))
-    announce_states(system, n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
+    system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
     closed = _closed(problem, q, qd) if active is None else active.expand(*whole, -1).reshape(n, -1)
     with one_thread() if n <= FEW else nullcontext():

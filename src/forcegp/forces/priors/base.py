@@ -88,6 +88,8 @@ class ForcePrior(ABC):
     name: str
     kernel: Kernel
     target: str
+    coupled: bool = False
+    """Whether Coulomb friction that is proportional to the multiplier goes with the prior."""
     vectors: tuple[str, ...] = ()
     """Inputs whose components are standardized by one scale, as turning the axes must change nothing."""
 
