@@ -42,7 +42,7 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
     rows = posterior.rows(system, at, z)
     hidden = [prior.target == CONSTRAINT for prior in posterior.priors]
     operators = (torch.zeros_like(W) if own else W for own, W in zip(hidden, rows.operators, strict=True))
-    covariance = posterior.covariance_of(dataclasses.replace(rows, operators=tuple(operators)))
+    covariance = posterior.latent.covariance(dataclasses.replace(rows, operators=tuple(operators)))
     nq = system.robot.nq
     cross = covariance[:, :nq, nq:].diagonal(dim1=-2, dim2=-1)
     own = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)
@@ -81,7 +81,7 @@ def doubts_of(posterior: ForcePosterior, system: ConstrainedSystem, training: Tr
         read = posterior.rows(system, at, affine_map(system, at, "multiplier"))
         own = system.active_rows(m.active, m.active.shape[:-1])
         means.append(posterior.mean_of(read)[own])
-        variances.append(posterior.covariance_of(read).diagonal(dim1=-2, dim2=-1).clamp(min=0.0)[own])
+        variances.append(posterior.latent.covariance(read).diagonal(dim1=-2, dim2=-1).clamp(min=0.0)[own])
         if {JOINT, CONTACT} <= targets:
             correlations.append(force_correlation(posterior, system, at))
     correlation = float(torch.cat(correlations).mean()) if correlations else None

@@ -15,10 +15,7 @@ from forcegp.forces.priors.base import ForceMean, ForcePrior, prior_rows
 from forcegp.forces.quantities import AffineMap, States
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.pathwise import FunctionSamples
-from forcegp.gp.structured_covariance import Block, chunked
-
-CHUNK_COLUMNS = 700
-"""Columns of the triangular solve that are held at a time."""
+from forcegp.gp.structured_covariance import Block
 
 
 @runtime_checkable
@@ -98,10 +95,10 @@ class ForcePosterior:
     def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Posterior mean of Q̄ = m + Σ E f, `(n, nq)`: the force field of a rollout."""
         force = self.mean(system, at)
-        for p, prior in enumerate(self.priors):
-            if self.moves(p):
-                features, E = self.features_of(p, system, at), prior.operator(system, at)
-                force = force + (E @ self.latent_mean(p, features)[..., None])[..., 0]
+        pairs = [(p, prior) for p, prior in enumerate(self.priors) if self.moves(p)]
+        parts = [(p, prior.features(system, at), prior.operator(system, at)) for p, prior in pairs]
+        for p, x, E in parts:
+            force = force + (E @ self.latent_mean(p, self.scales[p].apply(x))[..., None])[..., 0]
         return with_coulomb(system, at, force, self.coulomb) if self.coulomb else force
 
     def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
@@ -119,15 +116,8 @@ class ForcePosterior:
         """Posterior mean o + B(m + Σ E f) of rows, `(n, d)`."""
         mean = rows.target
         for p, W in enumerate(rows.operators):
-            if self.moves(p):
-                mean = mean + (W @ self.latent_mean(p, rows.features[p])[..., None])[..., 0]
+            mean = mean + (W @ self.latent_mean(p, rows.features[p])[..., None])[..., 0]
         return mean
-
-    def covariance_of(self, rows: Block) -> Tensor:
-        """Posterior covariance of the rows of each sample, `(n, d, d)`, without measurement noise."""
-        d = rows.target.shape[-1]
-        parts = [self.latent.covariance(part) for part in chunked([rows], max(1, CHUNK_COLUMNS // max(d, 1)))]
-        return torch.cat(parts) if parts else rows.target.new_zeros(0, d, d)
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
         """Posterior mean of a quantity at states, `(n, d)`."""
@@ -135,4 +125,4 @@ class ForcePosterior:
 
     def read_covariance(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
         """Posterior covariance of a quantity at each state, `(n, d, d)`, without measurement noise."""
-        return self.covariance_of(self.rows(system, at, z))
+        return self.latent.covariance(self.rows(system, at, z))

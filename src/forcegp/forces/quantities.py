@@ -67,10 +67,6 @@ class FlatStates(NamedTuple):
         """Some of the states."""
         return FlatStates(self.q[own], self.qd[own], self.tau[own], self.active[own], self.batch)
 
-    def at(self, system: ConstrainedSystem) -> States:
-        """The equations of motion at the states."""
-        return states(system, self.q, self.qd, self.tau, self.active)
-
 
 def flat_states(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
@@ -99,6 +95,16 @@ def flat_states(
     rows = batch.numel()
     q, qd, tau = (x.expand(*batch, x.shape[-1]).reshape(rows, x.shape[-1]) for x in given.values())
     return FlatStates(q, qd, tau, active.expand(*batch, contacts).reshape(rows, contacts), batch)
+
+
+def states_at(
+    system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
+) -> tuple[States, torch.Size]:
+    """States `(*batch, nq)` as a list with their equations of motion, and the batch; errors as of
+    `flat_states`."""
+    flat = flat_states(system, q, qd, tau, active)
+    eom = system.equations(flat.q, flat.qd, flat.active)
+    return States(flat.q, flat.qd, flat.tau, flat.active, eom), flat.batch
 
 
 class AffineMap(NamedTuple):

@@ -13,7 +13,10 @@ from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.likelihood import Conditioned, condition, require_exact_fits, target_of
 from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors
-from forcegp.gp.structured_covariance import Block, Process, cross_gram
+from forcegp.gp.structured_covariance import Block, Process, chunked, cross_gram
+
+CHUNK_COLUMNS = 700
+"""Columns of the triangular solve that are held at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +99,9 @@ class ExactPosterior:
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
         """Posterior mean of process p at standardized features, `(n, components)`."""
+        if not self.measured[p]:
+            x, components = next(iter(features.values())), self.blocks[0].operators[p].shape[-1]
+            return x.new_zeros(len(x), components)
         parts = [
             (kernel(features) @ w[..., None])[..., 0]
             for kernel, w in zip(self.kernels_to_data[p], self._weights[p], strict=True)
@@ -103,18 +109,19 @@ class ExactPosterior:
         return sum(parts[1:], start=parts[0]).mT
 
     def covariance(self, block: Block) -> Tensor:
-        """Posterior covariance of the rows of each sample of a block, `(n, r, r)`."""
-        n, d = block.target.shape
-        prior = sum(
-            torch.einsum(
-                "nak,kn,nbk->nab", W, process.kernel.diagonal(sub(self.params, process.prefix), x), W
-            )
-            for process, x, W in zip(self.processes, block.features, block.operators, strict=True)
-        )
-        cross = cross_gram(self.processes, self.params, self.blocks, [block])
-        V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
-        V = V.reshape(len(V), n, d).transpose(0, 1)
-        covariance = prior - V.mT @ V
+        """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise."""
+        d = block.target.shape[-1]
+        parts = [block.target.new_zeros(0, d, d)]
+        for own in chunked([block], max(1, CHUNK_COLUMNS // max(d, 1))):
+            cross = cross_gram(self.processes, self.params, self.blocks, [own])
+            V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
+            V = V.reshape(len(V), -1, d).transpose(0, 1)
+            prior = V.new_zeros(())
+            for process, x, W in zip(self.processes, own.features, own.operators, strict=True):
+                variance = process.kernel.diagonal(sub(self.params, process.prefix), x)
+                prior = prior + torch.einsum("nak,kn,nbk->nab", W, variance, W)
+            parts.append(prior - V.mT @ V)
+        covariance = torch.cat(parts)
         return 0.5 * (covariance + covariance.mT)
 
     def log_likelihood(self) -> Tensor:

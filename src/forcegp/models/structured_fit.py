@@ -19,7 +19,7 @@ from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states
+from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
 from forcegp.forces.samples import draw_samples
 from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
 from forcegp.gp.optimise import Learned
@@ -101,23 +101,22 @@ class StructuredFit(FittedModel):
             ShapeError: a state or `active` does not fit the system.
         """
         system = system or self.system
-        flat = flat_states(system, q, qd, tau, active)
-        at = flat.at(system)
+        at, batch = states_at(system, q, qd, tau, active)
         if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
             at = self._with_acceleration(system, at)
         z, parts = affine_maps(system, at, quantity)
         rows = self.posterior.rows(system, at, z)
         mean, spread = self.posterior.mean_of(rows), None
         if covariance:
-            spread = self.posterior.covariance_of(rows)
+            spread = self.posterior.latent.covariance(rows)
             z = coupled(system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
             if STICK_NOISE in self.hyperparameters:
                 spread = spread + _carried(z, stick_variance(self.hyperparameters, at))
             if noise:
                 spread = spread + self._noise_covariance(z, parts)
         return Prediction(
-            mean.reshape(*flat.batch, z.o.shape[-1]),
-            None if spread is None else spread.reshape(*flat.batch, *spread.shape[-2:]),
+            mean.reshape(*batch, z.o.shape[-1]),
+            None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
             parts,
         )
 
@@ -246,12 +245,11 @@ class StructuredFit(FittedModel):
                 known for quantities that the model was fitted to.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
         """
-        flat = flat_states(self.system, q, qd, tau, active)
-        at = flat.at(self.system)
+        at, batch = states_at(self.system, q, qd, tau, active)
         z, parts = affine_maps(self.system, at, quantity)
-        z = coupled(self.system, at, z, self.posterior.coulomb)
+        z = coupled(self.system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
         noise = self._noise_covariance(z, parts).diagonal(dim1=-2, dim2=-1)
-        return noise.reshape(*flat.batch, z.o.shape[-1])
+        return noise.reshape(*batch, z.o.shape[-1])
 
 
 def _carried(z: AffineMap, variance: Tensor) -> Tensor:
@@ -292,18 +290,17 @@ def conditioned(
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
+    names = enumerate(problem.training.quantities)
+    noise = {quantity: typical(problem.noise_at(hyperparameters, i)) for i, quantity in names}
     posterior, constant = forces or forces_and_constant(problem, hyperparameters)
-    likelihood = log_likelihood(posterior) - float(constant)
+    likelihood, jitter = log_likelihood(posterior) - float(constant), posterior.latent.jitter
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     training, system = problem.training, problem.system_at(hyperparameters)
-    noise = {
-        m.quantity: typical(problem.noise_at(hyperparameters, i)) for i, m in enumerate(training.measurements)
-    }
     doubts, lost = doubts_of(posterior, system, training), _lost(posterior)
     result = FitResult.of(
         learned,
         log_marginal_likelihood=likelihood,
-        jitter=posterior.latent.jitter,
+        jitter=jitter,
         constant_inputs=tuple(
             f"{prior.name}.{name}"
             for prior, scale in zip(problem.priors, training.scales, strict=True)

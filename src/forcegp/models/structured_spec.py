@@ -15,7 +15,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.learn import Problem, analytical_parameters
-from forcegp.forces.measurements import NoiseStd, Observation, Training, is_simulated, states_noise
+from forcegp.forces.measurements import NoiseStd, Observation, Training, is_simulated, plain, states_noise
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
@@ -207,10 +207,10 @@ def pack(
     exact = isinstance(latent, ExactPosterior)
     settings = StructuredSettings(
         mean=spec.mean.terms,
-        noise_std=_plain(spec.noise_std),
+        noise_std=plain(spec.noise_std),
         learn_noise=spec.learn_noise,
-        torque_noise=_plain(spec.torque_noise),
-        state_noise=None if spec.state_noise is None else tuple(map(_plain, spec.state_noise)),  # pyright: ignore[reportArgumentType]
+        torque_noise=plain(spec.torque_noise),
+        state_noise=None if spec.state_noise is None else tuple(map(plain, spec.state_noise)),  # pyright: ignore[reportArgumentType]
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
         inducing_points=spec.inducing_points,
         power=problem.power,
@@ -249,14 +249,6 @@ def _tensors_of(training: Training) -> dict[str, Tensor]:
         tensors |= {f"data.{i}.{name}": getattr(m, name) for name in COLUMNS}
         tensors[f"data.{i}.noise_std"] = std
     return tensors
-
-
-def _plain(noise: Any) -> Any:
-    """A noise as what JSON can hold."""
-    if noise is None or isinstance(noise, str):
-        return noise
-    values = torch.as_tensor(noise, dtype=torch.float64).tolist()
-    return tuple(values) if isinstance(values, list) else values
 
 
 def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:
