@@ -7,6 +7,7 @@ import torch
 
 from forcegp import memory
 from forcegp.errors import ModelError
+from forcegp.gp import likelihood
 from forcegp.gp.likelihood import exact_bytes, require_exact_fits
 from forcegp.gp.structured_covariance import Block
 from forcegp.memory import MemoryNeedWarning

@@ -1,4 +1,4 @@
-"""What the equations of motion of one state need, from one compiled call: M, Q_C, Q_G and moving points."""
+"""What the equations of motion of a state need, from one compiled call: M, Q_C, Q_G and moving points."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from forcegp.compiled.build import cpu_kernel
 from forcegp.compiled.links import Links, cross, numbers
@@ -21,10 +22,11 @@ Anchor = tuple[str, Sequence[float]]
 
 
 class CompiledMechanics:
-    """Mechanics of one robot at one state, as a compiled function of (q, q̇).
+    """Mechanics of one robot, as a compiled function of (q, q̇).
 
     A call returns M, Q_C and Q_G, then for each point: axes of its frame `(3, 3)` and position in the world,
-    Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and bias acceleration J̇ q̇ `(6,)`.
+    Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and bias acceleration J̇ q̇ `(6,)`. `batch` does so for tensors of
+    states.
 
     Args:
         robot: the robot, on the CPU; its parameters become constants.
@@ -53,6 +55,15 @@ class CompiledMechanics:
         self._kernel([torch.from_numpy(np.ascontiguousarray(given[name])) for name in self._arrays], out)
         flat = out.numpy()[0]
         return [flat[place].reshape(shape) for place, shape in self._places]
+
+    def batch(self, q: Tensor, qd: Tensor) -> list[Tensor]:
+        """The same at states `(*batch, nq)`, `(*batch, nq)`, outside of autograd."""
+        shape, q, qd = q.shape[:-1], q.reshape(-1, q.shape[-1]), qd.reshape(-1, qd.shape[-1])
+        given = {"q": lambda: q, "qd": lambda: qd, "sin": lambda: torch.sin(q), "cos": lambda: torch.cos(q)}
+        out = torch.empty(len(q), self._places[-1][0].stop, dtype=self._dtype)
+        if len(q):
+            self._kernel([given[name]().contiguous() for name in self._arrays], out)
+        return [out[:, place].reshape(*shape, *own) for place, own in self._places]
 
 
 def _forces(links: Links) -> list[np.ndarray]:

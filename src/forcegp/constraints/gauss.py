@@ -8,6 +8,7 @@ between redundant constraints and rounding.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -42,7 +43,8 @@ class Equations:
         c, cd: `(*batch, m)` constraint error and its rate, of all contacts, active or not.
         Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
         contact_points: the touching point of each surface contact, by name.
-        poses, motion: the links at the states, for whoever needs more of the kinematics.
+        links: computes the poses and the motion of the links at the states, where more of the kinematics is
+            asked for.
     """
 
     M: JointMatrix
@@ -54,8 +56,21 @@ class Equations:
     Q_G: JointVector
     Q_D: JointVector
     contact_points: dict[str, ContactPoint]
-    poses: LinkPoses
-    motion: LinkMotion
+    links: Callable[[], tuple[LinkPoses, LinkMotion]]
+
+    @cached_property
+    def _links(self) -> tuple[LinkPoses, LinkMotion]:
+        return self.links()
+
+    @property
+    def poses(self) -> LinkPoses:
+        """Where the links are."""
+        return self._links[0]
+
+    @property
+    def motion(self) -> LinkMotion:
+        """How the links move."""
+        return self._links[1]
 
     @cached_property
     def M_cholesky(self) -> JointMatrix:

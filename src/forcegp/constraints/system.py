@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +14,7 @@ from forcegp.constraints.contact import Constraint, ConstraintTerms
 from forcegp.constraints.gauss import Equations
 from forcegp.constraints.linearization import Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
+from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.memory import announce_memory
 from forcegp.notebook import html_table
 from forcegp.robot.model import RobotModel
@@ -214,12 +215,25 @@ class ConstrainedSystem:
             raise ShapeError("q and qd are not one batch", expected=tuple(q.shape), got=tuple(qd.shape))
         poses = kinematics.link_poses(robot, q)
         motion = kinematics.link_motion(robot, poses, qd)
-        M, Q_C, Q_G, Q_D = dynamics.known_terms(robot, poses, motion, qd)
+        known = dynamics.known_terms(robot, poses, motion, qd)
         terms = [contact.terms(robot, poses, motion, qd) for contact in self.contacts]
+        return self._assembled(q, qd, active, known, terms, lambda: (poses, motion))
+
+    def _assembled(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        active: Tensor | None,
+        known: tuple[Tensor, Tensor, Tensor, Tensor],
+        terms: Sequence[ConstraintTerms],
+        links: Callable[[], tuple[LinkPoses, LinkMotion]],
+    ) -> Equations:
+        """The equations of motion from M, Q_C, Q_G and Q_D of the robot and the terms of the constraints."""
         c, cd, A, b = self._rows(q, qd, terms, active)
         touching = zip(self.contact_names, (term.point for term in terms), strict=True)
         points = {name: point for name, point in touching if point is not None}
-        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, poses, motion)
+        M, Q_C, Q_G, Q_D = known
+        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, links)
 
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None

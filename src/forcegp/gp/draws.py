@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -25,6 +27,25 @@ class FunctionDraw(ABC):
         feature `(k, features)`; `None` where components differ by more than factors."""
         return None
 
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Number of features of each component."""
+
+    def terms(self, weights: Tensor) -> list[tuple[Callable[[Features], Tensor], Tensor]]:
+        """φ(x)ᵀw as a sum that is cheaper to evaluate: features that components have in common only once.
+
+        Args:
+            weights: `(k, features, samples)`.
+
+        Returns:
+            Functions `(k or 1, n, terms)`, each with weights `(k, terms, samples)`.
+        """
+        common = self.common()
+        if common is None:
+            return [(self.basis, weights)]
+        return [(common[0].basis, common[1][..., None] * weights)]
+
 
 @dataclass(frozen=True)
 class FourierDraw(FunctionDraw):
@@ -35,9 +56,13 @@ class FourierDraw(FunctionDraw):
     phase: Tensor
     std: Tensor
 
+    @property
+    def size(self) -> int:
+        return self.phase.shape[-1]
+
     def basis(self, x: Features) -> Tensor:
         angle = stacked(x, self.inputs) @ self.omega.mT + self.phase[:, None, :]
-        scale = self.std * math.sqrt(2.0 / self.phase.shape[-1])
+        scale = self.std * math.sqrt(2.0 / self.size)
         return scale[:, None, None] * torch.cos(angle)
 
     def common(self) -> tuple[FunctionDraw, Tensor] | None:
@@ -55,6 +80,10 @@ class LinearDraw(FunctionDraw):
     slope: Tensor
     bias: Tensor
 
+    @property
+    def size(self) -> int:
+        return self.slope.shape[-1] + 1
+
     def basis(self, x: Features) -> Tensor:
         scaled = stacked(x, self.inputs) * self.slope[:, None, :]
         return torch.cat([scaled, self.bias[:, None, None].expand(-1, scaled.shape[1], 1)], dim=-1)
@@ -70,6 +99,10 @@ class ConstantDraw(FunctionDraw):
 
     std: Tensor
 
+    @property
+    def size(self) -> int:
+        return 1
+
     def basis(self, x: Features) -> Tensor:
         n = stacked(x, None).shape[-2]
         return self.std[:, None, None].expand(-1, n, 1)
@@ -84,6 +117,14 @@ class SumDraw(FunctionDraw):
 
     left: FunctionDraw
     right: FunctionDraw
+
+    @property
+    def size(self) -> int:
+        return self.left.size + self.right.size
+
+    def terms(self, weights: Tensor) -> list[tuple[Callable[[Features], Tensor], Tensor]]:
+        own = weights.split([self.left.size, self.right.size], dim=1)
+        return [*self.left.terms(own[0]), *self.right.terms(own[1])]
 
     def basis(self, x: Features) -> Tensor:
         return torch.cat([self.left.basis(x), self.right.basis(x)], dim=-1)
@@ -101,6 +142,22 @@ class OuterDraw(FunctionDraw):
 
     left: FunctionDraw
     right: FunctionDraw
+
+    @property
+    def size(self) -> int:
+        return self.left.size * self.right.size
+
+    def terms(self, weights: Tensor) -> list[tuple[Callable[[Features], Tensor], Tensor]]:
+        common = self.common()
+        if common is None or not isinstance(common[0], OuterDraw) or not _is_square(common[0].left):
+            return super().terms(weights)
+        # The products ab and ba are the same function, so their weights add.
+        pairs, rest = common[0].left, common[0].right
+        count = pairs.left.size
+        i, j = torch.triu_indices(count, count, device=weights.device)
+        w = (common[1][..., None] * weights).unflatten(1, (count, count, rest.size))
+        folded = (w + w.transpose(1, 2))[:, i, j] * torch.where(i == j, 0.5, 1.0)[:, None, None].to(w)
+        return [(OuterDraw(SquareDraw(pairs.left), rest).basis, folded.flatten(1, 2))]
 
     def basis(self, x: Features) -> Tensor:
         return (self.left.basis(x)[..., :, None] * self.right.basis(x)[..., None, :]).flatten(-2)
@@ -121,6 +178,10 @@ class ProductDraw(FunctionDraw):
     features: int
     seed: int
 
+    @property
+    def size(self) -> int:
+        return self.features
+
     def basis(self, x: Features) -> Tensor:
         return self._paired(self.left.basis(x), self.right.basis(x))
 
@@ -140,6 +201,36 @@ class ProductDraw(FunctionDraw):
     def _pairs(self, n_left: int, n_right: int) -> tuple[Tensor, Tensor]:
         """Which features are multiplied."""
         return _random_pairs(n_left, n_right, self.features, self.seed)
+
+
+@dataclass(frozen=True)
+class SquareDraw(FunctionDraw):
+    """All different products of two features of one factor."""
+
+    factor: FunctionDraw
+
+    @property
+    def size(self) -> int:
+        return self.factor.size * (self.factor.size + 1) // 2
+
+    def basis(self, x: Features) -> Tensor:
+        phi = self.factor.basis(x)
+        i, j = torch.triu_indices(self.factor.size, self.factor.size, device=phi.device)
+        return phi[..., i] * phi[..., j]
+
+
+def _is_square(draw: FunctionDraw) -> TypeGuard[OuterDraw]:
+    """Whether a draw has all products of the features of a linear kernel with themselves."""
+    if not isinstance(draw, OuterDraw):
+        return False
+    left, right = draw.left, draw.right
+    return (
+        isinstance(left, LinearDraw)
+        and isinstance(right, LinearDraw)
+        and left.inputs == right.inputs
+        and torch.equal(left.slope, right.slope)
+        and torch.equal(left.bias, right.bias)
+    )
 
 
 @lru_cache(maxsize=64)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.features import Features
+from forcegp.gp.kernel_terms import kernel_terms
 from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.likelihood import Conditioned, condition, require_exact_fits, target_of
 from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors
@@ -143,10 +144,13 @@ class ExactPosterior:
         noise = torch.randn(len(like), count, dtype=torch.float64, generator=generator).to(like)
         residual = target_of(self.blocks)[:, None] - draws.at_rows - noise
         weights = self.weights_of(torch.cholesky_solve(residual, self.conditioned.L))
+        terms = [draw.terms(own) for draw, own in zip(draws.draws, draws.weights, strict=True)]
+        for p, process in enumerate(self.processes):
+            for block, w in zip(self.blocks, weights[p], strict=True) if self.measured[p] else ():
+                terms[p] += kernel_terms(
+                    process.kernel, sub(self.params, process.prefix), block.features[p], w
+                )
         return FunctionSamples(
-            tuple(
-                (draw.basis, *(self.kernels_to_data[p] if self.measured[p] else ()))
-                for p, draw in enumerate(draws.draws)
-            ),
-            tuple((own, *(weights[p] if self.measured[p] else ())) for p, own in enumerate(draws.weights)),
+            tuple(tuple(function for function, _ in own) for own in terms),
+            tuple(tuple(w for _, w in own) for own in terms),
         )

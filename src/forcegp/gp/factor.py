@@ -10,7 +10,7 @@ from torch import Tensor
 from forcegp.errors import NumericalError
 from forcegp.threads import threads_of_pytorch
 
-PANEL = 16
+PANEL = 24
 """Columns that LAPACK's triangular-pentagonal QR takes at a time."""
 
 

@@ -171,7 +171,7 @@ class Constant(Kernel):
 
 
 @dataclass(frozen=True)
-class _Stationary(Kernel):
+class Stationary(Kernel):
     """σ² g(r) of the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination).
 
     With `shared=True` the length-scales are those of all outputs, each with its own σ: fewer hyperparameters
@@ -227,7 +227,7 @@ class _Stationary(Kernel):
 
 
 @dataclass(frozen=True)
-class SquaredExponential(_Stationary):
+class SquaredExponential(Stationary):
     """k = σ² exp(−r²/2), a length-scale for each input and, unless shared, output (eq. 31)."""
 
     def profile(self, r2: Tensor) -> Tensor:
@@ -237,7 +237,7 @@ class SquaredExponential(_Stationary):
         return torch.randn(shape, dtype=torch.float64, generator=generator)
 
 
-class _Matern(_Stationary):
+class _Matern(Stationary):
     degrees: int
 
     def _radius(self, r2: Tensor) -> Tensor:

@@ -59,7 +59,8 @@ class SparsePosterior:
         """
         A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
         L, jitter = cholesky(A)
-        result = cls(basis, Moments(*sums.moments), L, jitter)
+        # LAPACK leaves the factor column by column; `extended` copies it faster row by row.
+        result = cls(basis, Moments(*sums.moments), L.contiguous(), jitter)
         result.__dict__["sums"] = sums
         return result
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.basis import LatentBasis, ProcessBasis
+from forcegp.gp.kernel_terms import kernel_terms
 from forcegp.gp.pathwise import UNMEASURED, Basis, FunctionSamples
 
 
@@ -47,11 +48,11 @@ def _terms(
         shape = (part.components, count, weights.shape[1])
         u = torch.randn(shape, dtype=torch.float64, generator=generator).to(weights)
         at_points = draw.basis(part.inducing) @ u
-        common = draw.common()
-        terms.append((draw.basis, u) if common is None else (common[0].basis, common[1][..., None] * u))
+        terms += draw.terms(u)
         if part.to_inducing is not None:
             # R Rᵀ f_prior(Z) are the weights of k(x, Z) that interpolate the prior function.
-            terms.append((part.to_inducing, on_kernel - part.roots @ (part.roots.mT @ at_points)))
+            w = on_kernel - part.roots @ (part.roots.mT @ at_points)
+            terms += kernel_terms(rest.kernel, rest.parameters(part.params), part.inducing, w)
     if part.finite is not None:
         terms.append((part.finite.basis, on_features))
     return terms

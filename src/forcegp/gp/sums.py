@@ -146,15 +146,16 @@ def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
         for run in _runs([basis.columns[l] for l in shown[position:]]):
             into.G[own, run].addmm_(V[:, own].mT, weighted[:, run])
         into.v[own] += V[:, own].mT @ c[:, k]
-    into.prior.add_(_by_process(basis, S, prior))
-    into.missed.add_(_by_process(basis, S, missed))
+    S_kk = torch.diagonal(S, dim1=0, dim2=1)
+    into.prior.add_(_by_process(basis, S_kk, prior))
+    into.missed.add_(_by_process(basis, S_kk, missed))
     into.yy.add_((block.target**2).sum())
     into.rows.add_(block.rows)
 
 
-def _by_process(basis: LatentBasis, S: Tensor, variance: Tensor) -> Tensor:
-    """Σ S_kk var_k of each process, `(processes,)`, with S `(k, k, n)` and variances `(n, k)`."""
-    traces = (torch.diagonal(S, dim1=0, dim2=1) * variance).sum(0)
+def _by_process(basis: LatentBasis, S_kk: Tensor, variance: Tensor) -> Tensor:
+    """Σ S_kk var_k of each process, `(processes,)`, with S_kk and variances `(n, k)`."""
+    traces = (S_kk * variance).sum(0)
     return torch.stack([traces[own].sum() for own in basis.components])
 
 
@@ -171,15 +172,15 @@ def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> t
     for block in blocks:
         V, prior, missed = basis.evaluate(block.features)
         W = torch.cat(block.operators, dim=-1)
-        S = (W.mT @ W).permute(1, 2, 0)
+        S_kk = W.square().sum(1)
         rows.append((W[:, :, basis.owner] * V[:, None, :]).flatten(0, 1))
         y = block.target.reshape(-1)
         moments = Moments(
             torch.addmv(moments.v, rows[-1].mT, y),
             moments.yy + y @ y,
             moments.rows + block.rows,
-            moments.prior + _by_process(basis, S, prior),
-            moments.missed + _by_process(basis, S, missed),
+            moments.prior + _by_process(basis, S_kk, prior),
+            moments.missed + _by_process(basis, S_kk, missed),
         )
     return moments, torch.cat(rows)
 

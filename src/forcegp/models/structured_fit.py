@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.compiled_system import compiled_system
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.coulomb import coupled
 from forcegp.forces.identifiability import doubts_of
@@ -139,7 +140,7 @@ class StructuredFit(FittedModel):
         Raises:
             ModelError: inference is exact.
         """
-        problem = dataclasses.replace(self.problem, training=measurements)
+        problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
         latent, central = _sparse(self.posterior), self.posterior.central
         if isinstance(central, SparsePosterior):
@@ -148,6 +149,11 @@ class StructuredFit(FittedModel):
         posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows), central=central)
         return dataclasses.replace(self, posterior=posterior)
 
+    def _problem_of(self, measurements: Training) -> Problem:
+        """The problem with other measurements and the learned robot, whose mechanics are compiled."""
+        system = compiled_system(self.system)
+        return dataclasses.replace(self.problem, training=measurements, system=system, parameters=None)
+
     def without(self, measurements: Training) -> StructuredFit:
         """The fit without samples that it was conditioned on.
 
@@ -155,7 +161,7 @@ class StructuredFit(FittedModel):
             ModelError: inference is exact, or there are more samples than it was conditioned on.
             NumericalError: the samples were not among them.
         """
-        problem = dataclasses.replace(self.problem, training=measurements)
+        problem = self._problem_of(measurements)
         latent, central = _sparse(self.posterior), self.posterior.central
         if isinstance(central, SparsePosterior):
             known = problem.of_means().rows(self.hyperparameters).blocks

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import Baumgarte, ConstrainedSystem
+from forcegp.constraints.compiled_system import compiled_system
 from forcegp.constraints.unilateral import any_row, can_open
 from forcegp.errors import ForceGPError, UnknownNameError
 from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
@@ -28,6 +29,8 @@ STEPS_PER_STATE = 4
 FEW = 8
 """Up to this number of trajectories one thread is used, as more only slow down work on small tensors."""
 
+COMPILED_STEPS = 1000
+"""Steps from which compiled mechanics save more time than compiling takes."""
 STABILIZATIONS = ("none", "baumgarte", "projection")
 ON_DIVERGENCE = ("raise", "keep")
 
@@ -212,7 +215,8 @@ def _run(
     steps = max(1, round(duration / dt))
     if noise is not None:
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
-    problem = Problem(system, law, inputs, unilateral)
+    mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
+    problem = Problem(mechanics, law, inputs, unilateral)
     system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
     closed = torch.ones(n, len(system.contacts), dtype=torch.bool, device=q.device)
@@ -235,7 +239,7 @@ def _run(
         name: getattr(found, name).unflatten(0, whole) if whole else getattr(found, name)[0]
         for name in FIELDS
     }
-    return dataclasses.replace(found, **shaped)
+    return dataclasses.replace(found, system=system, **shaped)
 
 
 def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:

@@ -1,0 +1,129 @@
+"""The equations of motion of one system, with the mechanics of its robot from a compiled kernel.
+
+At a few states the overhead of tensor operations is many times the work on them. The kernel is built by the
+machine's C++ compiler and kept on disk.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from forcegp import dynamics, kinematics
+from forcegp.compiled.mechanics import CompiledMechanics
+from forcegp.constraints.contact import Anchor, MovingPoint
+from forcegp.constraints.gauss import Equations
+from forcegp.constraints.system import ConstrainedSystem
+from forcegp.errors import MissingDependencyError
+from forcegp.robot.model import RobotModel
+from forcegp.types import JointVector
+
+POINT = 4
+"""Blocks of a point: rotation, position, Jacobian, bias acceleration."""
+_KERNELS: WeakKeyDictionary[RobotModel, dict[tuple[Anchor, ...], CompiledMechanics | None]] = (
+    WeakKeyDictionary()
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CompiledSystem(ConstrainedSystem):
+    """A constrained system whose equations of motion come from a kernel wherever no gradient is asked for.
+
+    Made by `compiled_system`.
+    """
+
+    @cached_property
+    def _anchors(self) -> tuple[Anchor, ...]:
+        return anchors_of(self)
+
+    @cached_property
+    def _mechanics(self) -> CompiledMechanics | None:
+        return _kernel(self.robot, self._anchors)
+
+    def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
+        """The same constraints on a robot with other parameters, which are not those of the kernel."""
+        return ConstrainedSystem(robot, self.contacts, self.baumgarte)
+
+    def equations(self, q: JointVector, qd: JointVector, active: Tensor | None = None) -> Equations:
+        """See `ConstrainedSystem.equations`."""
+        if self._mechanics is None or q.shape != qd.shape or _traced(q) or _traced(qd):
+            return super().equations(q, qd, active)
+        self.robot.check_state(q=q, qd=qd)
+        M, Q_C, Q_G, *blocks = self._mechanics.batch(q, qd)
+        points = {}
+        for anchor, i in zip(self._anchors, range(0, len(blocks), POINT), strict=True):
+            _, position, jacobian, bias = blocks[i : i + POINT]
+            points[anchor] = MovingPoint.of(position, jacobian, bias[..., 3:], qd)
+        terms = [c.terms_of([points[_key(a)] for a in c.anchors]) for c in self.contacts]
+
+        def links() -> tuple[kinematics.LinkPoses, kinematics.LinkMotion]:
+            poses = kinematics.link_poses(self.robot, q)
+            return poses, kinematics.link_motion(self.robot, poses, qd)
+
+        known = M, Q_C, Q_G, dynamics.damping_force(self.robot, qd)
+        return self._assembled(q, qd, active, known, terms, links)
+
+
+def compiled_system(system: ConstrainedSystem) -> ConstrainedSystem:
+    """The system with compiled equations of motion, for many evaluations of one robot.
+
+    The first call for a robot compiles for some seconds; later ones, in any process, read the kernel from
+    the cache. Where there is no compiler, or the robot's parameters require gradients or lie on a GPU, the
+    system is returned as it is.
+
+    Example:
+        >>> import torch, forcegp
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> q, qd = torch.zeros(2, 7, dtype=torch.float64)
+        >>> float(compiled_system(system).equations(q, qd).c - system.equations(q, qd).c)
+        0.0
+    """
+    if isinstance(system, CompiledSystem) or not _can_compile(system.robot):
+        return system
+    if _kernel(system.robot, anchors_of(system)) is None:
+        return system
+    return CompiledSystem(system.robot, system.contacts, system.baumgarte)
+
+
+def anchors_of(system: ConstrainedSystem) -> tuple[Anchor, ...]:
+    """The points that constraints read, each once."""
+    return tuple(dict.fromkeys(_key(a) for contact in system.contacts for a in contact.anchors))
+
+
+def _key(anchor: Anchor) -> Anchor:
+    frame, point = anchor
+    return frame, tuple(float(x) for x in point)
+
+
+def _can_compile(robot: RobotModel) -> bool:
+    if robot.device.type != "cpu" or robot.dtype not in (torch.float64, torch.float32):
+        return False
+    values = (getattr(robot, field.name) for field in dataclasses.fields(robot))
+    return not any(isinstance(value, Tensor) and value.requires_grad for value in values)
+
+
+def _kernel(robot: RobotModel, anchors: tuple[Anchor, ...]) -> CompiledMechanics | None:
+    """The kernel of a robot, `None` where the machine cannot build it; kept as long as the robot."""
+    kept = _KERNELS.setdefault(robot, {})
+    if anchors not in kept:
+        try:
+            kept[anchors] = CompiledMechanics(robot, anchors)
+        except MissingDependencyError:
+            kept[anchors] = None
+    return kept[anchors]
+
+
+def _traced(x: Tensor) -> bool:
+    """Whether derivatives by x may be asked for: by autograd, or by a transform of `torch.func`."""
+    if x.requires_grad and torch.is_grad_enabled():
+        return True
+    try:
+        x.data_ptr()
+    except RuntimeError:  # A transform wraps its tensors, which have no storage of their own.
+        return True
+    return False

@@ -1,0 +1,54 @@
+"""Terms that are cheap to evaluate are the same functions as the kernel and the random features."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from forcegp.gp.kernel_terms import kernel_terms
+from forcegp.gp.kernels import Constant, Kernel, Linear, Matern32, SquaredExponential
+
+SAME = 1e-12
+"""Of sums of some hundred terms in float64."""
+K, N, S = 3, 20, 4
+WIDTHS = {"q": 2, "qd": 2}
+SPEED = Linear(("qd",), shared=True)
+KERNELS = [
+    Linear(("q",)) + SquaredExponential(("q",), shared=True),
+    SPEED * SPEED * SquaredExponential(("q",), shared=True) + Matern32(("qd",), shared=True),
+    Constant() + SquaredExponential() + Linear(("q",)) * SquaredExponential(("qd",)),
+]
+
+
+def _case(kernel: Kernel) -> tuple[dict, dict, dict, torch.Generator]:
+    generator = torch.Generator().manual_seed(0)
+    initial = kernel.initial(K, WIDTHS)
+    params = {
+        name: v + 0.3 * torch.randn(v.shape, dtype=v.dtype, generator=generator)
+        for name, v in initial.items()
+    }
+    X, x = (
+        {name: torch.randn(n, 2, dtype=torch.float64, generator=generator) for name in WIDTHS} for n in (N, 7)
+    )
+    return params, X, x, generator
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=["finite and rest", "products", "no common functions"])
+def test_terms_of_a_kernel_add_up_to_its_covariance(kernel: Kernel) -> None:
+    params, X, x, generator = _case(kernel)
+    w = torch.randn(K, N, S, dtype=torch.float64, generator=generator)
+    terms = sum(basis(x) @ own for basis, own in kernel_terms(kernel, params, X, w))
+    torch.testing.assert_close(terms, kernel.covariance(params, x, X) @ w, rtol=SAME, atol=SAME)
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=["finite and rest", "products", "no common functions"])
+def test_terms_of_random_features_are_the_same_functions(kernel: Kernel) -> None:
+    params, _, x, generator = _case(kernel)
+    draw = kernel.draw(params, 64, generator)
+    assert draw.basis(x).shape[-1] == draw.size
+    w = torch.randn(K, draw.size, S, dtype=torch.float64, generator=generator)
+    terms = sum(basis(x) @ own for basis, own in draw.terms(w))
+    torch.testing.assert_close(terms, draw.basis(x) @ w, rtol=SAME, atol=SAME)
+    if kernel is KERNELS[1]:
+        # Nine products of three features are six different ones.
+        assert sum(own.shape[1] for _, own in draw.terms(w)) < draw.size
