@@ -22,8 +22,8 @@ STATES = 6
 def central_differences(fit: FittedModel, quantity: str, state: list[Tensor], active: Tensor) -> list[Tensor]:
     """Jacobians by each of q, q̇ and τ, `(n, d, nq)`."""
 
-    def mean(*state: Tensor) -> Tensor:
-        return fit.predict(*state, quantity, active=active, covariance=False).mean
+    def mean(q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        return fit.predict(q, qd, tau, quantity, active=active, covariance=False).mean
 
     found = []
     for k in range(3):
