@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
+import types
 from html.parser import HTMLParser
 
+import pytest
+
 import forcegp
-from forcegp.notebook import html_table
+from forcegp.notebook import FitBar, html_table
 from forces.cases import logged, two_contacts
 from logs import random_log
 
@@ -64,3 +68,27 @@ def test_a_fit_says_how_it_went() -> None:
     assert words[words.index("log marginal likelihood") + 1] == f"{fit.log_marginal_likelihood:.4g}"
     for one in (fit, fit.predict(*(x[:2] for x in (fit.training.measurements[0].states[:3])))):
         assert len(repr(one)) < 200, "no tensors are printed"
+
+
+def test_a_fit_shows_its_progress_in_a_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One output is displayed and then updated, by the protocol of IPython."""
+    outputs: list[list[str]] = []
+
+    class Handle:
+        def update(self, content: dict[str, str], raw: bool) -> None:
+            assert raw
+            outputs[-1].append(content["text/html"])
+
+    def display(content: dict[str, str], raw: bool, display_id: bool) -> Handle:
+        assert raw and display_id
+        outputs.append([content["text/html"]])
+        return Handle()
+
+    shell = types.SimpleNamespace(get_ipython=object, display=types.SimpleNamespace(display=display))
+    monkeypatch.setitem(sys.modules, "IPython", shell)
+    fit = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1).fit(
+        logged(two_contacts(), 8), progress=FitBar()
+    )
+    assert len(outputs) == 1
+    assert len(outputs[0]) >= fit.result.evaluations > 1
+    assert outputs[0][-1].startswith(f'<progress value="{fit.result.evaluations}" max=')

@@ -1,9 +1,11 @@
-"""What notebooks show of an object: a small HTML table, every text in it escaped."""
+"""What notebooks show: small HTML tables, every text in them escaped, and the progress of a fit."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from html import escape
+from typing import Any
 
 _TABLE = "border-collapse:collapse;font-variant-numeric:tabular-nums"
 _CELL = "text-align:right;padding:.15em .7em"
@@ -47,3 +49,37 @@ def _row(cells: Sequence[str], tag: str) -> str:
     pairs = zip(styles, map(escape, cells), strict=True)
     parts = (f'<{tag} style="{style}">{cell}</{tag}>' for style, cell in pairs)
     return f"<tr>{''.join(parts)}</tr>"
+
+
+class FitBar:
+    """A progress bar in the output of a notebook cell, for `fit(…, progress=FitBar())`.
+
+    Outside a notebook it prints nothing; the commands have a bar of their own.
+
+    Example:
+        >>> bar = FitBar()
+        >>> bar(3, 200, 12.5)
+        >>> bar.html()
+        '<progress value="3" max="200"></progress> 3 of at most 200 evaluations, objective 12.5'
+    """
+
+    def __init__(self) -> None:
+        self.done, self.total, self.objective = 0, 0, float("nan")
+        self._shown: Any = None
+
+    def __call__(self, done: int, total: int, objective: float) -> None:
+        """Show how many evaluations are done, of at most `total`, and the objective."""
+        self.done, self.total, self.objective = done, total, objective
+        interactive = sys.modules.get("IPython")
+        if interactive is None or interactive.get_ipython() is None:
+            return
+        content = {"text/html": self.html(), "text/plain": self.html().split("> ")[-1]}
+        if self._shown is None:
+            self._shown = interactive.display.display(content, raw=True, display_id=True)
+        else:
+            self._shown.update(content, raw=True)
+
+    def html(self) -> str:
+        """The bar, and its numbers."""
+        bar = f'<progress value="{self.done}" max="{self.total}"></progress>'
+        return f"{bar} {self.done} of at most {self.total} evaluations, objective {text(self.objective)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -120,6 +121,15 @@ def test_a_selection_cannot_be_cut_into_stretches() -> None:
     log = random_log(480)
     with pytest.raises(DataError, match="in order of time"):
         split_by_stretches(log[[5, 3, 1]], 1)
+
+
+def test_even_rows_keep_their_order_and_reach_both_ends() -> None:
+    log = random_log(100)
+    rows = select_points(log, 12, method="even")
+    assert rows.tolist() == np.round(np.linspace(0, 99, 12)).astype(int).tolist()
+    assert torch.equal(select_points(log, 100, method="even"), torch.arange(100))
+    with pytest.raises(DataError, match="cannot select 101 of 100 points"):
+        select_points(log, 101, method="even")
 
 
 def test_random_choice_depends_on_the_seed_alone() -> None:

@@ -155,6 +155,8 @@ def test_a_structured_gp_with_learned_noise_is_held_against_that() -> None:
     learned = model.hyperparameters["noise.0.log_noise_std"].exp()
     assert found.noise_std == pytest.approx(learned.tolist())
     assert max(found.noise_std or ()) < 0.29
+    # A fit is held against the same noise as the model that contains it.
+    assert evaluate(model.fitted, data[40:60]).uncertainty == found.uncertainty
 
 
 def test_wrong_use_is_refused() -> None:

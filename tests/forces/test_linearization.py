@@ -49,11 +49,13 @@ def test_jacobians_are_central_differences(kind: str) -> None:
     else:
         inference = "sparse" if kind == "sparse" else "exact"
         fit = forcegp.StructuredGP(system, "zero", noise_std=0.1, inference=inference).fit(data, learn=[])
-    state = list(draw(STATES, 7))
-    at = fit.linearize(*state, active=active)
-    assert torch.allclose(at.qdd, fit.predict(*state, active=active, covariance=False).mean)
+    q, qd, tau = draw(STATES, 7)
+    at = fit.linearize(q, qd, tau, active=active)
+    assert torch.allclose(at.qdd, fit.predict(q, qd, tau, active=active, covariance=False).mean)
     for quantity, jacobians in (("qdd", at[1:4]), ("multiplier", at[5:8])):
-        for got, expected in zip(jacobians, central_differences(fit, quantity, state, active), strict=True):
+        for got, expected in zip(
+            jacobians, central_differences(fit, quantity, [q, qd, tau], active), strict=True
+        ):
             assert float((got - expected).abs().max()) < DIFFERENCES * float(expected.abs().max())
 
 

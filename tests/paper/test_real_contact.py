@@ -13,9 +13,13 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError
+from forcegp.evaluation import evaluate
 from forcegp.forces.measurements import measurement_of
+from forcegp.gp.optimise import LearningOptions
 from forcegp.logs import import_log
-from forcegp.models.sensed import with_sensor
+from forcegp.models.registry import create
+from forcegp.models.sensed import force_from_sensor, sensed_force, sensor_noise_std, with_sensor
+from forcegp.models.structured_gp import StructuredGP
 from forcegp.paper.foreign_log import mapping_of, write_foreign_log
 from forcegp.paper.real_contact import rows_of, rows_right, surface_error
 from forcegp.paper.real_contact_page import findings, tables
@@ -83,6 +87,41 @@ def test_the_sensor_measures_the_force_on_the_tip(logs: dict[str, Dataset]) -> N
         measured.values[:, 0] - truth.contact_extras["multiplier"]["ball"][rows_of(log, truth)][closed]
     )
     assert float(difference.std()) == pytest.approx(FORCE_NOISE, rel=0.2)
+
+
+def test_the_noise_of_the_sensor_is_read_off_the_log(logs: dict[str, Dataset]) -> None:
+    assert sensor_noise_std(logs["wrench"], SYSTEM) == pytest.approx(FORCE_NOISE, rel=0.15)
+    with pytest.raises(ModelError, match="noise cannot be estimated"):
+        sensor_noise_std(logs["wrench"][~logs["wrench"].contact["ball"]], SYSTEM)
+
+
+def test_with_the_sensor_at_each_state_the_force_is_better_than_either(logs: dict[str, Dataset]) -> None:
+    log, truth = logs["wrench"], logs["truth"]
+    rows = torch.arange(len(log))
+    train, test = log[rows[(rows // 200) % 2 == 0]], log[rows[(rows // 200) % 2 == 1]]
+    logged = {"ball": truth.contact_extras["multiplier"]["ball"][rows_of(test, truth)]}
+    test = test.replace(contact_extras={**test.contact_extras, "multiplier": logged})
+    model = create("sgp-real", SYSTEM)
+    assert isinstance(model, StructuredGP)
+    few = LearningOptions(max_evaluations=15)
+    model.fit(with_sensor(train[::8], SYSTEM, FORCE_NOISE), options=few)
+    found = evaluate(model, test, compare=False)
+    (own,), (sensed,) = found.multipliers, found.sensed
+    assert sensed.spread < min(own.spread, FORCE_NOISE)
+    # An independent formula: the mean of two independent measurements, weighted by their precisions.
+    test = test[test.contact["ball"]]
+    mean, std = force_from_sensor(model.fitted, test)
+    states = test.q, test.qd, test.tau
+    active = test.active(SYSTEM.contact_names)
+    alone = model.fitted.predict(*states, "multiplier", active=active)
+    assert alone.variance is not None
+    w2 = (alone.variance + model.fitted.noise_variance(*states, "multiplier", active, sensor=False))[:, 0]
+    precision = 1.0 / w2 + 1.0 / FORCE_NOISE**2
+    expected = (alone.mean[:, 0] / w2 + sensed_force(test, SYSTEM) / FORCE_NOISE**2) / precision
+    np.testing.assert_allclose(mean, expected, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(std, precision**-0.5, rtol=1e-9)
+    with pytest.raises(ModelError, match="no measurement of this model"):
+        force_from_sensor(model.fitted, truth)
 
 
 def test_a_sensor_needs_one_contact_and_its_columns(logs: dict[str, Dataset]) -> None:

@@ -21,6 +21,13 @@ SPIKE = 12.0
 """Robust standard deviations beyond which a single value is a spike: never reached by normal noise."""
 SPIKE_ALONE = 4.0
 """Factor by which a spike stands out from the misfit of its neighbours."""
+SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
+"""Departures of the neighbours may differ from those of one wrong value by this share of it, and by this many
+robust standard deviations."""
+SPIKE_SHARED = 0.05
+"""A departure of another channel by this share of a value's own says that the motion jumped."""
+FEWEST = 50
+"""Values that a scale is taken from."""
 SPIKE_VISIBLE = (0.01, 0.002)
 """A spike is also this share of its own column's range, and of the largest range of the joints."""
 COARSE = 0.05
@@ -109,15 +116,10 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     """Single values far off the curve through their neighbours."""
-    bad, hit = np.zeros(len(log), bool), []
-    for name, value in logged(log).items():
-        own, around, scale = np.zeros_like(value), np.zeros_like(value), np.zeros(log.nq)
-        for s in log.stretches:
-            own[s], around[s] = spikes(value[s])
-        inner = own[log.usable]
-        if len(inner) < 50:
-            continue
-        scale = robust_std(inner) + resolution(value[log.usable]) + 1e-12 * np.abs(value[log.usable]).max()
+    bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
+    departures = {name: _departures(log, value) for name, value in vectors.items()}
+    for name, value in vectors.items():
+        own, around, scale = departures[name]
         reach = np.ptp(np.percentile(value[log.usable], (0.5, 99.5), axis=0), axis=0)
         least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
         # Next to a contact switch values jump by nature.
@@ -125,6 +127,8 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
             ~_switches(log)[:, None]
             & (np.abs(own) > np.maximum(SPIKE * scale, least))
             & (np.abs(own) > SPIKE_ALONE * around)
+            & _one_value(own, scale)
+            & ~_shocks(log, departures, name)
         )
         # The neighbours of a spike are off as well, by less.
         for j in np.flatnonzero(outlier.any(axis=0)):
@@ -136,6 +140,57 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     rows = intervals(bad)
     text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}: {describe(rows)}"
     return [Finding("spike", text, rows, evidence={"rows": bad.sum()})], log.mask(bad)
+
+
+def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
+    """Departures of the values of a vector and of their neighbours `(n, nq)`, and their scale `(nq,)`."""
+    own, around = np.zeros_like(value), np.zeros_like(value)
+    for s in log.stretches:
+        own[s], around[s] = spikes(value[s])
+    inner = own[log.usable]
+    if len(inner) < FEWEST:
+        return own, around, np.full(value.shape[1], np.inf)
+    scale = robust_std(inner) + resolution(value[log.usable]) + 1e-12 * np.abs(value[log.usable]).max()
+    return own, around, scale
+
+
+def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
+    """`(n, nq)` bool, values that depart as others do, of which each is compared with its column's range.
+
+    A shock moves several joints, or shows in torque and acceleration; a sensor errs in one channel. No shock
+    moves the position.
+    """
+    own = departures[name][0]
+    if name == "q":
+        return np.zeros(own.shape, bool)
+    pair = ("tau", "qdd") if name in ("tau", "qdd") else (name,)
+    size = {key: _size(log, key, *departures[key]) for key in pair if key in departures}
+    confirmed = np.zeros(own.shape, bool)
+    for j in range(own.shape[1]):
+        others = [np.delete(part, j, axis=1) if key == name else part for key, part in size.items()]
+        most = np.concatenate([*others, np.zeros((len(own), 1))], axis=1).max(axis=1)
+        confirmed[:, j] = most > SPIKE_SHARED * size[name][:, j]
+    return confirmed
+
+
+def _size(log: Log, name: str, own: Array, around: Array, scale: Array) -> Array:
+    """Largest departure within two rows over the range of the column; zero where it may be noise."""
+    reach = np.ptp(np.percentile(getattr(log, name)[log.usable], (0.5, 99.5), axis=0), axis=0)
+    large = np.where(np.abs(own) > SPIKE * scale, np.abs(own) / np.maximum(reach, 1e-300), 0.0)
+    padded = np.pad(large, ((2, 2), (0, 0)))
+    return np.max([padded[k : len(own) + k] for k in range(5)], axis=0)
+
+
+def _one_value(own: Array, scale: Array) -> np.ndarray:
+    """`(n, d)` bool, departures that those of the neighbours follow from, as they do for one wrong value.
+
+    A value that is off by h departs by h, its neighbours by −4h/6 and h/6; a kink or a step has other shapes.
+    """
+    padded = np.pad(own, ((2, 2), (0, 0)))
+    n, misfit = len(own), np.zeros_like(own)
+    for k, share in ((0, 1.0 / 6.0), (1, -4.0 / 6.0), (3, -4.0 / 6.0), (4, 1.0 / 6.0)):
+        misfit = np.maximum(misfit, np.abs(padded[k : n + k] - share * own))
+    return misfit <= SPIKE_SHAPE * np.abs(own) + SPIKE_NOISE * scale
 
 
 def _switches(log: Log) -> np.ndarray:

@@ -66,12 +66,13 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
 
 
 def show(result: Mapping[str, object], as_json: bool) -> None:
-    """Print the result of a command, one line a figure, or as JSON."""
+    """Print the result of a command, one value per line without those that are empty, or all as JSON."""
     if as_json:
         typer.echo(json.dumps(dict(result), default=str))
         return
-    width = max(len(name) for name in result)
-    for name, value in result.items():
+    shown = {name: value for name, value in result.items() if value is not None and value != ()}
+    width = max(len(name) for name in shown)
+    for name, value in shown.items():
         text = f"{value:.6g}" if isinstance(value, float) else str(value)
         typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from forcegp.constraints import ConstrainedSystem
     from forcegp.data import Dataset
+    from forcegp.models.base import Predictor
 
 CHUNK = 2000
 """States predicted at once: bounds the memory, and moves the progress bar."""
@@ -43,12 +44,22 @@ def predict(
             "contact_friction.",
         ),
     ] = "qdd",
+    noise: Annotated[
+        bool, typer.Option("--noise", help="Count the noise of the motor torque and of the sensor too.")
+    ] = False,
+    sensor: Annotated[
+        bool,
+        typer.Option(
+            "--sensor", help="λ with the log's force sensor as a measurement too (fit with sensor_noise_std)."
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Predict a quantity at the states of a data set.
 
     The output is the data set with the columns predicted_<quantity> and, for models that know their
-    uncertainty, predicted_<quantity>_std (without measurement noise).
+    uncertainty, predicted_<quantity>_std (without measurement noise, unless --noise is given). A
+    measured normal force differs from the prediction by the noise of the motor torque too: use --noise.
 
     [bold]Examples[/bold]
 
@@ -59,6 +70,7 @@ def predict(
     import torch
 
     from forcegp.destination import write_or_keep
+    from forcegp.errors import ModelError
     from forcegp.models.load import load_model
 
     check_data_destination(out, data)
@@ -67,14 +79,14 @@ def predict(
     active = test.active(regression.system.contact_names)
     means: list[Tensor] = []
     stds: list[Tensor] = []
+    if sensor and quantity != "multiplier":
+        raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
     with progress_bar(f"predicting {quantity}", len(test)) as progress:
         for first in range(0, len(test), CHUNK):
             rows = slice(first, first + CHUNK)
-            part = regression.predict(
-                test.q[rows], test.qd[rows], test.tau[rows], quantity, active=active[rows]
-            )
-            means.append(part.mean)
-            stds += [part.std] if part.std is not None else []
+            mean, std = _predicted(regression, test[rows], quantity, active[rows], noise, sensor)
+            means.append(mean)
+            stds += [std] if std is not None else []
             progress(min(first + CHUNK, len(test)))
     test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", torch.cat(means))
     if stds:
@@ -82,6 +94,31 @@ def predict(
         test = _with_columns(test, regression.system, quantity, name, torch.cat(stds))
     write_or_keep(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
     show({"quantity": quantity, "samples": len(test), "uncertainty": bool(stds), "file": str(out)}, as_json)
+
+
+def _predicted(
+    model: Predictor, part: Dataset, quantity: str, active: Tensor, noise: bool, sensor: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Mean and standard deviation of a quantity at some states.
+
+    Raises:
+        ModelError: the model learned no noise, or was not fitted to a sensor.
+    """
+    from forcegp.errors import ModelError
+    from forcegp.models.sensed import force_from_sensor
+    from forcegp.models.structured_fit import StructuredFit
+
+    if not (noise or sensor):
+        found = model.predict(part.q, part.qd, part.tau, quantity, active=active)
+        return found.mean, found.std
+    fit = getattr(model, "fitted", model)
+    if not isinstance(fit, StructuredFit):
+        raise ModelError("--noise and --sensor need a structured Gaussian process", got=model.kind)
+    if sensor:
+        mean, std = force_from_sensor(fit, part)
+        return mean[:, None], std[:, None]
+    found = fit.predict(part.q, part.qd, part.tau, quantity, active=active, noise=True)
+    return found.mean, found.std
 
 
 def _with_columns(

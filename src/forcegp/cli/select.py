@@ -30,7 +30,7 @@ def select(
     fraction: Annotated[float, typer.Option(help="Part of the motion that is held out.")] = 0.2,
     margin: Annotated[float, typer.Option(help="Time kept free beside held-out stretches in seconds.")] = 0.0,
     method: Annotated[
-        Literal["farthest", "random"], typer.Option(help="How training points are chosen.")
+        Literal["farthest", "even", "random"], typer.Option(help="How training points are chosen.")
     ] = "farthest",
     keep_impacts: Annotated[
         bool, typer.Option("--keep-impacts", help="Keep rows that the log marks as near an impact.")

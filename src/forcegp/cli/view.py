@@ -121,7 +121,7 @@ def _motion(
 
 
 def _stretch(log: Path, system: ConstrainedSystem, start: int, seconds: float) -> Dataset:
-    """The rows of one trajectory from `start` on, as long as asked for."""
+    """The rows of one trajectory from `start` on, up to its first gap, and as long as asked for."""
     from forcegp.errors import DataError
 
     data = data_of_robot(read_data(log), system.robot)
@@ -135,6 +135,9 @@ def _stretch(log: Path, system: ConstrainedSystem, start: int, seconds: float) -
         raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 1}", got=start)
     rest = data[start:]
     own = rest[rest.segment == rest.segment[0]]
+    steps = own.t.diff()
+    gaps = (steps > 1.5 * steps.median()).nonzero() if len(steps) > 0 else steps  # left by `forcegp select`
+    own = own[: int(gaps[0]) + 1] if len(gaps) > 0 else own
     return own[own.t <= own.t[0] + seconds]
 
 

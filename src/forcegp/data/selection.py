@@ -91,7 +91,8 @@ def select_points(
     Args:
         data: the log.
         count: how many points.
-        method: `"farthest"` (on standardized q, q̇, τ), or `"random"` for comparison.
+        method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in their order), or
+            `"random"` for comparison. Farthest points favour outliers, which a measured log has.
         seed: of the random choice; farthest points need none.
         candidates: row numbers to choose from; default all.
         progress: called with the number of points chosen so far.
@@ -104,11 +105,13 @@ def select_points(
     if method == "farthest":
         # Scaled by the whole log, so that the metric does not depend on what is held out.
         return rows[farthest_points(standardized_inputs(data)[rows], count, progress=progress)]
-    if method != "random":
-        raise UnknownNameError("method of selection", method, ["farthest", "random"])
+    if method not in ("even", "random"):
+        raise UnknownNameError("method of selection", method, ["farthest", "even", "random"])
     if not 0 < count <= len(rows):
         raise DataError(
             f"cannot select {count} of {len(rows)} points", expected=f"1 to {len(rows)}", got=count
         )
+    if method == "even":
+        return rows[torch.linspace(0, len(rows) - 1, count, dtype=torch.float64).round().long()]
     order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
     return rows[order[:count].to(rows.device)]

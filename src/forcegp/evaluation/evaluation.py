@@ -12,9 +12,10 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.evaluation.baselines import FEWEST, as_torque, baselines
+from forcegp.evaluation.multiplier import MultiplierScore, multiplier_scores, sensed_scores
 from forcegp.evaluation.predicted import CHUNK_STATES, Predicted, Progress, predict_all
 from forcegp.evaluation.scores import Errors, JointErrors, moving_joints
-from forcegp.evaluation.uncertainty import MultiplierScore, Uncertainty, multiplier_scores, nlpd
+from forcegp.evaluation.uncertainty import Uncertainty, nlpd
 from forcegp.evaluation.verdict import PredictorScores, Verdict, sentence, verdicts
 from forcegp.models.base import Predictor
 
@@ -37,6 +38,8 @@ class Evaluation:
         predictors: errors by joint of the model and of the trivial predictors.
         verdicts: the model against each trivial predictor; empty if there are too few samples.
         multipliers: λ against the logged one, for models of forces and logs that contain it.
+        sensed: the same with the log's force sensor as a measurement at each state, for models that were
+            fitted to that sensor.
     """
 
     kind: str
@@ -52,6 +55,7 @@ class Evaluation:
     predictors: tuple[PredictorScores, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
     multipliers: tuple[MultiplierScore, ...] = ()
+    sensed: tuple[MultiplierScore, ...] = ()
 
     @property
     def noisy_mae(self) -> float:
@@ -178,6 +182,7 @@ def evaluate(
         predictors=scores,
         verdicts=verdicts(scores, data.joint_names) if scores else (),
         multipliers=multiplier_scores(model, data, CHUNK_STATES) if model.force_field() else (),
+        sensed=sensed_scores(model, data, CHUNK_STATES),
     )
 
 

@@ -27,7 +27,9 @@ STRETCHES = 8
 MOST_STRETCHES = 16
 """Segments beyond this number are left out together with others, since each costs a conditioning."""
 FEWEST = 50
-"""Samples in free motion below which nothing is calibrated."""
+"""Samples below which nothing is calibrated."""
+SWEEPS, SETTLED = 20, 1e-3
+"""Sweeps over the joints at most, and the relative change of their noise that ends them."""
 MOST_RESIDUALS = 16_000
 """Samples whose residuals are looked at for their correlation, in contiguous stretches of a longer log."""
 CHUNK_STATES = 2000
@@ -126,8 +128,9 @@ def _residual(
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
     """Standard deviation of torque noise `(nq,)` with which held-out stretches have unit normalised errors.
 
-    Each stretch is predicted from all others with the hyperparameters as they are. Of joint i, s_i² solves
-    mean(r² / (s_i² + Var r)) = 1 over all samples in free motion.
+    Each stretch is predicted from all others with the hyperparameters as they are. What accelerations show
+    of the error of the force is r = M(q̈ − E q̈) = P ε, with P = I in free motion. Of joint i, s_i² solves
+    mean(r_i² / (Σ_k P_ik² s_k² + Var r_i)) = 1 over all samples at which P_ii is more than a half.
 
     Args:
         problem: what was learned.
@@ -135,20 +138,18 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
         least: the learned standard deviation, which is kept where the errors ask for less.
     """
     training = problem.training
-    residuals, variances = [], []
+    parts = []
     for i in _motions(training):
         m = training.measurements[i]
         group = stretches(m.segment)
         for g in group.unique().tolist():
             own = (group == g).nonzero()[:, 0]
             rest = dataclasses.replace(problem, training=training.without(i, own))
-            found = _held_out(rest, hyperparameters, m[own], problem.noise_at(hyperparameters, i))
-            residuals.append(found[0])
-            variances.append(found[1])
-    if sum(len(r) for r in residuals) < FEWEST:
+            parts.append(_held_out(rest, hyperparameters, m[own], problem.noise_at(hyperparameters, i)))
+    if sum(len(residual) for residual, _, _ in parts) < FEWEST:
         return least
-    r2, V = torch.cat(residuals) ** 2, torch.cat(variances)
-    return torch.stack([_unit_scale(r2[:, j], V[:, j], least[j]) for j in range(len(least))])
+    residual, variance, P = (torch.cat(part) for part in zip(*parts, strict=True))
+    return unit_scales(residual**2, variance, P**2, least)
 
 
 def stretches(segment: Tensor) -> Tensor:
@@ -162,17 +163,40 @@ def stretches(segment: Tensor) -> Tensor:
 
 def _held_out(
     problem: Problem, hyperparameters: Mapping[str, Tensor], m: Measurement, noise_std: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Torque residuals of unseen samples in free motion, and their variance but for torque noise, `(n,
-    nq)`."""
-    m = m[_free(m)]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Torque residuals of unseen samples, their variance but for torque noise, `(n, nq)` each, and P."""
     posterior, system = force_posterior(problem, hyperparameters), problem.system
     at = m.at(system)
-    z = affine_map(system, at, "total_force")
-    residual = (at.eom.M @ m.values[..., None])[..., 0] - posterior.read_mean(system, at, z)
-    spread = posterior.read_covariance(system, at, z).diagonal(dim1=-2, dim2=-1)
+    z = affine_map(system, at, "qdd")
+    M, P = at.eom.M, at.eom.P
+    residual = (M @ (m.values - posterior.read_mean(system, at, z))[..., None])[..., 0]
+    spread = (M @ posterior.read_covariance(system, at, z) @ M.mT).diagonal(dim1=-2, dim2=-1)
     std = noise_std if noise_std.ndim == 1 else noise_std.square().mean(0).sqrt()
-    return residual, spread + (at.eom.M**2 @ std**2) + stick_variance(hyperparameters, at)
+    stick = (P**2 @ stick_variance(hyperparameters, at)[..., None])[..., 0]
+    return residual, spread + (M**2 @ std**2) + stick, P
+
+
+def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:
+    """s with mean(r_i² / (Σ_k share_ik s_k² + V_i)) = 1 for each joint i, found joint by joint.
+
+    Args:
+        r2, V: `(n, nq)` squared errors, and their variance but for the noise.
+        share: `(n, nq, nq)` P_ik², how much of the noise of joint k is in the error of joint i.
+        least: `(nq,)` smallest values.
+    """
+    s = least.clone()
+    for _ in range(SWEEPS):
+        before = s.clone()
+        for i in range(len(s)):
+            own = share[:, i, i]
+            shows = own > 0.25
+            if int(shows.sum()) < FEWEST:
+                continue
+            others = (share[:, i] @ s**2 - own * s[i] ** 2 + V[:, i])[shows]
+            s[i] = _unit_scale(r2[shows, i] / own[shows], others / own[shows], least[i])
+        if torch.allclose(s, before, rtol=SETTLED, atol=0.0):
+            break
+    return s
 
 
 def _unit_scale(r2: Tensor, V: Tensor, least: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ def linearize_field(
     flat = flat_states(system, q, qd, tau, active)
     with torch.enable_grad():
         leaves = [x.detach().clone().requires_grad_() for x in (flat.q, flat.qd, flat.tau)]
-        at = states(system, *leaves, flat.active)
+        at = states(system, leaves[0], leaves[1], leaves[2], flat.active)
         F = force(system, at) - at.eom.Q_K
         rows = [
             torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)

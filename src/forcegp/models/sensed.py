@@ -1,17 +1,28 @@
-"""The force sensor of a log as a second measurement: the normal force λ beside the accelerations."""
+"""The force sensor of a log as a second measurement: the normal force λ beside the accelerations.
+
+A model is fitted to both, and at a state where the sensor was read, its reading is one more measurement of
+that state's λ: λ̂ = (λ_m/w² + s/σ²) / (1/w² + 1/σ²), with the model's λ_m ± w, in which w contains the noise
+of the motor torque, and the sensor's s ± σ. Both errors are independent.
+"""
 
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Observation
+from forcegp.models.structured_fit import StructuredFit
 
 SENSOR = "F_sensor"
 """Force on the robot at a contact, as `forcegp import` writes it [N]."""
+MAD_TO_STD = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
+TINY = 1e-12
+"""Smallest variance of a predicted force [N²]."""
 
 
 def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> list[Observation]:
@@ -26,6 +37,22 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
     Raises:
         ModelError: there is no sensor, no row in contact, or more than one contact.
     """
+    contact = _contact(system)
+    closed = data.active([contact.name])[:, 0]
+    if not has_sensor(data, system) or not bool(closed.any()):
+        raise ModelError(
+            f"the log has no sensor's force at contact {contact.name!r}",
+            expected=f"columns {SENSOR}.{contact.name}.x, .y, .z and rows in contact",
+            hint="import the log with a table [wrench], or leave out sensor_noise_std",
+        )
+    extras = {**data.contact_extras, "multiplier": {contact.name: sensed_force(data, system)}}
+    rows = torch.nonzero(closed)[:, 0]
+    sensed = data.replace(contact_extras=extras)[rows]
+    return [Observation(data), Observation(sensed, "multiplier", noise_std)]
+
+
+def _contact(system: ConstrainedSystem) -> SurfaceContact:
+    """The contact that a sensor measures."""
     contact = system.contacts[0] if len(system.contacts) == 1 else None
     if not isinstance(contact, SurfaceContact):
         raise ModelError(
@@ -33,18 +60,74 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
             expected="a single contact with a surface",
             got=", ".join(system.contact_names) or "none",
         )
-    logged = data.contact_extras.get(SENSOR, {})
-    closed = data.active([contact.name])[:, 0]
-    if contact.name not in logged or not bool(closed.any()):
-        raise ModelError(
-            f"the log has no sensor's force at contact {contact.name!r}",
-            expected=f"columns {SENSOR}.{contact.name}.x, .y, .z and rows in contact",
-            hint="import the log with a table [wrench], or leave out sensor_noise_std",
-        )
+    return contact
+
+
+def has_sensor(data: Dataset, system: ConstrainedSystem) -> bool:
+    """Whether the log holds a sensor's force at the system's contact."""
+    return any(name in data.contact_extras.get(SENSOR, {}) for name in system.contact_names)
+
+
+def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
+    """The normal force n·F of the sensor `(n,)` [N].
+
+    Raises:
+        ModelError: the system has more than one contact, or none with a surface.
+    """
+    contact = _contact(system)
     q = data.select(system.robot.joint_names).q
     point = kinematics.point_position(system.robot, q, contact.frame, tuple(contact.point))
-    force = (contact.surface.gradient(point) * logged[contact.name]).sum(-1)
-    extras = {**data.contact_extras, "multiplier": {contact.name: force}}
-    rows = torch.nonzero(closed)[:, 0]
-    sensed = data.replace(contact_extras=extras)[rows]
-    return [Observation(data), Observation(sensed, "multiplier", noise_std)]
+    return (contact.surface.gradient(point) * data.contact_extras[SENSOR][contact.name]).sum(-1)
+
+
+def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
+    """Standard deviation of the white noise of the sensor's normal force, from the log itself [N].
+
+    x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6, the departure from the cubic through the neighbours,
+    has the variance 35/18 σ² where the force is smooth; its median absolute value does not see jumps.
+
+    Args:
+        data: a log in order of time, with `F_sensor`.
+        system: robot with a single contact with a surface.
+
+    Raises:
+        ModelError: no five rows follow each other in contact.
+    """
+    closed, force = data.active([_contact(system).name])[:, 0], sensed_force(data, system)
+    steps = data.t.diff()
+    follows = (steps < 1.5 * steps.median()) & (data.segment[1:] == data.segment[:-1])
+    inner = torch.stack([follows[k : len(closed) - 4 + k] for k in range(4)]).all(0)
+    inner &= torch.stack([closed[k : len(closed) - 4 + k] for k in range(5)]).all(0)
+    a, b, middle, c, d = (force[k : len(force) - 4 + k][inner] for k in range(5))
+    if not len(middle):
+        raise ModelError("the sensor's noise cannot be estimated", expected="five rows in contact in a row")
+    departure = middle - (4.0 * (b + c) - a - d) / 6.0
+    return float(MAD_TO_STD * departure.abs().median() / (35.0 / 18.0) ** 0.5)
+
+
+@torch.no_grad()
+def force_from_sensor(fit: StructuredFit, data: Dataset) -> tuple[Tensor, Tensor]:
+    """λ of the contact with the sensor's reading as a measurement, mean and standard deviation `(n,)` [N].
+
+    Args:
+        fit: fitted to the accelerations and the sensor (`with_sensor`).
+        data: states with `F_sensor`.
+
+    Raises:
+        ModelError: the fit does not know the sensor's noise, or the log has no sensor.
+    """
+    if "multiplier" not in fit.noise or not has_sensor(data, fit.system):
+        raise ModelError(
+            "the sensor is no measurement of this model",
+            expected="a model fitted with sensor_noise_std, and a log with columns F_sensor",
+        )
+    active = data.active(fit.system.contact_names)
+    states = data.q, data.qd, data.tau
+    own = fit.predict(*states, "multiplier", active=active)
+    assert own.variance is not None
+    noise = fit.noise_variance(*states, "multiplier", active, sensor=False)
+    spread = (own.variance + noise)[:, 0].clamp(min=TINY)
+    sensor = fit.noise["multiplier"][0] ** 2
+    weight = spread / (spread + sensor)
+    mean = own.mean[:, 0] + weight * (sensed_force(data, fit.system) - own.mean[:, 0])
+    return mean, (weight * sensor).sqrt()

@@ -241,7 +241,14 @@ class StructuredFit(FittedModel):
 
     @torch.no_grad()
     def noise_variance(
-        self, q: Tensor, qd: Tensor, tau: Tensor, quantity: str = "qdd", active: Tensor | None = None
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str = "qdd",
+        active: Tensor | None = None,
+        *,
+        sensor: bool = True,
     ) -> Tensor:
         """Variance that a measurement of a quantity adds to its prediction, `(*batch, d)`.
 
@@ -250,11 +257,12 @@ class StructuredFit(FittedModel):
             quantity: what is measured; the noise of the torque reaches every quantity, that of the sensor is
                 known for quantities that the model was fitted to.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            sensor: whether the noise of the quantity's own sensor counts beside that of the torque.
         """
         at, batch = states_at(self.system, q, qd, tau, active)
         z, parts = affine_maps(self.system, at, quantity)
         z = coupled(self.system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
-        noise = self._noise_covariance(z, parts).diagonal(dim1=-2, dim2=-1)
+        noise = self._noise_covariance(z, parts if sensor else {}).diagonal(dim1=-2, dim2=-1)
         return noise.reshape(*batch, z.o.shape[-1])
 
 

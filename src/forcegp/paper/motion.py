@@ -18,7 +18,7 @@ SAMPLES, AHEAD, SECONDS = 8, 1.0, 5.0
 
 
 def write_motion(root: Path, task: Task, fits: Sequence[Fit]) -> str | None:
-    """Write the view of the first held-out stretch with the last structured model of the main size.
+    """Write the view of the first held-out stretch with the structured model that opens the page.
 
     Returns:
         The name of the file, or `None` where viser is not installed or no structured model was fitted.
@@ -27,7 +27,7 @@ def write_motion(root: Path, task: Task, fits: Sequence[Fit]) -> str | None:
     structured = [fit for fit in structured if fit.name.startswith("sgp") and not fit.name.endswith("-se")]
     if not structured or find_spec("viser") is None:
         return None
-    model = max(structured, key=lambda fit: fit.points).load()
+    model = max(structured, key=lambda fit: (fit.points, fit.name == "sgp-mean")).load()
     data = task.data[slice(*task.stretches()[0])]
     data = data[data.t <= data.t[0] + SECONDS]
     motion = with_rollout(of_log(task.system, data, model), sampled_rollout(model, data, SAMPLES, AHEAD))

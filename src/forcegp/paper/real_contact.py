@@ -19,7 +19,7 @@ from forcegp import kinematics
 from forcegp.checks import Report, check
 from forcegp.checks import read_log as read_checked
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
-from forcegp.data import Dataset, split_by_stretches, without_marked_impacts
+from forcegp.data import Dataset, complement, split_by_stretches, without_marked_impacts
 from forcegp.errors import DataError
 from forcegp.evaluation import evaluate
 from forcegp.files import write_json, write_text
@@ -28,7 +28,7 @@ from forcegp.logs.surface_fit import fit_surface
 from forcegp.models.base import Predictor
 from forcegp.models.load import load_model
 from forcegp.models.registry import create
-from forcegp.models.sensed import with_sensor
+from forcegp.models.sensed import force_from_sensor, sensor_noise_std, with_sensor
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.paper.foreign_log import mapping_of, write_foreign_log
 from forcegp.paper.stages import Advance, Stage, Stages
@@ -40,9 +40,9 @@ SCENES = ("ur5_wiping", "panda_sphere")
 SOURCES = ("distance", "wrench")
 """What contact is detected from; the first is what the models are fitted with."""
 MODEL = "sgp-real"
-VARIANTS = {"file": None, "torques": None, "sensor": 0.5}
-"""The robot file alone; fitted to accelerations; and to the wrist sensor's force with this noise too [N]."""
-POINTS = 200
+VARIANTS = ("file", "torques", "sensor")
+"""The robot file alone; fitted to accelerations; and to the wrist sensor's force too, which is then also a
+measurement at the states that are predicted."""
 MATCHED = 1e-6
 """Rounding of the exported positions [rad]."""
 
@@ -125,16 +125,16 @@ def surface_error(log: Dataset, system: ConstrainedSystem) -> dict[str, float]:
 
 
 def selected(log: Dataset, truth: Dataset, system: ConstrainedSystem) -> tuple[Dataset, Dataset]:
-    """Training points of the log, and the held-out stretches with the simulator's normal force.
+    """The log but for held-out stretches, and these with the simulator's normal force.
 
     Rows at impacts are left out, as by `forcegp select`: no smooth acceleration describes them.
     """
     log = without_marked_impacts(log)
-    split = split_by_stretches(log, POINTS)
+    split = split_by_stretches(log, 1)
     name, rows = system.contact_names[0], rows_of(log, truth)
     force = {name: truth.contact_extras["multiplier"][name][rows]}
     known = log.replace(contact_extras={**log.contact_extras, "multiplier": force})
-    return log[split.train], known[split.test]
+    return log[complement(split.test, len(log))], known[split.test]
 
 
 def fitted(stages: Stages, scene: str, variant: str, run: Stage, log: Stage) -> Stage:
@@ -148,7 +148,7 @@ def fitted(stages: Stages, scene: str, variant: str, run: Stage, log: Stage) -> 
         model.save(folder / "model")
         write_json(folder / "evaluation.json", evaluate(model, test, train=train).to_dict())
 
-    return stages.run(f"{scene}/{variant}", make, settings={"points": POINTS}, inputs=[run, log])
+    return stages.run(f"{scene}/{variant}", make, settings={}, inputs=[run, log])
 
 
 def _model(
@@ -158,17 +158,23 @@ def _model(
         return create("analytical", system)
     model = create(MODEL, system)
     assert isinstance(model, StructuredGP)
-    noise = VARIANTS[variant]
-    return model.fit(train if noise is None else with_sensor(train, system, noise), progress=progress)
+    if variant == "sensor":
+        return model.fit(with_sensor(train, system, sensor_noise_std(train, system)), progress=progress)
+    return model.fit(train, progress=progress)
 
 
 def force_of(stage: Stage, test: Dataset) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean and standard deviation of the normal force of a fitted model at states, `(n,)` each [N]."""
     model = load_model(stage / "model")
-    active = test.active(model.system.contact_names)
-    found = model.predict(test.q, test.qd, test.tau, "multiplier", active=active)
-    assert found.std is not None
-    return found.mean[:, 0], found.std[:, 0]
+    assert isinstance(model, StructuredGP)
+    fit, active = model.fitted, test.active(model.system.contact_names)
+    if "multiplier" in fit.noise:
+        return force_from_sensor(fit, test)
+    states = test.q, test.qd, test.tau
+    found = fit.predict(*states, "multiplier", active=active)
+    assert found.variance is not None
+    variance = found.variance + fit.noise_variance(*states, "multiplier", active)
+    return found.mean[:, 0], variance[:, 0].sqrt()
 
 
 def numbers_of(stage: Stage, name: str) -> dict[str, Any]:

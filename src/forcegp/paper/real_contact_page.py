@@ -14,7 +14,6 @@ from forcegp.files import write_json, write_text
 from forcegp.paper.multiplier import MultiplierBand, MultiplierData, draw_multiplier, spans
 from forcegp.paper.real_contact import (
     MODEL,
-    POINTS,
     SCENES,
     VARIANTS,
     fitted,
@@ -109,7 +108,6 @@ def run_real_contact(
         findings=findings(results),
         blocks=blocks,
         checks={scene: found["check"] for scene, found in results.items()},
-        points=POINTS,
         seconds=seconds,
     )
     write_text(root / PAGE, page)
@@ -120,7 +118,8 @@ def _force_score(stage: Stage) -> dict[str, Any]:
     """λ against the simulator's force, and the coverage of accelerations."""
     found = numbers_of(stage, "evaluation.json")
     coverage = (found["uncertainty"] or {}).get("coverage_noisy")
-    return found["multipliers"][0] | {"acceleration_rmse": found["noisy"]["rmse"], "qdd_coverage": coverage}
+    force = (found["sensed"] or found["multipliers"])[0]
+    return force | {"acceleration_rmse": found["noisy"]["rmse"], "qdd_coverage": coverage}
 
 
 def tables(results: dict[str, dict[str, Any]]) -> tuple[Table, Table]:

@@ -148,13 +148,15 @@ def uncertainty_tables(found: Evaluation) -> tuple[Table, ...]:
         rows = tuple((p.name, "–" if p.nlpd is None else f"{-p.nlpd:.3f}") for p in found.predictors)
         caption = "Mean log density of a measured joint acceleration [nats], higher is better"
         tables.append(Table(caption, ("predictor", "log density"), rows))
-    if found.multipliers:
+    head = ("contact", "samples", "bias [N]", "standard deviation [N]", "correlation", "±2σ coverage")
+    caption = "Multiplier λ: predicted less logged"
+    for scores, title in ((found.multipliers, caption), (found.sensed, f"{caption}, with the force sensor")):
         rows = tuple(
             (m.contact, str(m.samples), *map(_short, (m.bias, m.spread, m.correlation, m.coverage)))
-            for m in found.multipliers
+            for m in scores
         )
-        head = ("contact", "samples", "bias [N]", "standard deviation [N]", "correlation", "±2σ coverage")
-        tables.append(Table("Multiplier λ: predicted less logged", head, rows))
+        if rows:
+            tables.append(Table(title, head, rows))
     return tuple(tables)
 
 

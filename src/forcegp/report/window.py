@@ -144,7 +144,7 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
     relative, shown = centre.dim() > 1, colour(window.model)
     for i, axes in enumerate(rows):
         ink = GREY if relative else INK
-        axes.plot(window.t, measured[i], color=ink, linewidth=0.6, label="measured")
+        axes.plot(window.t, measured[i], color=ink, linewidth=0.7, label="measured")
         if window.std is not None:
             spread = 2.0 * as_tensor(window.std[i])
             band: dict[str, Any] = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ", "zorder": 3}
@@ -161,5 +161,7 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
     rows[-1].set_xlabel("time [s]")
     figure.align_ylabels()
     handles, names = rows[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=len(names))
+    legend = figure.legend(handles, names, loc="outside upper center", ncols=len(names))
+    for shown_line in legend.get_lines():
+        shown_line.set_linewidth(1.6)  # a hairline of the plot would look grey
     figure.supylabel(f"acceleration{' less prediction' if relative else ''} [rad/s²]", fontsize=9)
