@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -26,12 +28,16 @@ def model(inference: str = "sparse") -> forcegp.StructuredGP:
     )
 
 
-def test_an_update_is_a_refit() -> None:
-    reference, grown = model(), model()
+@pytest.mark.parametrize("inference", ["sparse", "exact"])
+def test_an_update_is_a_refit(inference: str, tmp_path: Path) -> None:
+    reference, grown = model(inference), model(inference)
     for one in (reference, grown):
         one.fit(data[:16], learn=[])
     reference.condition(data)  # keeps the input scales of the first samples, as an update does
-    grown.update(data[16:])
+    grown.update(data[16:20])
+    grown.update(data[20:])
+    grown.save(tmp_path / "grown")
+    grown = forcegp.load_model(tmp_path / "grown")
     q, qd, tau = draw(5, seed=3)
     for quantity in ("qdd", "multiplier"):
         a, b = (m.predict(q, qd, tau, quantity, active=mixed_contacts(5)) for m in (reference, grown))
@@ -53,8 +59,8 @@ def test_forgetting_returns_to_the_prior() -> None:
 def test_what_cannot_be_updated() -> None:
     exact = model("exact")
     exact.fit(data, learn=[])
-    with pytest.raises(ModelError, match="exact inference cannot be updated"):
-        exact.update(data[:2])
+    with pytest.raises(ModelError, match="exact inference cannot forget"):
+        exact.forget(0.5)
     sparse = model()
     sparse.fit(data, learn=[])
     with pytest.raises(ModelError, match="invalid forgetting factor"):

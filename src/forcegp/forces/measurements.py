@@ -262,6 +262,14 @@ class Training:
             ),
         )
 
+    def joined(self, measurements: Sequence[Measurement], noise_std: Sequence[Tensor]) -> Training:
+        """These and further measurements, with the noise of the latter."""
+        return dataclasses.replace(
+            self,
+            measurements=(*self.measurements, *measurements),
+            noise_std=(*self.noise_std, *noise_std),
+        )
+
     def moving(self, speed: float) -> Training:
         """The samples in which a joint moves faster than a speed [rad/s, m/s]."""
         fast = [(m.qd.abs().amax(-1) > speed).nonzero()[:, 0] for m in self.measurements]

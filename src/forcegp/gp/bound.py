@@ -19,10 +19,10 @@ from forcegp.gp.kernels import Parameters
 from forcegp.gp.likelihood import Valued, with_gradient
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block, Gradient, Process, components_of, rows_of
-from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
+from forcegp.gp.sums import CHUNK_SAMPLES, Moments, accumulate
 
 
-def bound_of(sums: Sums, posterior: SparsePosterior) -> Tensor:
+def bound_of(sums: Moments, posterior: SparsePosterior) -> Tensor:
     """The negative bound from the sums `()`."""
     fit = sums.yy - sums.v @ posterior.weights
     log_determinant = 2.0 * posterior.L.diagonal().abs().log().sum()

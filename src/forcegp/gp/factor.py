@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
+from forcegp.linalg import cholesky
 from forcegp.threads import threads_of_pytorch
 
 PANEL = 24
@@ -33,3 +34,25 @@ def extended(L: Tensor, rows: Tensor) -> Tensor:
     if info != 0:
         raise NumericalError("a Cholesky factor could not be updated", got=f"LAPACK tpqrt info {info}")
     return torch.from_numpy(R).mT
+
+
+def bordered(L: Tensor, cross: Tensor, corner: Tensor) -> tuple[Tensor, float]:
+    """Lower factor of [[L Lᵀ, C], [Cᵀ, K]], in O(r n²) for r new rows.
+
+    Args:
+        L: lower factor `(n, n)`.
+        cross: C `(n, r)`.
+        corner: K `(r, r)`, whose lower triangle is read.
+
+    Returns:
+        The factor `(n + r, n + r)`, and the jitter that the new rows needed.
+
+    Raises:
+        NumericalError: the matrix is not positive definite.
+    """
+    n, r = cross.shape
+    below = torch.linalg.solve_triangular(L, cross, upper=False).mT
+    own, jitter = cholesky(corner - below @ below.mT)
+    whole = L.new_zeros(n + r, n + r)
+    whole[:n, :n], whole[n:, :n], whole[n:, n:] = L, below, own
+    return whole, jitter

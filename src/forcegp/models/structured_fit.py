@@ -23,6 +23,7 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
 from forcegp.forces.samples import draw_samples
 from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
+from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
@@ -135,19 +136,26 @@ class StructuredFit(FittedModel):
         return draw_samples(self.posterior, samples, generator, FEATURES).total_force
 
     def updated(self, measurements: Training) -> StructuredFit:
-        """The fit with more samples, at a cost that does not depend on how many it has seen.
+        """The fit with more samples.
 
-        Raises:
-            ModelError: inference is exact.
+        The cost of a sparse fit does not depend on how many it has seen; that of an exact one grows with the
+        square of their number.
         """
         problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
-        latent, central = _sparse(self.posterior), self.posterior.central
-        if isinstance(central, SparsePosterior):
+        latent, central = self.posterior.latent, self.posterior.central
+        assert isinstance(latent, SparsePosterior | ExactPosterior)
+        if isinstance(central, SparsePosterior | ExactPosterior):
             known = problem.of_means().rows(self.hyperparameters).blocks
             central = central.updated(problem.silenced(known))
         posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows), central=central)
-        return dataclasses.replace(self, posterior=posterior)
+        if isinstance(latent, SparsePosterior):
+            return dataclasses.replace(self, posterior=posterior)
+        noise = [problem.noise_at(self.hyperparameters, i) for i in range(len(measurements.measurements))]
+        whole = dataclasses.replace(
+            self.problem, training=self.training.joined(measurements.measurements, noise)
+        )
+        return dataclasses.replace(self, problem=whole, posterior=posterior)
 
     def _problem_of(self, measurements: Training) -> Problem:
         """The problem with other measurements and the learned robot, whose mechanics are compiled."""
@@ -274,8 +282,8 @@ def _carried(z: AffineMap, variance: Tensor) -> Tensor:
 def _sparse(posterior: ForcePosterior) -> SparsePosterior:
     if not isinstance(posterior.latent, SparsePosterior):
         raise ModelError(
-            "a fit with exact inference cannot be updated",
-            hint='make the model with inference="sparse", or condition it on all data',
+            "a fit with exact inference cannot forget",
+            hint='make the model with inference="sparse", or condition it on the data that count',
         )
     return posterior.latent
 

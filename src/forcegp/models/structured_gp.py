@@ -278,17 +278,17 @@ class StructuredGP(Model[StructuredFit]):
         return self.adopt(conditioned(spec, problem, values, warnings=doubts))
 
     def update(self, data: Dataset | Sequence[Observation]) -> StructuredFit:
-        """Add samples to the most recent fit, as in a control loop; needs sparse inference.
+        """Add samples to the most recent fit, as in a control loop.
 
-        The cost does not depend on the number of samples seen before. Hyperparameters, input scales and
-        inducing points stay as they are.
+        With sparse inference the cost does not depend on the number of samples seen before; with exact
+        inference it grows with their square. Hyperparameters, input scales and inducing points stay as they
+        are.
 
         Args:
             data: further measurements of the same quantities.
 
         Raises:
-            ModelError: the model has not been fitted, its inference is exact, or the data measure something
-                else.
+            ModelError: the model has not been fitted, or the data measure something else.
         """
         fitted = self.fitted
         training, _ = self._training(data, learned=())
