@@ -321,7 +321,7 @@ def training_of(
             continue
         features = [prior.features(system, a) for a in at]
         together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
-        scales.append(Standardization.of(together, prior.vectors))
+        scales.append(Standardization.of(together, prior.vectors, prior.centred))
     period = _period(observations[0].data)
     return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales), period=period)
 

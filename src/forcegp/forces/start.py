@@ -39,6 +39,7 @@ WIDTH = {
     "log_lengthscale": (1.0, 4.0),
     "log_noise_std": (5.0, 5.0),
     "log_scale": (1.0, 1.0),
+    "log_offset": (1.0, 1.0),
 }
 """Standard deviations of the log-normal priors below and above the start, in e-folds; 3 where not named."""
 START_SAMPLES = 5000

@@ -108,41 +108,53 @@ class Linear(Kernel):
 
     Fewer hyperparameters to overfit: with `ard=False` all inputs have one σ, and there is no slope that
     learning takes for zero; with `shared=True` the σ_d are those of all outputs, each with its own s and σ_0.
+    With an `offset` σ_0 is that fraction of the root mean square σ_d: a learned ratio, which starts there and
+    is the same for all outputs. One output alone does not show which σ_0 its one constant was drawn from.
     """
 
     inputs: tuple[str, ...] | None = None
     ard: bool = True
     shared: bool = False
+    offset: float | None = None
 
     is_finite = True
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = width_of(self.inputs, widths)
         # Standardized inputs have unit variance: every column and the bias get the same share.
-        share = torch.zeros(outputs, dtype=torch.float64) + log_std - 0.5 * math.log(width + 1.0)
+        bias = 1.0 if self.offset is None else self.offset**2
+        share = torch.zeros(outputs, dtype=torch.float64) + log_std - 0.5 * math.log(width + bias)
         columns = width if self.ard else 1
         if self.shared:
             slopes = {"log_slope_std": share.new_zeros(1, columns), "log_std": share}
         else:
             slopes = {"log_slope_std": share[:, None].repeat(1, columns)}
-        return slopes | {"log_bias_std": share}
+        if self.offset is None:
+            return slopes | {"log_bias_std": share}
+        return slopes | {"log_offset": share.new_tensor([math.log(self.offset)])}
 
     def _slope_std(self, params: Parameters) -> Tensor:
         """s σ_d `(k, w)`, or `(k, 1)` where all inputs have one."""
         log = params["log_slope_std"]
         return torch.exp(log + params["log_std"][:, None] if self.shared else log)
 
+    def _bias_std(self, params: Parameters) -> Tensor:
+        """σ_0 `(k,)`."""
+        if self.offset is None:
+            return torch.exp(params["log_bias_std"])
+        return torch.exp(params["log_offset"]) * self._slope_std(params).square().mean(-1).sqrt()
+
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         slope = self._slope_std(params)[:, None, :]
         product = (stacked(x1, self.inputs) * slope) @ (stacked(x2, self.inputs) * slope).mT
-        return product + torch.exp(2.0 * params["log_bias_std"])[:, None, None]
+        return product + self._bias_std(params).square()[:, None, None]
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         scaled = stacked(x, self.inputs) * self._slope_std(params)[:, None, :]
-        return (scaled * scaled).sum(-1) + torch.exp(2.0 * params["log_bias_std"])[:, None]
+        return (scaled * scaled).sum(-1) + self._bias_std(params).square()[:, None]
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return LinearDraw(self.inputs, self._slope_std(params), params["log_bias_std"].exp())
+        return LinearDraw(self.inputs, self._slope_std(params), self._bias_std(params))
 
 
 @dataclass(frozen=True)

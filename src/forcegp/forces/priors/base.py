@@ -92,6 +92,8 @@ class ForcePrior(ABC):
     """Whether Coulomb friction that is proportional to the multiplier goes with the prior."""
     vectors: tuple[str, ...] = ()
     """Inputs whose components are standardized by one scale, as turning the axes must change nothing."""
+    centred: bool = True
+    """Whether the mean of the training data is subtracted from the inputs before they are scaled."""
 
     @property
     def prefix(self) -> str:
