@@ -26,7 +26,6 @@ from forcegp.checks.finding import SEVERITIES, Finding, Report
 from forcegp.checks.kinds import KINDS
 from forcegp.checks.log import Log, log_of, of_robot
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.footprint import announce_states
 from forcegp.data.dataset import Dataset
 
 Check = Callable[[ConstrainedSystem, Log], Outcome]
@@ -106,7 +105,7 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
     system = replace(system, robot=system.robot.to("cpu", torch.float64))
     log = of_robot(data if isinstance(data, Log) else log_of(data), system.robot)
     samples, findings, skipped = len(log), [], {}
-    announce_states(system, samples, 2.0, f"checking {samples:,} rows")
+    system.announce_states(samples, 2.0, f"checking {samples:,} rows")
     for done, (name, run) in enumerate(CHECKS):
         if progress is not None:
             progress(done, len(CHECKS))
