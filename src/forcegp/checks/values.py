@@ -169,7 +169,8 @@ def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: s
     for j in range(own.shape[1]):
         others = [np.delete(part, j, axis=1) if key == name else part for key, part in size.items()]
         most = np.concatenate([*others, np.zeros((len(own), 1))], axis=1).max(axis=1)
-        confirmed[:, j] = most > SPIKE_SHARED * size[name][:, j]
+        # No shock exceeds the range of the whole motion.
+        confirmed[:, j] = (most > SPIKE_SHARED * size[name][:, j]) & (size[name][:, j] < 1.0)
     return confirmed
 
 
