@@ -2,10 +2,10 @@
 
     python benchmarks/payload.py --json result.json
 
-A KUKA arm, free and on a plane, is simulated twice along the same plan, without and with the payload; the log
-goes from one to the other after six seconds. The model knows the first six. Then it takes 10 samples at a time
-(42 ms), in three ways: not at all, with a memory that fades with time, and with `follow`, which forgets
-on evidence. Errors are those of accelerations without noise, of the 10 samples that come next.
+A KUKA arm, free and on a plane, is simulated twice along the same plan, without and with the payload; the
+log goes from one to the other after six seconds. The model knows the first six. Then it takes 10 samples at
+a time (42 ms), in three ways: not at all, with a memory that fades with time, and with `follow`, which
+forgets on evidence. Errors are those of accelerations without noise, of the 10 samples that come next.
 """
 
 from __future__ import annotations
