@@ -63,6 +63,20 @@ def torque_error(fit, test: forcegp.Dataset) -> Tensor:
     return (M @ (predicted - test.qdd)[..., None])[..., 0]
 
 
+def test_a_joint_that_moved_one_way_has_friction_the_other_way_too(file: forcegp.RobotModel) -> None:
+    """Its friction is not taken for an offset of the torque sensor."""
+    data = log(file, 800, 0)
+    train, test = data[data.qd[:, 0] > 0.05], data[data.qd[:, 0] < -0.05]
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(train)
+    error = torque_error(fit, test)[:, 0]
+    assert float(error.mean().abs()) < 0.25 * COULOMB, "an offset would leave twice the Coulomb friction"
+    force = fit.predict(test.q, test.qd, test.tau, "total_force")
+    file_alone = forcegp.AnalyticalModel(forcegp.ConstrainedSystem(file))
+    found = force.mean[:, 0] - file_alone.predict(test.q, test.qd, test.tau, "total_force").mean[:, 0]
+    true = -(VISCOUS * test.qd[:, 0] + COULOMB * torch.tanh(test.qd[:, 0] / 0.02))
+    assert float(((found - true).abs() <= 2.0 * force.std[:, 0]).double().mean()) > 0.9
+
+
 def test_defaults_of_a_measured_log_learn_friction_and_noise(file: forcegp.RobotModel) -> None:
     train, test = log(file, 800, 0), log(file, 400, 7)
     model = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical")

@@ -104,3 +104,10 @@ def test_a_column_that_hardly_varies_is_not_magnified() -> None:
     torch.testing.assert_close(alone.std["x"][:2], spread[:2])
     assert float(alone.std["x"][2]) == pytest.approx(FLOOR * whole)
     assert vector.std["x"].tolist() == pytest.approx([whole] * 3)
+
+
+def test_features_whose_zero_means_something_are_scaled_and_not_shifted() -> None:
+    x = 3.0 + torch.randn(500, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    scales = Standardization.of({"x": x}, centred=False)
+    assert float(scales.apply({"x": torch.zeros_like(x)})["x"].abs().max()) == 0.0
+    assert scales.apply({"x": x})["x"].square().mean(0).tolist() == pytest.approx([1.0, 1.0])

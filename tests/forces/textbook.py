@@ -13,8 +13,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.quantities import affine_map, states
-from forcegp.gp.kernels import Kernel, Linear, Product, Sum, sub
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Kernel, Linear, Product, SquaredExponential, Sum, sub
 from forcegp.models.structured_gp import StructuredGP
 
 
@@ -27,17 +26,26 @@ def covariance(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict) ->
     a, b = (torch.cat([x[name] for name in kernel.inputs or tuple(x)], dim=-1) for x in (x1, x2))
     if a.ndim == 3:  # Each component has inputs of its own.
         one = [
-            covariance(kernel, {n: v[k : k + 1] for n, v in params.items()}, {"x": a[:, k]}, {"x": b[:, k]})
+            covariance(kernel, _of_component(params, k), {"x": a[:, k]}, {"x": b[:, k]})
             for k in range(a.shape[1])
         ]
         return torch.cat(one)
     if isinstance(kernel, Linear):
-        slopes, bias = params["log_slope_std"].exp() ** 2, params["log_bias_std"].exp() ** 2
+        slopes = params["log_slope_std"].exp() ** 2
         if kernel.shared:
             slopes = params["log_std"].exp()[:, None] ** 2 * slopes
+        if kernel.offset is None:
+            bias = params["log_bias_std"].exp() ** 2
+        else:
+            bias = params["log_offset"].exp() ** 2 * slopes.mean(-1)
         return torch.einsum("kd,nd,md->knm", slopes.expand(-1, a.shape[-1]), a, b) + bias[:, None, None]
     assert isinstance(kernel, SquaredExponential)
     return squared_exponential(params, a, b)
+
+
+def _of_component(params: dict[str, Tensor], k: int) -> dict[str, Tensor]:
+    """The hyperparameters of one component, and those that all of them share."""
+    return {name: v if name.endswith("log_offset") else v[k : k + 1] for name, v in params.items()}
 
 
 def squared_exponential(params: dict[str, Tensor], x1: Tensor, x2: Tensor) -> Tensor:

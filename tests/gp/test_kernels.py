@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.kernels import Kernel, Linear
-from forcegp.gp.stationary import Matern32, Matern52, SquaredExponential
+from forcegp.gp.kernels import Kernel, Linear, Matern32, Matern52, SquaredExponential
 
 WIDTHS = {"q": 3, "qd": 2}
 OUTPUTS = 2
@@ -28,6 +27,8 @@ KERNELS: dict[str, Kernel] = {
     "linear": LIN,
     "linear with one slope": Linear(ard=False),
     "linear with shared slopes": Linear(shared=True),
+    "linear with an offset": Linear(ard=False, offset=0.3),
+    "shared slopes with an offset": Linear(shared=True, offset=0.3),
     "damping": Linear(("qd",), ard=False) * SquaredExponential(("q",)),
     "quadratic": Linear(("qd",), shared=True) * Linear(("qd",), shared=True) * SquaredExponential(("q",)),
     "of one input": SquaredExponential(("qd",)),
@@ -70,7 +71,10 @@ def by_hand(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict, k: in
         given = params["log_slope_std"][0 if kernel.shared else k]
         size = math.exp(float(params["log_std"][k])) ** 2 if kernel.shared else 1.0
         slopes = [size * math.exp(float(v)) ** 2 for v in given.expand(len(a))]
-        bias = math.exp(float(params["log_bias_std"][k])) ** 2
+        if kernel.offset is None:
+            bias = math.exp(float(params["log_bias_std"][k])) ** 2
+        else:
+            bias = math.exp(float(params["log_offset"])) ** 2 * sum(slopes) / len(slopes)
         return bias + sum(s * p * q for s, p, q in zip(slopes, a, b, strict=True))
     lengths = [math.exp(float(v)) for v in params["log_lengthscale"][0 if kernel.shared else k]]
     r = math.sqrt(sum(((p - q) / s) ** 2 for p, q, s in zip(a, b, lengths, strict=True)))

@@ -43,6 +43,7 @@ class Standardization:
     A column that hardly varies says nothing of the scale on which a function varies along it. So no scale is
     below `FLOOR` times the root mean square of the standard deviations of all columns of its input, and the
     columns of a vector share that mean: neither turning its axes nor a step off a plane changes much.
+    Features whose zero means something, such as the friction of a joint that rests, are scaled but not shifted.
 
     Columns that are constant to rounding keep the scale 1, or that of their vector, and are listed in
     `constant`.
@@ -53,17 +54,20 @@ class Standardization:
     constant: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, features: Mapping[str, Tensor], vectors: Collection[str] = ()) -> Standardization:
-        """Mean and standard deviation of each column.
+    def of(
+        cls, features: Mapping[str, Tensor], vectors: Collection[str] = (), centred: bool = True
+    ) -> Standardization:
+        """Mean and standard deviation of each column, or zero and its root mean square.
 
         Args:
             features: named inputs `(n, w)`.
             vectors: inputs whose columns are components of one vector.
+            centred: whether the mean is subtracted.
         """
-        mean = {name: x.mean(0) for name, x in features.items()}
+        mean = {name: x.mean(0) if centred else torch.zeros_like(x[0]) for name, x in features.items()}
         std, constant = {}, []
         for name, x in features.items():
-            spread = x.std(0, correction=0)
+            spread = (x - mean[name]).square().mean(0).sqrt()
             fixed = spread <= 1e-12 * (1.0 + mean[name].abs())
             constant += [f"{name}[{i}]" for i in fixed.nonzero()[:, 0].tolist()]
             whole = spread.square().mean().sqrt()

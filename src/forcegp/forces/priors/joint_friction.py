@@ -25,18 +25,23 @@ from forcegp.robot.model import RobotModel
 SPEEDS = (0.02, 0.1, 0.5)
 """Velocities at which the Coulomb features saturate [rad/s, m/s]: a sharp step, and two slower
 transitions."""
+OFFSET = 0.3
+"""Standard deviation of a torque sensor's offset, as a fraction of that of a friction weight, at the start."""
 
 
 @dataclass(frozen=True)
 class JointFrictionPrior(ForcePrior):
     """Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)).
 
-    The weights w_i and the offset c_i are Gaussian and marginalised; their standard deviations are learned. A
-    kernel with a smooth part, such as `Linear() + SquaredExponential(("velocity",))`, adds a smooth
-    remainder.
+    The weights w_i and the offset c_i are Gaussian and marginalised. One standard deviation per joint is
+    learned for all weights, and for the offsets one fraction of it: a joint that moved in one direction only
+    does not tell its offset from its friction, and what separates them is that friction is the rule. With a
+    standard deviation for each weight, learning takes most of them for zero, and the joint is overconfident
+    where it does something new. A kernel with a smooth part, such as
+    `Linear(ard=False, offset=0.3) + SquaredExponential(("velocity",))`, adds a smooth remainder.
 
     Args:
-        kernel: covariance of each component; linear in the features by default.
+        kernel: covariance of each component; linear in the features by default, which are scaled, not shifted.
         speeds: v_1, v_2, … [rad/s, m/s].
         load: whether friction proportional to the load |Q_G,i| is a feature.
         name: prefix of the hyperparameters.
@@ -52,11 +57,13 @@ class JointFrictionPrior(ForcePrior):
         ModelError: a speed is not positive and finite.
     """
 
-    kernel: Kernel = field(default_factory=Linear)
+    kernel: Kernel = field(default_factory=lambda: Linear(ard=False, offset=OFFSET))
     speeds: tuple[float, ...] = SPEEDS
     load: bool = True
     name: str = "joint_friction"
     target: str = JOINT
+
+    centred = False
 
     def __post_init__(self) -> None:
         if not self.speeds or not all(0.0 < v < float("inf") for v in self.speeds):
