@@ -27,10 +27,11 @@ from torch import Tensor
 
 import forcegp
 from forcegp.data import split_by_stretches
+from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.priors.default import PAPER, default_priors
 from forcegp.forces.quantities import states
+from forcegp.forces.start import initial
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.models.structured_problem import kernel_parameters
 from forcegp.simulate import simulate
 
 REPEATS = 3
@@ -58,7 +59,7 @@ def start_of(data: forcegp.Dataset) -> tuple[forcegp.StructuredGP, object, dict[
     # The dense formula is the paper's, kernel included.
     model.force_priors = default_priors(model.system, "zero", PAPER)
     problem = model._problem(model._training(data, ("joint",)))
-    return model, problem, problem.initial(learn_noise=False)
+    return model, problem, initial(problem, learn_noise=False)
 
 
 def projected(data: forcegp.Dataset) -> Callable[[], float]:
@@ -68,7 +69,7 @@ def projected(data: forcegp.Dataset) -> Callable[[], float]:
 
     def evaluate() -> float:
         leaves = {key: value.clone().requires_grad_() for key, value in kernel_parameters(start).items()}
-        value, _ = negative_log_likelihood(model.force_priors, leaves, blocks)
+        value = negative_log_likelihood(model.force_priors, leaves, blocks)
         torch.autograd.grad(value, list(leaves.values()))
         return float(value.detach()) + constant
 

@@ -139,7 +139,7 @@ def exact(samples: int) -> dict:
     conditioned = time.perf_counter() - began
     leaves = {key: value.clone().requires_grad_() for key, value in params.items()}
     began = time.perf_counter()
-    value, _ = negative_log_likelihood([Prior()], leaves, blocks)
+    value = negative_log_likelihood([Prior()], leaves, blocks)
     torch.autograd.grad(value, list(leaves.values()))
     return {
         "samples": samples,

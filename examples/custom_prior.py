@@ -13,7 +13,7 @@ import torch
 
 import forcegp
 from forcegp import dynamics, kinematics
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import SquaredExponential
 
 figure = next((x for x in sys.argv[1:] if x.endswith(".png")), "custom_prior.png")
 torch.manual_seed(0)

@@ -32,7 +32,7 @@ LAYERS = (
     ),
     ("plots",),
     ("robot",),
-    ("kinematics", "friction", "dynamics"),
+    ("kinematics", "dynamics"),
     ("compiled", "derivatives", "identification"),
     ("constraints",),
     ("data",),

@@ -6,29 +6,27 @@ import torch
 
 import forcegp
 from forcegp import dynamics
-from forcegp.friction import JointFriction
 
 
-def _friction(**figures: float) -> JointFriction:
-    defaults = {"viscous": 0.0, "coulomb": 0.0, "stribeck": 0.0, "stribeck_velocity": 0.5}
-    values = defaults | {"smoothing_velocity": 0.01} | figures
-    return JointFriction(
-        **{name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
-    )
+def _force(speed: torch.Tensor, **parameters: float) -> torch.Tensor:
+    """Friction of a joint at speeds `(n,)`."""
+    robot = forcegp.load_robot("double_pendulum")
+    values = {"stribeck_velocity": 0.5, "friction_velocity": 0.01} | parameters
+    robot = robot.replace(**{name: torch.full_like(robot.mass, value) for name, value in values.items()})
+    return dynamics.damping_force(robot, speed[:, None].expand(-1, robot.nq))[:, 0]
 
 
 def test_limits_of_the_law() -> None:
-    speed = torch.tensor([[5.0], [0.1], [-5.0], [0.0]], dtype=torch.float64)
-    force = _friction(viscous=0.3, coulomb=2.0, stribeck=1.5).force(speed)
+    speed = torch.tensor([5.0, 0.1, -5.0, 0.0], dtype=torch.float64)
+    force = _force(speed, damping=0.3, friction=2.0, stribeck=1.5)
     peak = 2.0 + 1.5 * torch.exp(torch.tensor(-0.04, dtype=torch.float64)).item()
-    expected = torch.tensor([[-3.5], [-0.03 - peak], [3.5], [0.0]], dtype=torch.float64)
+    expected = torch.tensor([-3.5, -0.03 - peak, 3.5, 0.0], dtype=torch.float64)
     torch.testing.assert_close(force, expected, rtol=1e-8, atol=1e-12)
 
 
 def test_it_only_ever_dissipates_and_has_finite_slope_at_rest() -> None:
-    friction = _friction(viscous=0.3, coulomb=2.0, stribeck=1.5)
-    speed = torch.linspace(-3, 3, 1001, dtype=torch.float64)[:, None].requires_grad_()
-    force = friction.force(speed)
+    speed = torch.linspace(-3, 3, 1001, dtype=torch.float64).requires_grad_()
+    force = _force(speed, damping=0.3, friction=2.0, stribeck=1.5)
     assert bool((force * speed <= 0).all())
     (slope,) = torch.autograd.grad(force.sum(), speed)
     assert bool(torch.isfinite(slope).all())

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     )
     from forcegp.data import Dataset, SavitzkyGolay, StreamedDataset
     from forcegp.evaluation import Evaluation, evaluate
-    from forcegp.forces.mean import AnalyticalMean
     from forcegp.forces.measurements import Observation
+    from forcegp.forces.priors.base import AnalyticalMean
     from forcegp.forces.priors.contact import ContactForcePrior
     from forcegp.forces.priors.inertial import InertialPrior
     from forcegp.forces.priors.joint import JointForcePrior
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from forcegp.scene import Scene, load_scene
 
 _HOME = {
-    "AnalyticalMean": "forces.mean",
+    "AnalyticalMean": "forces.priors.base",
     "AnalyticalModel": "models.analytical",
     "AnalyticalParameters": "robot",
     "Baumgarte": "constraints",

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from forcegp import batchlast
 from forcegp.batchlast import apply, batch_first, batch_last, cross, dot, sum_over
-from forcegp.friction import JointFriction
 from forcegp.kinematics import LinkMotion, LinkPoses, common_states, link_motion, link_poses
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointMatrix, JointVector
@@ -64,15 +63,10 @@ def mass_matrix_of_poses(robot: RobotModel, poses: LinkPoses, links: LinkInertia
 
 
 def _gravity_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
-    """`gravity_force_of_poses` with the batch last, `(nq, B)`."""
+    """Q_G = sᵀ Eᵀ [m c × g; m g] with the batch last, `(nq, B)`."""
     Et, g = robot.ancestors.mT, robot.gravity[:, None, None]
     torque = cross(sum_over(Et, links.moment), g)
     return dot(poses.angular, torque) + dot(poses.linear, (Et @ links.mass) * g)
-
-
-def gravity_force_of_poses(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> JointVector:
-    """Q_G = sᵀ Eᵀ [m c × g; m g]."""
-    return batch_first(_gravity_force(robot, poses, links), poses.batch)
 
 
 def momentum(links: LinkInertia, w: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -96,12 +90,20 @@ def _joint_force(robot: RobotModel, poses: LinkPoses, torque: Tensor, force: Ten
     return dot(poses.angular, sum_over(Et, torque)) + dot(poses.linear, sum_over(Et, force))
 
 
-def bias_force_of_motion(
-    robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion
-) -> JointVector:
-    """Q_C from link motion already known."""
+def _bias_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion) -> Tensor:
+    """Q_C with the batch last, `(nq, B)`."""
     torque, force = link_force(links, motion, motion.alpha, motion.acceleration)
-    return batch_first(-_joint_force(robot, poses, torque, force), poses.batch)
+    return -_joint_force(robot, poses, torque, force)
+
+
+def known_terms(
+    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: JointVector
+) -> tuple[JointMatrix, JointVector, JointVector, JointVector]:
+    """M, Q_C, Q_G and Q_D, all that the robot file knows, from links whose motion is known."""
+    links, Q_D = link_inertia(robot, poses), damping_force(robot, qd)
+    M, Q_C = _mass_matrix(robot, poses, links), _bias_force(robot, poses, links, motion)
+    Q_G = _gravity_force(robot, poses, links)
+    return *(batch_first(x, poses.batch) for x in (M, Q_C, Q_G)), Q_D  # pyright: ignore[reportReturnType]
 
 
 def equation_of_motion(
@@ -152,7 +154,7 @@ def gravity_force(robot: RobotModel, q: JointVector) -> JointVector:
         ShapeError: q does not fit the robot.
     """
     poses = link_poses(robot, q)
-    return gravity_force_of_poses(robot, poses, link_inertia(robot, poses))
+    return batch_first(_gravity_force(robot, poses, link_inertia(robot, poses)), poses.batch)
 
 
 def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVector:
@@ -170,11 +172,16 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
     """
     q, qd = common_states(robot, q=q, qd=qd)
     poses = link_poses(robot, q)
-    return bias_force_of_motion(robot, poses, link_inertia(robot, poses), link_motion(robot, poses, qd))
+    force = _bias_force(robot, poses, link_inertia(robot, poses), link_motion(robot, poses, qd))
+    return batch_first(force, poses.batch)
 
 
 def damping_force(robot: RobotModel, qd: JointVector) -> JointVector:
-    """Joint friction Q_D(q̇) of the robot: viscous, Coulomb and Stribeck, `(*batch, nq)` [N m, N].
+    """Joint friction of the robot: viscous, Coulomb (smoothed at zero speed) and the Stribeck effect.
+
+    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]; see Armstrong-Hélouvry,
+    Dupont, Canudas de Wit, *A survey of models, analysis tools and compensation methods for the control of
+    machines with friction* (Automatica 30, 1994). It is smooth, so it can be integrated and differentiated.
 
     Example:
         >>> import torch, forcegp
@@ -187,7 +194,8 @@ def damping_force(robot: RobotModel, qd: JointVector) -> JointVector:
         ShapeError: qd does not fit the robot.
     """
     robot.check_state(qd=qd)
-    return JointFriction.of(robot).force(qd)
+    dry = robot.friction + robot.stribeck * torch.exp(-((qd / robot.stribeck_velocity) ** 2))
+    return -robot.damping * qd - dry * torch.tanh(qd / robot.friction_velocity)
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:

@@ -7,6 +7,7 @@ V_i = Σ_j E_ij s_j q̇_j, so only the poses need a recursion, over the depth of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -100,7 +101,7 @@ def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
 
     With K = [a]× and the placement P: R = P a aᵀ + sin(q) P K + cos(q) (P − P a aᵀ).
     """
-    P, a = robot.placement_rotation, robot.axis[:, None, :]
+    q, P, a = batch_last(q, 1), robot.placement_rotation, robot.axis[:, None, :]
     slide = (P * a).sum(-1)
     along = slide[..., None] * a
     # The fourth column holds the placement and takes no part in the turn.
@@ -117,15 +118,16 @@ def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
     return torch.addcmul(turned, slides, q * (1.0 - turns))
 
 
-def _chain(robot: RobotModel, local: Tensor) -> Tensor:
+def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -> Tensor:
     """R_parent [R p]_local of every link, `(3, 4, nq, B)`, level by level of the tree."""
+    local = _local_poses(robot, q)
     turned, parents = robot.base_rotation[..., None, None], [BASE]
     blocks, order = [], []
-    for level in robot.levels:
+    for level in levels:
         slots = [parents.index(robot.parents[i]) for i in level]
         turned = batchlast.product(take(turned[:, :3], slots), take(local, level))
         blocks.append(turned)
-        order += level
+        order += [*level]
         parents = list(level)
     joined = torch.cat(blocks, dim=2)
     return take(joined, [order.index(i) for i in range(robot.nq)])
@@ -142,8 +144,9 @@ def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
         ShapeError: q does not fit the robot.
     """
     robot.check_state(q=q)
-    T = _chain(robot, _local_poses(robot, batch_last(q, 1)))
-    R, p = T[:, :3], sum_over(robot.ancestors, T[:, 3])
+    levels, E = robot.levels, robot.ancestors
+    T = _chain(robot, levels, q)
+    R, p = T[:, :3], sum_over(E, T[:, 3])
     z = batchlast.apply(R, robot.axis.T[..., None])
     if "prismatic" not in robot.joint_types:
         return LinkPoses(q.shape[:-1], R, p, z, batchlast.cross(p, z))

@@ -17,7 +17,7 @@ from forcegp import memory
 from forcegp.cli import app
 from forcegp.data import Dataset
 from forcegp.errors import DataError, DestinationError, ForceGPError, MemoryLimitError
-from forcegp.gp import capacity
+from forcegp.gp import likelihood
 from forcegp.memory import MemoryNeedWarning
 
 PLENTY = 1 << 60
@@ -169,7 +169,7 @@ def test_work_that_takes_most_of_the_memory_is_announced(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "LARGE", 0.0)
-    for module in (memory, capacity):
+    for module in (memory, likelihood):
         monkeypatch.setattr(module, "free_memory", lambda: PLENTY)
     sentences = " ".join(said(command, made, tmp_path))
     for sentence in WORK[command].split("|"):
@@ -180,7 +180,7 @@ def test_work_that_takes_most_of_the_memory_is_announced(
 def test_work_that_cannot_fit_is_refused(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (memory, capacity):
+    for module in (memory, likelihood):
         monkeypatch.setattr(module, "free_memory", lambda: 1)
     if command != "select":
         monkeypatch.setattr("forcegp.data.table.announce_memory", lambda *_, **__: None)
@@ -201,7 +201,7 @@ def test_the_bound_on_the_equations_of_motion_is_one() -> None:
     script = """
 import re, torch, forcegp
 from pathlib import Path
-from forcegp.constraints.footprint import CERTAIN, state_bytes
+from forcegp.constraints.system import CERTAIN
 system = forcegp.load_scene("kuka_plane").system()
 def peak(): return 1024 * int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 def work(n):
@@ -211,7 +211,7 @@ def work(n):
 work(10)
 before = peak()
 work(20_000)
-print((peak() - before) / 20_000 / state_bytes(system), CERTAIN)
+print((peak() - before) / 20_000 / system.state_bytes, CERTAIN)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     share, certain = map(float, done.stdout.split())

@@ -14,8 +14,7 @@ from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.default import REMAINING
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
-from forcegp.gp.kernels import Linear
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Linear, SquaredExponential
 
 CONTACTS = ("table", "ball")
 NOISE = 0.1

@@ -69,7 +69,7 @@ def gradients(model: forcegp.StructuredGP, start: dict) -> tuple[dict, dict]:
         else:
             rows = model.fitted.problem.rows(leaves)
             kernel = {k: v for k, v in leaves.items() if not k.startswith(("noise.", "analytical."))}
-            value = negative_log_likelihood(model.force_priors, kernel, rows.blocks)[0] + rows.constant
+            value = negative_log_likelihood(model.force_priors, kernel, rows.blocks) + rows.constant
         found = torch.autograd.grad(value, list(leaves.values()), allow_unused=True)
         results.append(dict(zip(leaves, found, strict=True)))
     return results[0], results[1]

@@ -8,9 +8,8 @@ import torch
 
 import forcegp
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, tangent_frame
 from forcegp.forces.priors.sliding_friction import TERMS, SlidingFrictionPrior
-from forcegp.forces.priors.surface_force import tangent_frame
 from forcegp.forces.quantities import States, states
 from random_data import random_data, table_system
 

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.quantities import affine_map, states
-from forcegp.gp.kernels import Kernel, Linear, Product, Sum, sub
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Kernel, Linear, Product, SquaredExponential, Sum, sub
 from forcegp.models.structured_gp import StructuredGP
 
 

@@ -9,8 +9,8 @@ import torch.distributed as dist
 from safetensors.torch import save_file
 
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.blocks import rows_of
 from forcegp.gp.distributed import accumulate_shards, gather_candidates, shard, share_basis
+from forcegp.gp.structured_covariance import rows_of
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
 
 SAMPLES, POINTS = 61, 12

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.gp.kernels import Kernel, Linear, sub
-from forcegp.gp.stationary import Matern32, SquaredExponential
+from forcegp.gp.kernels import Kernel, Linear, Matern32, SquaredExponential, sub
 from forcegp.gp.structured_covariance import Block
 
 WIDTHS = {"q": 2, "qd": 2}

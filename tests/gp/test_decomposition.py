@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.decomposition import split
-from forcegp.gp.kernels import Kernel, Linear
-from forcegp.gp.stationary import Matern52, SquaredExponential
+from forcegp.gp.kernels import Kernel, Linear, Matern52, SquaredExponential
 from gp.sparse_cases import WIDTHS
 
 SE, M52, LIN = SquaredExponential(("q",)), Matern52(("qd",)), Linear(("qd",))

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.inducing import candidates, select_inducing
-from forcegp.gp.kernels import Linear, sub
-from forcegp.gp.stationary import Matern32, SquaredExponential
+from forcegp.gp.kernels import Linear, Matern32, SquaredExponential, sub
 from forcegp.gp.structured_covariance import Block
 from forcegp.gp.sums import accumulate
 from gp.sparse_cases import COMPONENTS, PROCESSES, Named, parameters, rows

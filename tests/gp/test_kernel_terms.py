@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from forcegp.gp.kernel_terms import kernel_terms
-from forcegp.gp.kernels import Constant, Kernel, Linear
-from forcegp.gp.stationary import Matern32, SquaredExponential
+from forcegp.gp.kernels import Constant, Kernel, Linear, Matern32, SquaredExponential
 
 SAME = 1e-12
 """Of sums of some hundred terms in float64."""

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.kernels import Kernel, Linear
-from forcegp.gp.stationary import Matern32, Matern52, SquaredExponential
+from forcegp.gp.kernels import Kernel, Linear, Matern32, Matern52, SquaredExponential
 
 WIDTHS = {"q": 3, "qd": 2}
 OUTPUTS = 2

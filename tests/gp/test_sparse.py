@@ -9,12 +9,11 @@ from torch import Tensor
 
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.blocks import rows_of
 from forcegp.gp.bound import bound_of
 from forcegp.gp.kernels import sub
 from forcegp.gp.likelihood import condition
 from forcegp.gp.sparse import SparsePosterior, condition_sparse
-from forcegp.gp.structured_covariance import Block, cross_gram
+from forcegp.gp.structured_covariance import Block, cross_gram, rows_of
 from forcegp.gp.sums import accumulate
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows, textbook
 

@@ -9,12 +9,11 @@ import pytest
 
 from forcegp import LearningOptions
 from forcegp.errors import SceneError, UnknownNameError
-from forcegp.forces.mean import AnalyticalMean
+from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
-from forcegp.gp.kernels import Linear, Sum
-from forcegp.gp.stationary import Matern52, SquaredExponential
+from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.configured import KEYS, Configured, configured
 from forcegp.models.independent_gp import IndependentGP

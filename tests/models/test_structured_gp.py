@@ -25,9 +25,8 @@ from forcegp.forces.priors.operator import OperatorForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.quantities import QUANTITIES
 from forcegp.forces.start import negative_log_prior
-from forcegp.gp.kernels import Linear
+from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
 from forcegp.gp.optimise import LearningOptions
-from forcegp.gp.stationary import Matern52, SquaredExponential
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.storage.checkpoint import Checkpoint
 from forces.cases import all_priors, conditioned, draw, logged, mixed_contacts, two_contacts

@@ -25,6 +25,8 @@ TOUCH = 2e-4
 """Distance within which a tip touches, at least: surfaces and arms are no stiffer [m]."""
 ROUGH = 8.0
 """Robust standard deviations of the distance in contact within which a tip touches."""
+DRIFT = 2e-3
+"""Distance that a tip may gain and lose while it touches: soft ground, a bent arm, a drift [m]."""
 RUN_SECONDS = 0.02
 """Shortest run of rows that a wrong label is reported for [s]."""
 MISSED_SECONDS = 0.1
@@ -160,6 +162,8 @@ def _labels(
             if b - a >= least:
                 kind = "contact-early" if a == 0 and b < stop - start else "contact-late"
                 inside = (a > 0 and b < stop - start) or (a == 0 and b == stop - start)
+                if inside and float(np.abs(c[start + a : start + b]).max()) <= max(DRIFT, touch):
+                    continue
                 runs["contact-far" if inside else kind].append((start + a, start + b))
     texts = {
         "contact-early": "labelled closed before the tip touches",

@@ -10,12 +10,12 @@ from itertools import combinations
 import numpy as np
 import torch
 
-from forcegp import dynamics
+from forcegp import dynamics, kinematics
 from forcegp.checks.fit import Problem
 from forcegp.checks.log import Log
-from forcegp.checks.residual import residual, tensors
+from forcegp.checks.residual import known_contacts, residual, takes_friction_out, tensors
 from forcegp.checks.statistics import Array
-from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.identification import regressor
 
 LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
@@ -26,6 +26,8 @@ MOMENT_ARM = 0.1
 """How far centres of mass may be off [m]."""
 TOOL_MASS = 5.0
 """How heavy a tool may be that the robot file lacks [kg]."""
+SLOW = 0.01
+"""Sliding speed below which dry friction of a contact is smooth [m/s]."""
 GRAVITY = 10.0
 """How far gravity may be off [m/s²]."""
 
@@ -66,6 +68,29 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
     qd = log.qd[rows]
     smooth = np.tanh(qd / system.robot.friction_velocity.numpy())
     return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
+
+
+def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
+    """Viscous and dry friction of each contact of which only the normal force is taken out, `(n, nq, p)`."""
+    touching = [c for c in known_contacts(system, log) if isinstance(c, SurfaceContact)]
+    if takes_friction_out(system, log):
+        touching = []
+    empty = np.zeros((len(rows), log.nq, 0))
+    return np.concatenate([empty, *(_sliding_columns(system, c, log, rows) for c in touching)], axis=-1)
+
+
+def _sliding_columns(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> Array:
+    """Torque −Jᵀv and −Jᵀv/|v| of a point that slides at v where the contact is closed, `(n, nq, 2)`."""
+    q, qd = tensors(log, rows, "q", "qd")
+    with torch.no_grad():
+        p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
+        normal = contact.surface.gradient(p).numpy()
+        J = kinematics.point_jacobian(system.robot, q, contact.frame, contact.point).numpy()
+    v = np.einsum("nkj,nj->nk", J, qd.numpy())
+    v = v - (v * normal).sum(axis=1, keepdims=True) * normal
+    speed = np.sqrt((v**2).sum(axis=1, keepdims=True) + SLOW**2)
+    closed = log.contact[contact.name][rows][:, None]
+    return np.stack([np.einsum("nkj,nk->nj", J, closed * f) for f in (v, v / speed)], axis=-1)
 
 
 def with_log(problem: Problem, system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Problem:

@@ -22,6 +22,8 @@ WINDOW = 0.05
 """Length of a window [s]; long enough that noise averages out, short against the motion."""
 TOLERANCE = 0.05
 """A slope within this of 1 is right: filters and uneven clocks cost a few percent."""
+INSTANT = 0.15
+"""The same for accelerations: at an instant, that of a light damped joint is not its mean over a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
 EXCHANGED = 0.9
@@ -53,10 +55,10 @@ class Match:
     correlation: Array
     moving: np.ndarray
 
-    def right(self, factor: float = 1.0) -> np.ndarray:
+    def right(self, factor: float = 1.0, tolerance: float = TOLERANCE) -> np.ndarray:
         """`(nq,)` bool, whether a slope can be this factor."""
         ratio = np.stack([self.low, self.high]) / factor
-        return (ratio.min(axis=0) < 1.0 + TOLERANCE) & (ratio.max(axis=0) > 1.0 - TOLERANCE)
+        return (ratio.min(axis=0) < 1.0 + tolerance) & (ratio.max(axis=0) > 1.0 - tolerance)
 
 
 def match(log: Log, value: str, rate: str) -> Match | None:
@@ -226,7 +228,7 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     if level is None:
         return [], log
     related = np.abs(level.correlation) > 0.3
-    wrong = level.moving & related & ~level.right()
+    wrong = level.moving & related & ~level.right(tolerance=INSTANT)
     # An acceleration without relation to the motion shows where its integral is as large as the change.
     size = np.sqrt((level.integral**2).sum(axis=0) / np.maximum((level.change**2).sum(axis=0), 1e-300))
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))

@@ -15,7 +15,7 @@ from torch import Tensor
 from forcegp import dynamics, kinematics
 from forcegp.checks.log import Log
 from forcegp.checks.statistics import Array
-from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.constraints import ConstrainedSystem, Constraint, SurfaceContact
 
 CHUNK = 8192
 """Rows whose dynamics are in memory at once."""
@@ -51,12 +51,21 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Residual:
     return Residual(np.concatenate(r), np.concatenate(J))
 
 
+def known_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
+    """The contacts whose state the log knows."""
+    return [c for c in system.contacts if c.name in log.contact]
+
+
+def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
+    """Whether enough torques are left once any force at the contacts is taken out, not the normal alone."""
+    return 3 * len(known_contacts(system, log)) < log.nq
+
+
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
     """Rows of J of all contacts, those of the surface normal alone where all of J would leave no torque."""
-    known = [c for c in system.contacts if c.name in log.contact]
+    known, whole = known_contacts(system, log), takes_friction_out(system, log)
     if not known or not len(rows):
         return np.zeros((len(rows), 0, log.nq))
-    whole = 3 * len(known) < log.nq
     parts = []
     for c in known:
         if whole and isinstance(c, SurfaceContact):

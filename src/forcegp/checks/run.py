@@ -26,9 +26,11 @@ from forcegp.checks.finding import SEVERITIES, Finding, Report
 from forcegp.checks.kinds import KINDS
 from forcegp.checks.log import Log, log_of, of_robot
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.footprint import announce_states
 from forcegp.data.dataset import Dataset
+from forcegp.memory import announce_memory
 
+NUMBERS = 24
+"""Upper bound on the numbers of one joint in one row that are held at a time; twenty were measured."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]
 Progress = Callable[[int, int], None]
 
@@ -106,7 +108,7 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
     system = replace(system, robot=system.robot.to("cpu", torch.float64))
     log = of_robot(data if isinstance(data, Log) else log_of(data), system.robot)
     samples, findings, skipped = len(log), [], {}
-    announce_states(system, samples, 2.0, f"checking {samples:,} rows")
+    announce_memory(8 * NUMBERS * log.nq * samples, f"checking {samples:,} rows")
     for done, (name, run) in enumerate(CHECKS):
         if progress is not None:
             progress(done, len(CHECKS))

@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from forcegp import kinematics
+from forcegp import dynamics, kinematics
 from forcegp.compiled.mechanics import CompiledMechanics
 from forcegp.constraints.contact import Anchor, MovingPoint
 from forcegp.constraints.gauss import Equations
@@ -59,13 +59,14 @@ class CompiledSystem(ConstrainedSystem):
         for anchor, i in zip(self._anchors, range(0, len(blocks), POINT), strict=True):
             _, position, jacobian, bias = blocks[i : i + POINT]
             points[anchor] = MovingPoint.of(position, jacobian, bias[..., 3:], qd)
-        terms = {c.name: c.terms_of([points[_key(a)] for a in c.anchors]) for c in self.contacts}
+        terms = [c.terms_of([points[_key(a)] for a in c.anchors]) for c in self.contacts]
 
         def links() -> tuple[kinematics.LinkPoses, kinematics.LinkMotion]:
             poses = kinematics.link_poses(self.robot, q)
             return poses, kinematics.link_motion(self.robot, poses, qd)
 
-        return self._assembled(q, qd, active, terms, M=M, Q_C=Q_C, Q_G=Q_G, links=links)
+        known = M, Q_C, Q_G, dynamics.damping_force(self.robot, qd)
+        return self._assembled(q, qd, active, known, terms, links)
 
 
 def compiled_system(system: ConstrainedSystem) -> ConstrainedSystem:

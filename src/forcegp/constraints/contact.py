@@ -176,23 +176,20 @@ class SurfaceContact(Constraint):
     def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
         (tip,) = points
         surface = self.center_surface
-        normal = surface.gradient(tip.position)
+        c, normal = surface.value(tip.position), surface.gradient(tip.position)
         A = normal[..., None, :] @ tip.jacobian
         b = -((normal * tip.bias).sum(-1) + surface.curvature(tip.position, tip.velocity))
-        at = self._touching(tip, normal)
-        return ConstraintTerms(surface.value(tip.position)[..., None], A, b[..., None], at)
-
-    def _touching(self, tip: MovingPoint, normal: Tensor) -> ContactPoint:
-        """The material point that touches."""
-        if not self.radius:
-            return ContactPoint(tip.position, tip.velocity, tip.jacobian, normal)
-        arm = -self.radius * normal
-        return ContactPoint(
-            tip.position + arm,
-            tip.velocity + kinematics.cross(tip.turning, arm),
-            tip.jacobian - kinematics.skew(arm) @ tip.angular,
-            normal,
-        )
+        touching = ContactPoint(tip.position, tip.velocity, tip.jacobian, normal)
+        if self.radius:
+            # The material point that touches lies below the centre of the ball.
+            arm = -self.radius * normal
+            touching = ContactPoint(
+                tip.position + arm,
+                tip.velocity + kinematics.cross(tip.turning, arm),
+                tip.jacobian - kinematics.skew(arm) @ tip.angular,
+                normal,
+            )
+        return ConstraintTerms(c[..., None], A, b[..., None], touching)
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,9 +15,18 @@ from forcegp.constraints.gauss import Equations
 from forcegp.constraints.linearization import Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
 from forcegp.kinematics import LinkMotion, LinkPoses
+from forcegp.memory import announce_memory
 from forcegp.notebook import html_table
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintVector, JointVector
+
+SQUARE, LINEAR = 20, 60
+"""Matrices over joints and constraint rows, and vectors over them, that the equations of one state hold at
+their peak; measured, and rounded up."""
+CERTAIN = 0.25
+"""Part of the bound below which no measured work stays."""
+ITEM = 8
+"""Bytes of a float64."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,26 @@ class ConstrainedSystem:
                 return contact
         raise UnknownNameError("contact", name, self.contact_names)
 
+    @property
+    def state_bytes(self) -> int:
+        """Upper bound on the memory that the equations of motion of one state take [bytes]."""
+        width = self.robot.nq + self.m
+        return ITEM * (SQUARE * width**2 + LINEAR * width)
+
+    def announce_states(self, states: int, copies: float, what: str) -> None:
+        """Announce, or refuse, work on many states; see `announce_memory`.
+
+        Args:
+            states: how many are worked on at once.
+            copies: how many times the memory of the equations of motion a state takes at the peak.
+            what: the work, as the subject of a sentence.
+
+        Raises:
+            MemoryLimitError: it certainly needs more than is free.
+        """
+        needed = int(copies * states * self.state_bytes)
+        announce_memory(needed, what, certain=int(CERTAIN * needed))
+
     def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
         """The same constraints on a robot with other parameters."""
         return dataclasses.replace(self, robot=robot)
@@ -187,37 +215,25 @@ class ConstrainedSystem:
             raise ShapeError("q and qd are not one batch", expected=tuple(q.shape), got=tuple(qd.shape))
         poses = kinematics.link_poses(robot, q)
         motion = kinematics.link_motion(robot, poses, qd)
-        links = dynamics.link_inertia(robot, poses)
-        return self._assembled(
-            q,
-            qd,
-            active,
-            self._terms(poses, motion, qd),
-            M=dynamics.mass_matrix_of_poses(robot, poses, links),
-            Q_C=dynamics.bias_force_of_motion(robot, poses, links, motion),
-            Q_G=dynamics.gravity_force_of_poses(robot, poses, links),
-            links=lambda: (poses, motion),
-        )
+        known = dynamics.known_terms(robot, poses, motion, qd)
+        terms = [contact.terms(robot, poses, motion, qd) for contact in self.contacts]
+        return self._assembled(q, qd, active, known, terms, lambda: (poses, motion))
 
     def _assembled(
         self,
         q: Tensor,
         qd: Tensor,
         active: Tensor | None,
-        terms: dict[str, ConstraintTerms],
-        **mechanics: Any,
+        known: tuple[Tensor, Tensor, Tensor, Tensor],
+        terms: Sequence[ConstraintTerms],
+        links: Callable[[], tuple[LinkPoses, LinkMotion]],
     ) -> Equations:
-        """The equations of motion from the constraints' terms and the mechanics of the robot."""
+        """The equations of motion from M, Q_C, Q_G and Q_D of the robot and the terms of the constraints."""
         c, cd, A, b = self._rows(q, qd, terms, active)
-        return Equations(
-            A=A,
-            b=b,
-            c=c,
-            cd=cd,
-            Q_D=dynamics.damping_force(self.robot, qd),
-            contact_points={name: term.point for name, term in terms.items() if term.point is not None},
-            **mechanics,
-        )
+        touching = zip(self.contact_names, (term.point for term in terms), strict=True)
+        points = {name: point for name, point in touching if point is not None}
+        M, Q_C, Q_G, Q_D = known
+        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, links)
 
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
@@ -253,33 +269,23 @@ class ConstrainedSystem:
 
         def rows(q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
             poses = kinematics.link_poses(self.robot, q)
-            terms = self._terms(poses, kinematics.link_motion(self.robot, poses, qd), qd)
+            motion = kinematics.link_motion(self.robot, poses, qd)
+            terms = [contact.terms(self.robot, poses, motion, qd) for contact in self.contacts]
             _, _, A, b = self._rows(q, qd, terms, active)
             return A, b
 
         return linearize(self.robot, eom, rows, q, qd, force)
 
-    def _terms(self, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> dict[str, ConstraintTerms]:
-        return {contact.name: contact.terms(self.robot, poses, motion, qd) for contact in self.contacts}
-
     def _rows(
-        self, q: Tensor, qd: Tensor, terms: dict[str, ConstraintTerms], active: Tensor | None
+        self, q: Tensor, qd: Tensor, terms: Sequence[ConstraintTerms], active: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """c and ċ of all contacts, and the stabilized A and b of the active ones."""
-        c, A, b = self._stack(q, list(terms.values()))
+        empty, none = q.new_zeros(*q.shape[:-1], 0), q.new_zeros(*q.shape[:-1], 0, q.shape[-1])
+        c = torch.cat([empty, *(term.c for term in terms)], dim=-1)
+        b = torch.cat([empty, *(term.b for term in terms)], dim=-1)
+        A = torch.cat([none, *(term.A for term in terms)], dim=-2)
         cd = (A @ qd[..., None])[..., 0]
         if self.baumgarte is not None:
             b = self.baumgarte.stabilized(b, c, cd)
         rows = self.active_rows(active, q.shape[:-1])
         return c, cd, torch.where(rows[..., None], A, 0.0), torch.where(rows, b, 0.0)
-
-    def _stack(self, q: Tensor, terms: list[ConstraintTerms]) -> tuple[Tensor, Tensor, Tensor]:
-        """c, A, b of all contacts, concatenated over rows."""
-        if not terms:
-            empty = q.new_zeros(*q.shape[:-1], 0)
-            return empty, q.new_zeros(*q.shape[:-1], 0, q.shape[-1]), empty
-        return (
-            torch.cat([t.c for t in terms], dim=-1),
-            torch.cat([t.A for t in terms], dim=-2),
-            torch.cat([t.b for t in terms], dim=-1),
-        )

@@ -1,4 +1,4 @@
-"""Whether a data set fits a robot, and data sets fit each other."""
+"""Whether a data set fits a robot and its contacts, and data sets fit each other."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from forcegp.data.fields import JOINT_VECTORS, Fields
 from forcegp.data.header import DataHeader
@@ -50,6 +51,19 @@ def check_robot(data: Fields, robot: RobotModel) -> None:
             RobotMismatchWarning,
             stacklevel=3,
         )
+
+
+def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
+    """`(n, len(contacts))` bool: which of the named contacts are closed."""
+    for name in contacts:
+        if name not in data.contact:
+            raise DataError(
+                f"column 'contact.{name}' is missing",
+                expected=f"contact.{name}, 1 where the contact is closed and 0 elsewhere",
+                got=", ".join(f"contact.{c}" for c in data.contact) or "no contact column",
+            )
+    columns_ = [data.contact[name] for name in contacts]
+    return torch.stack(columns_, dim=-1) if columns_ else data.segment.new_zeros(len(data), 0).bool()
 
 
 def check_alike(parts: Sequence[Fields]) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forcegp.data import check, columns, compatible, table
 from forcegp.data.derivative import SavitzkyGolay
-from forcegp.data.fields import JOINT_VECTORS, contact_table
+from forcegp.data.fields import JOINT_VECTORS
 from forcegp.data.header import DataHeader
 from forcegp.data.summary import summary, summary_table
 from forcegp.errors import DataError, UnknownNameError
@@ -143,7 +143,7 @@ class Dataset:
         Raises:
             DataError: the data do not say whether a contact is closed.
         """
-        return contact_table(self, contacts)
+        return compatible.contact_table(self, contacts)
 
     def replace(self, **fields: object) -> Dataset:
         """A data set with some fields changed."""

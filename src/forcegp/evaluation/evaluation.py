@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.footprint import announce_states
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.evaluation.baselines import FEWEST, as_torque, baselines
@@ -160,7 +159,7 @@ def evaluate(
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
     data.check_robot(model.system.robot)
-    announce_states(model.system, len(data), 2.0, f"an evaluation on {len(data):,} samples")
+    model.system.announce_states(len(data), 2.0, f"an evaluation on {len(data):,} samples")
     before = system or getattr(model, "specified", model.system)
     predicted = predict_all(model, data, system or model.system, progress)
     clean, noise_std = data.extras.get("qdd_clean"), predicted.noise_std

@@ -15,10 +15,9 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.totals import PIECE_SAMPLES, basis_of, posterior_of, total_over
 from forcegp.gp.bound import bound_of
-from forcegp.gp.capacity import require_exact_fits
-from forcegp.gp.decomposition import split
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
+from forcegp.gp.likelihood import require_exact_fits
 from forcegp.gp.sparse import SparsePosterior
 
 METHODS = ("auto", "exact", "sparse")
@@ -39,7 +38,7 @@ def check_method(inference: str) -> str:
 
 def is_finite(priors: Sequence[ForcePrior]) -> bool:
     """Whether all priors are a finite number of features, so that sparse inference is exact."""
-    return all(split(prior.kernel).rest is None for prior in priors)
+    return all(prior.kernel.is_finite for prior in priors)
 
 
 def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> bool:
@@ -118,9 +117,3 @@ def log_likelihood(posterior: ForcePosterior) -> float:
         return float(latent.log_likelihood())
     assert isinstance(latent, SparsePosterior)
     return -float(bound_of(latent.sums, latent))
-
-
-def jitter_of(posterior: ForcePosterior) -> float:
-    """Added to the diagonal to factorise, relative to unit noise."""
-    latent = posterior.latent
-    return latent.conditioned.jitter if isinstance(latent, ExactPosterior) else getattr(latent, "jitter", 0.0)

@@ -1,9 +1,9 @@
-"""The learning problem of force priors: the rows at given parameters, the objective, and its solution."""
+"""The learning problem of force priors: what its rows and their likelihood are at given parameters."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -11,29 +11,19 @@ import torch
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.coulomb import CoulombFriction, below_jamming, coulomb_of, initial_coulomb
+from forcegp.forces.coulomb import CoulombFriction, coulomb_of
 from forcegp.forces.measurements import Training
-from forcegp.forces.priors.base import ANALYTICAL, NOISE, ForcePrior
+from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForcePrior
 from forcegp.forces.projection import ForceMean, ForceNoise, WhitenedRows, combine, whiten
-from forcegp.forces.start import (
-    OWN,
-    bounds_of,
-    given_start,
-    initial_hyperparameters,
-    negative_log_prior,
-    random_starts,
-    warm_start_sizes,
-)
-from forcegp.forces.torque_noise import TORQUE_NOISE, initial_torque_noise, stick_variance
+from forcegp.forces.torque_noise import TORQUE_NOISE, stick_variance
 from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
 from forcegp.gp.structured_covariance import Block
 
 Tensors = dict[str, Tensor]
-START_SAMPLES = 5000
-"""Evenly spaced samples that the start of learning is computed from, where there are more."""
+OWN = tuple(name + "." for name in RESERVED)
+"""Prefixes of what is learned besides the hyperparameters of the priors."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -87,7 +77,7 @@ class Problem:
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """The system with the robot at the analytical parameters among the tensors."""
-        own = analytical_parameters(tensors)
+        own = {} if self.parameters is None else analytical_parameters(tensors)
         if self.parameters is None or not own:
             return self.system
         return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
@@ -98,11 +88,16 @@ class Problem:
         learned = tensors.get(noise_key(measurement))
         if learned is None:
             return std
-        return learned.exp() if std.ndim == 1 else std * (learned.exp() / _typical(std))
+        return learned.exp() if std.ndim == 1 else std * (learned.exp() / typical(std))
 
     def coulomb(self, tensors: Mapping[str, Tensor]) -> tuple[CoulombFriction, ...]:
         """Coulomb friction of contacts, at its start where it is not among the tensors."""
-        return coulomb_of(self.priors, tensors, self.system.robot.mass)
+        return coulomb_of(self.priors, tensors, self.system.robot.mass) if self.has_coulomb else ()
+
+    @property
+    def has_coulomb(self) -> bool:
+        """Whether a prior goes with Coulomb friction that is proportional to the multiplier."""
+        return any(prior.coupled for prior in self.priors)
 
     def force_noise(self, tensors: Mapping[str, Tensor]) -> ForceNoise | None:
         """Variance of the white noise on the joint force, or `None` for none."""
@@ -153,23 +148,6 @@ class Problem:
         """The rows at the noise and robot as given."""
         return self.rows({})
 
-    def initial(self, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
-        """Default start of everything that can be learned."""
-        few = self
-        if self.training.samples > START_SAMPLES:
-            few = dataclasses.replace(self, training=self.training.evenly(START_SAMPLES))
-        start = initial_hyperparameters(self.priors, few.fixed_rows.blocks)
-        start |= initial_coulomb(self.priors, self.system.robot.mass)
-        if learn_torque_noise:
-            start |= initial_torque_noise(few.torque_residual())
-        if learn_noise:
-            noise = self.training.noise_std
-            start |= {noise_key(i): _typical(std).double().log() for i, std in enumerate(noise)}
-        if self.parameters is not None:
-            named = self.parameters.named_parameters()
-            start |= {f"{ANALYTICAL}.{name}": value.detach().clone() for name, value in named}
-        return start
-
     @torch.no_grad()
     def torque_residual(self) -> Tensor:
         """Root mean square of M times the residual of accelerations, `(nq,)` [N m, N]."""
@@ -186,96 +164,14 @@ class Problem:
         """Of the rows, exact or as the collapsed bound, with their constant."""
         if self.inducing is not None:
             return negative_bound(self.priors, params, rows.blocks, self.inducing) + rows.constant
-        return negative_log_likelihood(self.priors, params, rows.blocks)[0] + rows.constant
+        return negative_log_likelihood(self.priors, params, rows.blocks) + rows.constant
 
-    def objective(self, tensors: Tensors, held: Tensors, center: Tensors) -> Tensor:
-        """Negative log posterior: the likelihood of the rows, and weak priors around `center`."""
-        moving = any(key.startswith(OWN) for key in tensors)
-        rows = self.rows({**held, **tensors}) if moving else self._held_rows(held)
-        value = self.negative_log_likelihood(kernel_parameters({**held, **tensors}), rows)
-        hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL + ".")}
-        return value + negative_log_prior(hyper, center)
-
-    def _held_rows(self, held: Tensors) -> WhitenedRows:
-        """The rows where neither noise nor robot is learned; computed once for those as given."""
-        return self.rows(held) if any(key.startswith(OWN) for key in held) else self.fixed_rows
+    def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
+        """The rows at learned and held tensors; computed once where they are those as given."""
+        own = any(key.startswith(OWN) for part in (tensors, held) for key in part)
+        return self.rows({**held, **tensors}) if own else self.fixed_rows
 
 
-def _typical(std: Tensor) -> Tensor:
+def typical(std: Tensor) -> Tensor:
     """One standard deviation per component, `(d,)`."""
     return std if std.ndim == 1 else std.square().mean(0).sqrt()
-
-
-@dataclass(frozen=True)
-class Search:
-    """How hyperparameters are searched.
-
-    Attributes:
-        start: default initial values of what is learned, and centre of the weak priors.
-        held: values that are not learned.
-        options: optimiser and its limits.
-        recorded: wraps the objective, such as `Checkpoint.recorded`.
-    """
-
-    start: Tensors
-    held: Tensors
-    options: LearningOptions
-    recorded: Callable[[Objective], Objective] = lambda objective: objective
-
-    def solve(
-        self,
-        problem: Problem,
-        progress: Progress | None = None,
-        begin: Mapping[str, Tensor] | None = None,
-    ) -> Learned:
-        """Learn; on a part of the data first where there is much, and from several starts on request.
-
-        Args:
-            problem: whose objective is minimised.
-            progress: called after each evaluation on all data.
-            begin: where to begin on all data, instead of warm starts and restarts.
-
-        Raises:
-            ModelError: `begin` does not fit what is learned.
-            NumericalError: the likelihood cannot be computed.
-        """
-        if begin is not None:
-            return self._minimise(problem, given_start(begin, self.start), progress)
-        found = (
-            self._minimise(problem, self._warmed(problem, cold), progress)
-            for cold in random_starts(self.start, self.options.restarts, self.options.seed)
-        )
-        return min(found, key=lambda learned: learned.value)
-
-    def _warmed(self, problem: Problem, cold: Tensors) -> Tensors:
-        """Where to begin on all data: what fewer samples taught, unless the cold start is better."""
-        first = cold
-        for samples in warm_start_sizes(problem.training.samples, self.options.warm_start):
-            small = dataclasses.replace(problem, training=problem.training.thinned(samples))
-            first = self._minimise(small, self._better(small, (first, cold)), None).tensors
-        return self._better(problem, (first, cold))
-
-    @torch.no_grad()
-    def _better(self, problem: Problem, starts: Iterable[Tensors]) -> Tensors:
-        one, two = starts
-        if one is two:
-            return one
-        return min((one, two), key=lambda tensors: float(problem.objective(tensors, self.held, self.start)))
-
-    def _minimise(self, problem: Problem, begin: Tensors, progress: Progress | None) -> Learned:
-        # The tolerance is relative to the objective, so the part that no hyperparameter changes is left out.
-        constant = float(problem.fixed_rows.constant)
-        analytical = frozenset(key for key in begin if key.startswith(ANALYTICAL + "."))
-        bounds = bounds_of({key: value for key, value in begin.items() if key not in analytical})
-        bounds = below_jamming(problem.system, problem.training.measurements, problem.priors, bounds)
-
-        def objective(tensors: Tensors) -> Tensor:
-            return problem.objective(tensors, self.held, self.start) - constant
-
-        def whole(evaluations: int, value: float, best: Tensors) -> None:
-            if progress is not None:
-                progress(evaluations, value + constant, best)
-
-        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, whole)
-        history = [value + constant for value in learned.history]
-        return dataclasses.replace(learned, value=learned.value + constant, history=history)

@@ -6,12 +6,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, farthest_points, standardized
+from forcegp.data.compatible import check_robot, contact_table
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.quantities import QUANTITIES, States, states
@@ -20,6 +22,14 @@ from forcegp.gp.features import Standardization
 NoiseStd = float | Sequence[float] | Tensor
 DEFAULT_NOISE_STD = 0.1
 """Noise of accelerations where neither the caller nor the log states it, as in the paper [rad/s², m/s²]."""
+
+
+def plain(noise: NoiseStd | str | None) -> Any:
+    """A noise as what JSON can hold."""
+    if noise is None or isinstance(noise, str):
+        return noise
+    values = torch.as_tensor(noise, dtype=torch.float64).tolist()
+    return tuple(values) if isinstance(values, list) else values
 
 
 @dataclass(frozen=True)
@@ -145,12 +155,13 @@ def measurement_of(
     data, quantity = observation.data, observation.quantity
     if quantity not in QUANTITIES or quantity not in COLUMNS:
         raise UnknownNameError("measured quantity", quantity, COLUMNS)
-    data.check_robot(system.robot)
-    if len(data) == 0:
+    names = system.contact_names
+    check_robot(data, system.robot)
+    active = contact_table(data, names)
+    if not len(data.q):
         raise ModelError("there are no samples to learn from", expected="at least one sample", got="none")
     values = COLUMNS[quantity](data, system)
     std = _checked_noise(_noise_of(observation, default_noise), quantity, values)
-    active = data.active(system.contact_names)
     return Measurement(quantity, data.q, data.qd, data.tau, active, values, data.segment), std
 
 

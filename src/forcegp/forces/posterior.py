@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -11,20 +11,21 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombFriction, coupled, with_coulomb
-from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.projection import ForceMean, prior_mean, prior_operators
+from forcegp.forces.priors.base import ForceMean, ForcePrior, prior_rows
 from forcegp.forces.quantities import AffineMap, States
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.pathwise import FunctionSamples
 from forcegp.gp.structured_covariance import Block
 
-CHUNK_COLUMNS = 700
-"""Columns of the triangular solve that are held at a time."""
-
 
 @runtime_checkable
 class LatentPosterior(Protocol):
     """Latent processes conditioned on rows, exactly or through inducing points."""
+
+    @property
+    def jitter(self) -> float:
+        """Added to the diagonal to factorise, relative to unit noise."""
+        ...
 
     def is_measured(self, p: int) -> bool:
         """Whether any row depends on process p; where none does, its posterior is its prior."""
@@ -65,29 +66,27 @@ class ForcePosterior:
     central: LatentPosterior | None = None
     coulomb: tuple[CoulombFriction, ...] = ()
 
-    def latent_mean(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | None:
-        """Posterior mean of the force of prior p, `(n, components)`; `None` where it is zero."""
+    def moves(self, p: int) -> bool:
+        """Whether the posterior mean of the force of prior p can differ from zero."""
         if self.central is not None:
-            if not self.central.is_measured(p):
-                return None
-            return self.central.latent_mean(p, self.features_of(p, system, at))
-        return self._own_mean(p, system, at)
+            return self.central.is_measured(p)
+        return self.latent.is_measured(p) or self._has_offset(p)
 
-    def _own_mean(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | None:
-        """Posterior mean where no force is pinned."""
-        offset = self.offsets.get(self.priors[p].name)
-        if not self.latent.is_measured(p):
-            return None if offset is None else offset.expand(len(at.q), -1)
-        mean = self.latent.latent_mean(p, self.features_of(p, system, at))
-        return mean if offset is None else mean + offset
+    def latent_mean(self, p: int, features: Features) -> Tensor:
+        """Posterior mean of the force of prior p at standardized features, `(n, components)`."""
+        if self.central is not None:
+            return self.central.latent_mean(p, features)
+        mean = self.latent.latent_mean(p, features)
+        return mean + self.offsets[self.priors[p].name] if self._has_offset(p) else mean
 
-    def shift(self, p: int, system: ConstrainedSystem, at: States) -> Tensor | float:
+    def shift(self, p: int, features: Features) -> Tensor | float:
         """What samples of the latent force of prior p must be moved by to have the mean that is predicted."""
-        if self.central is None:
-            return self.offsets.get(self.priors[p].name, 0.0)
-        mean, own = self.latent_mean(p, system, at), self._own_mean(p, system, at)
-        offset = self.offsets.get(self.priors[p].name, 0.0)
-        return (0.0 if mean is None else mean) - (0.0 if own is None else own) + offset
+        if self.central is not None:
+            return self.central.latent_mean(p, features) - self.latent.latent_mean(p, features)
+        return self.offsets[self.priors[p].name] if self._has_offset(p) else 0.0
+
+    def _has_offset(self, p: int) -> bool:
+        return bool(self.offsets) and self.priors[p].name in self.offsets
 
     def features_of(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         """Standardized kernel inputs of prior p at states."""
@@ -96,53 +95,34 @@ class ForcePosterior:
     def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Posterior mean of Q̄ = m + Σ E f, `(n, nq)`: the force field of a rollout."""
         force = self.mean(system, at)
-        for p, prior in enumerate(self.priors):
-            latent = self.latent_mean(p, system, at)
-            if latent is not None:
-                force = force + (prior.operator(system, at) @ latent[..., None])[..., 0]
-        return with_coulomb(system, at, force, self.coulomb)
+        pairs = [(p, prior) for p, prior in enumerate(self.priors) if self.moves(p)]
+        parts = [(p, prior.features(system, at), prior.operator(system, at)) for p, prior in pairs]
+        for p, x, E in parts:
+            force = force + (E @ self.latent_mean(p, self.scales[p].apply(x))[..., None])[..., 0]
+        return with_coulomb(system, at, force, self.coulomb) if self.coulomb else force
 
-    def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
-        """Posterior mean of a quantity, o + B(m + Σ E f), `(n, d)`."""
-        z = coupled(system, at, z, self.coulomb)
-        mean = prior_mean(system, at, z, self.mean)
-        for p, prior in enumerate(self.priors):
-            latent = self.latent_mean(p, system, at)
-            if latent is not None:
-                (W,) = prior_operators([prior], system, at, z)
-                mean = mean + (W @ latent[..., None])[..., 0]
-        return mean
-
-    def read_covariance(
-        self,
-        system: ConstrainedSystem,
-        at: States,
-        z: AffineMap,
-        without: Sequence[str] = (),
-    ) -> Tensor:
-        """Posterior covariance of a quantity at each state, `(n, d, d)`, without measurement noise.
+    def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
+        """A quantity at n states as rows of the processes, with its prior mean as target.
 
         Args:
             system: robot and contacts.
             at: n states.
-            z: the quantity.
-            without: targets of priors that are left out.
+            z: the quantity, without Coulomb friction of contacts.
         """
-        z = coupled(system, at, z, self.coulomb)
-        operators = [
-            torch.zeros_like(W) if prior.target in without else W
-            for prior, W in zip(self.priors, prior_operators(self.priors, system, at, z), strict=True)
-        ]
-        features = [self.features_of(p, system, at) for p in range(len(self.priors))]
-        n, d = z.o.shape
-        step = max(1, CHUNK_COLUMNS // max(d, 1))
-        parts = []
-        for i in range(0, n, step):
-            rows = slice(i, i + step)
-            block = Block(
-                tuple({key: x[rows] for key, x in f.items()} for f in features),
-                tuple(W[rows] for W in operators),
-                z.o[rows],
-            )
-            parts.append(self.latent.covariance(block))
-        return torch.cat(parts) if parts else z.o.new_zeros(0, d, d)
+        z = coupled(system, at, z, self.coulomb) if self.coulomb else z
+        return prior_rows(self.priors, self.scales, self.mean, system, at, z)
+
+    def mean_of(self, rows: Block) -> Tensor:
+        """Posterior mean o + B(m + Σ E f) of rows, `(n, d)`."""
+        mean = rows.target
+        for p, W in enumerate(rows.operators):
+            mean = mean + (W @ self.latent_mean(p, rows.features[p])[..., None])[..., 0]
+        return mean
+
+    def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
+        """Posterior mean of a quantity at states, `(n, d)`."""
+        return self.mean_of(self.rows(system, at, z))
+
+    def read_covariance(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
+        """Posterior covariance of a quantity at each state, `(n, d, d)`, without measurement noise."""
+        return self.latent.covariance(self.rows(system, at, z))

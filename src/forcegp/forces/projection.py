@@ -22,15 +22,12 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombFriction, coupled
 from forcegp.forces.measurements import Measurement
-from forcegp.forces.priors.base import CONSTRAINT, CONTACT, ForcePrior
+from forcegp.forces.priors.base import ForceMean, ForcePrior, prior_rows
 from forcegp.forces.quantities import AffineMap, States, affine_map
 from forcegp.forces.state_noise import state_jacobian
-from forcegp.gp.features import Standardization
+from forcegp.gp.features import Features, Standardization
 from forcegp.gp.structured_covariance import Block
 from forcegp.linalg import null_space_basis
-
-ForceMean = Callable[[ConstrainedSystem, States], Tensor]
-"""Prior mean of the joint force Q at states, `(n, nq)`."""
 
 ForceNoise = Callable[[States], Tensor]
 """Variance of the white noise on the joint force at states, `(n, nq)`."""
@@ -62,19 +59,6 @@ class WhitenedRows:
         return WhitenedRows(blocks, power * self.constant)
 
 
-def prior_operators(
-    priors: Sequence[ForcePrior], system: ConstrainedSystem, at: States, z: AffineMap
-) -> list[Tensor]:
-    """B(x) E(x) of each prior, from its components to the quantity, `(n, d, components)`."""
-    by_target = {CONTACT: z.B_z, CONSTRAINT: z.B_N}
-    return [by_target.get(prior.target, z.B_Q) @ prior.operator(system, at) for prior in priors]
-
-
-def prior_mean(system: ConstrainedSystem, at: States, z: AffineMap, mean: ForceMean) -> Tensor:
-    """o(x) + B(x) m(x), `(n, d)`."""
-    return z.o + (z.B_Q @ mean(system, at)[..., None])[..., 0]
-
-
 def _split(A: Tensor, rank: int) -> tuple[Tensor, Tensor]:
     """Null-space basis of A, and A⁺, both with the rank that the equations of motion count.
 
@@ -93,7 +77,7 @@ class _Rows:
     """Samples with a common number of rows: residual `(n, r)`, operators `(n, r, ·)`, and the factor N of
     the noise `(n, r, k)`, whose covariance is 1 + N Nᵀ; `None` for white noise alone."""
 
-    features: tuple[dict[str, Tensor], ...]
+    features: tuple[Features, ...]
     operators: tuple[Tensor, ...]
     residual: Tensor
     noise: Tensor | None
@@ -148,25 +132,29 @@ def whiten(
         state_std: `(2 nq,)` standard deviation of the noise of q and q̇.
     """
     at = measurement.at(system)
-    z = coupled(system, at, affine_map(system, at, measurement.quantity), coulomb)
+    z = affine_map(system, at, measurement.quantity)
+    if coulomb:
+        z = coupled(system, at, z, coulomb)
+    # Noise of the state reaches the directions that the constraint fixes too, so their rows tell of it.
+    has_fixed = measurement.quantity == "qdd" and system.m > 0 and state_std is None
+    rank = at.eom.rank if has_fixed else None
     std = noise_std.expand_as(measurement.values)
-    operators = prior_operators(priors, system, at, z)
-    expected = prior_mean(system, at, z, mean)
-    for prior, W in zip(priors, operators, strict=True):
+    rows = prior_rows(priors, scales, mean, system, at, z)
+    expected = rows.target
+    for prior, W in zip(priors, rows.operators, strict=True):
         if offsets and prior.name in offsets:
             expected = expected + W @ offsets[prior.name]
     everything = _Rows(
-        tuple(scale.apply(prior.features(system, at)) for prior, scale in zip(priors, scales, strict=True)),
-        tuple(W / std[..., None] for W in operators),
+        rows.features,
+        tuple(W / std[..., None] for W in rows.operators),
         (measurement.values - expected) / std,
         _noise_factor(system, at, measurement, z, force_noise, state_std, std),
     )
     constant = std.log().sum()
-    # Noise of the state reaches the directions that the constraint fixes too, so these tell of it.
-    if measurement.quantity != "qdd" or system.m == 0 or state_std is not None:
+    if rank is None:
         block, log_det = everything.whitened()
         return WhitenedRows([block], constant + log_det)
-    A, rank = at.eom.A * std[:, None, :], at.eom.rank
+    A = at.eom.A * std[:, None, :]
     violated = (at.eom.A @ measurement.values[..., None])[..., 0] - at.eom.b
     blocks = []
     for value in rank.unique().tolist():

@@ -6,7 +6,7 @@ from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -67,10 +67,6 @@ class FlatStates(NamedTuple):
         """Some of the states."""
         return FlatStates(self.q[own], self.qd[own], self.tau[own], self.active[own], self.batch)
 
-    def at(self, system: ConstrainedSystem) -> States:
-        """The equations of motion at the states."""
-        return states(system, self.q, self.qd, self.tau, self.active)
-
 
 def flat_states(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
@@ -99,6 +95,16 @@ def flat_states(
     rows = batch.numel()
     q, qd, tau = (x.expand(*batch, x.shape[-1]).reshape(rows, x.shape[-1]) for x in given.values())
     return FlatStates(q, qd, tau, active.expand(*batch, contacts).reshape(rows, contacts), batch)
+
+
+def states_at(
+    system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
+) -> tuple[States, torch.Size]:
+    """States `(*batch, nq)` as a list with their equations of motion, and the batch; errors as of
+    `flat_states`."""
+    flat = flat_states(system, q, qd, tau, active)
+    eom = system.equations(flat.q, flat.qd, flat.active)
+    return States(flat.q, flat.qd, flat.tau, flat.active, eom), flat.batch
 
 
 class AffineMap(NamedTuple):
@@ -203,8 +209,10 @@ QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {
 """The quantities that can be measured and predicted, by name."""
 
 
-def affine_maps(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> dict[str, AffineMap]:
-    """The affine map of a quantity, or of each of several, by name.
+def affine_maps(
+    system: ConstrainedSystem, at: States, quantity: str | Sequence[str]
+) -> tuple[AffineMap, dict[str, slice]]:
+    """The affine map of a quantity, or of several one above the other, and the rows of each.
 
     Raises:
         UnknownNameError: no such quantity.
@@ -216,11 +224,7 @@ def affine_maps(system: ConstrainedSystem, at: States, quantity: str | Sequence[
     for name in names:
         if not isinstance(name, str) or name not in QUANTITIES:
             raise UnknownNameError("quantity", name, QUANTITIES)
-    return {name: QUANTITIES[name](system, at) for name in names}
-
-
-def stack(maps: Mapping[str, AffineMap]) -> tuple[AffineMap, dict[str, slice]]:
-    """Several affine maps one above the other, and the rows of each."""
+    maps = {name: QUANTITIES[name](system, at) for name in names}
     rows, first = {}, 0
     for name, z in maps.items():
         rows[name] = slice(first, first + z.o.shape[-1])
@@ -232,4 +236,4 @@ def stack(maps: Mapping[str, AffineMap]) -> tuple[AffineMap, dict[str, slice]]:
 
 def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:
     """The affine map of a quantity, or of several one above the other; errors as of `affine_maps`."""
-    return stack(affine_maps(system, at, quantity))[0]
+    return affine_maps(system, at, quantity)[0]

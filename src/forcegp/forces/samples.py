@@ -52,8 +52,8 @@ class ForceSamples:
         Q = Q if sample is not None else Q.expand(self.count, *Q.shape)
         Q_z = torch.zeros_like(Q)
         for p, prior in enumerate(self.posterior.priors):
-            latent = self.functions.latent(p, self.posterior.features_of(p, system, at), sample)
-            latent = latent + self.posterior.shift(p, system, at)
+            features = self.posterior.features_of(p, system, at)
+            latent = self.functions.latent(p, features, sample) + self.posterior.shift(p, features)
             force = (prior.operator(system, at) @ latent[..., None])[..., 0]
             Q, Q_z = (Q, Q_z + force) if prior.target == CONTACT else (Q + force, Q_z)
         return Q, with_coulomb(system, at, Q + Q_z, self.posterior.coulomb) - Q
@@ -85,7 +85,7 @@ class ForceSamples:
                     for own in chunks
                 ]
             )
-            force = force + self.posterior.shift(p, system, at)
+            force = force + self.posterior.shift(p, features)
             Q_bar = Q_bar + (prior.operator(system, at) @ force[..., None])[..., 0]
         return with_coulomb(system, at, Q_bar, self.posterior.coulomb)
 

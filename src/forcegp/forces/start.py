@@ -1,4 +1,4 @@
-"""Where L-BFGS starts: initial hyperparameters, their bounds and weak priors, warm starts and restarts.
+"""Where L-BFGS starts, and the search from there: initial values, bounds, weak priors, warm starts, restarts.
 
 Inputs are standardized, so a length-scale of about the square root of their number relates typical samples. A
 log-normal prior around this start, with a different width on either side, keeps the length-scales of
@@ -9,15 +9,21 @@ starts at the root mean square of the force that explains the training residuals
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.forces.priors.base import RESERVED, ForcePrior
+from forcegp.forces.coulomb import below_jamming, initial_coulomb
+from forcegp.forces.learn import OWN, Problem, Tensors, kernel_parameters, noise_key, typical
+from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
+from forcegp.forces.torque_noise import initial_torque_noise
 from forcegp.gp.kernels import Parameters
+from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
 from forcegp.gp.structured_covariance import Block
 
 LOG_LENGTHSCALE_BOUNDS = (math.log(0.03), math.log(3e4))
@@ -36,16 +42,34 @@ WIDTH = {
     "log_offset": (1.0, 1.0),
 }
 """Standard deviations of the log-normal priors below and above the start, in e-folds; 3 where not named."""
-OWN = tuple(name + "." for name in RESERVED)
-"""Prefixes of what is learned besides the hyperparameters of the priors."""
+START_SAMPLES = 5000
+"""Evenly spaced samples that the start of learning is computed from, where there are more."""
+
+
+def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
+    """Default start of everything that can be learned of a problem."""
+    few = problem
+    if problem.training.samples > START_SAMPLES:
+        few = dataclasses.replace(problem, training=problem.training.evenly(START_SAMPLES))
+    start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks)
+    if problem.has_coulomb:
+        start |= initial_coulomb(problem.priors, problem.system.robot.mass)
+    if learn_torque_noise:
+        start |= initial_torque_noise(few.torque_residual())
+    if learn_noise:
+        noise = problem.training.noise_std
+        start |= {noise_key(i): typical(std).double().log() for i, std in enumerate(noise)}
+    if problem.parameters is not None:
+        named = problem.parameters.named_parameters()
+        start |= {f"{ANALYTICAL}.{name}": value.detach().clone() for name, value in named}
+    return start
 
 
 def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block]) -> dict[str, Tensor]:
     """Initial log-hyperparameters, by `<prior>.<name>`."""
     params: dict[str, Tensor] = {}
-    for p, prior in enumerate(priors):
-        if prior.prefix != prior.name:
-            continue  # It shares the hyperparameters of another prior.
+    # Some priors share the hyperparameters of another one.
+    for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
         scale = _force_scale(p, blocks)
         initial = prior.kernel.initial(len(scale), widths, scale.log().cpu().double())
@@ -123,3 +147,87 @@ def warm_start_sizes(samples: int, first: int | None) -> list[int]:
         sizes.append(size)
         size *= 2
     return sizes
+
+
+@dataclass(frozen=True)
+class Search:
+    """How hyperparameters are searched.
+
+    Attributes:
+        start: default initial values of what is learned, and centre of the weak priors.
+        held: values that are not learned.
+        options: optimiser and its limits.
+        recorded: wraps the objective, such as `Checkpoint.recorded`.
+    """
+
+    start: Tensors
+    held: Tensors
+    options: LearningOptions
+    recorded: Callable[[Objective], Objective] = lambda objective: objective
+
+    def solve(
+        self,
+        problem: Problem,
+        progress: Progress | None = None,
+        begin: Mapping[str, Tensor] | None = None,
+    ) -> Learned:
+        """Learn; on a part of the data first where there is much, and from several starts on request.
+
+        Args:
+            problem: whose objective is minimised.
+            progress: called after each evaluation on all data.
+            begin: where to begin on all data, instead of warm starts and restarts.
+
+        Raises:
+            ModelError: `begin` does not fit what is learned.
+            NumericalError: the likelihood cannot be computed.
+        """
+        if begin is not None:
+            return self._minimise(problem, given_start(begin, self.start), progress)
+        found = (
+            self._minimise(problem, self._warmed(problem, cold), progress)
+            for cold in random_starts(self.start, self.options.restarts, self.options.seed)
+        )
+        return min(found, key=lambda learned: learned.value)
+
+    def objective(self, problem: Problem, tensors: Tensors) -> Tensor:
+        """Negative log posterior: the likelihood of the rows, and weak priors around the start."""
+        hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL + ".")}
+        weak = negative_log_prior(hyper, self.start)
+        rows = problem.rows_for(tensors, self.held)
+        return problem.negative_log_likelihood(kernel_parameters({**self.held, **tensors}), rows) + weak
+
+    def _warmed(self, problem: Problem, cold: Tensors) -> Tensors:
+        """Where to begin on all data: what fewer samples taught, unless the cold start is better."""
+        first = cold
+        for samples in warm_start_sizes(problem.training.samples, self.options.warm_start):
+            small = dataclasses.replace(problem, training=problem.training.thinned(samples))
+            first = self._minimise(small, self._better(small, (first, cold)), None).tensors
+        return self._better(problem, (first, cold))
+
+    @torch.no_grad()
+    def _better(self, problem: Problem, starts: Iterable[Tensors]) -> Tensors:
+        one, two = starts
+        if one is two:
+            return one
+        return min((one, two), key=lambda tensors: float(self.objective(problem, tensors)))
+
+    def _minimise(self, problem: Problem, begin: Tensors, progress: Progress | None) -> Learned:
+        # The tolerance is relative to the objective, so the part that no hyperparameter changes is left out.
+        constant = float(problem.fixed_rows.constant)
+        analytical = frozenset(key for key in begin if key.startswith(ANALYTICAL + "."))
+        bounds = bounds_of({key: value for key, value in begin.items() if key not in analytical})
+        if problem.has_coulomb:
+            bounds = below_jamming(problem.system, problem.training.measurements, problem.priors, bounds)
+
+        def objective(tensors: Tensors) -> Tensor:
+            return self.objective(problem, tensors) - constant
+
+        def whole(evaluations: int, value: float, best: Tensors) -> None:
+            assert progress is not None
+            progress(evaluations, value + constant, best)
+
+        report = None if progress is None else whole
+        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report)
+        history = [value + constant for value in learned.history]
+        return dataclasses.replace(learned, value=learned.value + constant, history=history)

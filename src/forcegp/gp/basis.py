@@ -15,13 +15,12 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from forcegp.gp.blocks import points
 from forcegp.gp.decomposition import Split, split
 from forcegp.gp.draws import FunctionDraw
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.spectrum import Spectrum
-from forcegp.gp.structured_covariance import Process
+from forcegp.gp.structured_covariance import Process, points
 
 
 @dataclass(frozen=True, eq=False)

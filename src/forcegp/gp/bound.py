@@ -9,18 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from forcegp.gp.basis import ProcessBasis, latent_basis
-from forcegp.gp.blocks import components_of, rows_of
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters
-from forcegp.gp.places import Gradient, Place, from_tensors, tensors_of
+from forcegp.gp.likelihood import Valued, with_gradient
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.structured_covariance import Block, Process
+from forcegp.gp.structured_covariance import Block, Gradient, Process, components_of, rows_of
 from forcegp.gp.sums import CHUNK_SAMPLES, Moments, accumulate
 
 
@@ -51,43 +49,14 @@ def negative_bound(
     Raises:
         NumericalError: the sums are not finite.
     """
-    named = dict(tensors_of(params, blocks))
-    value = _NegativeBound.apply(processes, inducing, list(named), *named.values())
-    return value  # pyright: ignore[reportReturnType]
 
-
-class _NegativeBound(torch.autograd.Function):
-    """The bound; forward computes the gradient too."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        processes: Sequence[Process],
-        inducing: Sequence[Features],
-        places: list[Place],
-        *tensors: Tensor,
-    ) -> Tensor:
-        named = dict(zip(places, (t.detach() for t in tensors), strict=True))
-        params, blocks = from_tensors(named)
+    def value(params: Parameters, blocks: Sequence[Block]) -> Valued:
         basis = latent_basis(processes, params, inducing, components_of(blocks[0]))
         sums = accumulate(basis, blocks)
         posterior = SparsePosterior.of(basis, sums)
-        needs = ctx.needs_input_grad[3:]
-        ctx.wanted = [i for i, need in enumerate(needs) if need]
-        if ctx.wanted:
-            deep = any(needs[len(params) :])
-            gradient = _BoundGradient(posterior, deep).over(blocks)
-            ctx.save_for_backward(
-                *(gradient.get(places[i], torch.zeros_like(tensors[i])) for i in ctx.wanted)
-            )
-        return bound_of(sums, posterior)
+        return bound_of(sums, posterior), lambda deep: _BoundGradient(posterior, deep).over(blocks)
 
-    @staticmethod
-    def backward(ctx: Any, *grad: Tensor) -> tuple[Any, ...]:
-        gradients: list[Tensor | None] = [None] * len(ctx.needs_input_grad)
-        for i, saved in zip(ctx.wanted, ctx.saved_tensors, strict=True):
-            gradients[3 + i] = grad[0] * saved
-        return tuple(gradients)
+    return with_gradient(value, params, blocks)
 
 
 class _BoundGradient:

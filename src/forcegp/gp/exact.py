@@ -9,14 +9,16 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from forcegp.gp.capacity import require_exact_fits
 from forcegp.gp.factor import bordered
 from forcegp.gp.features import Features
 from forcegp.gp.kernel_terms import kernel_terms
 from forcegp.gp.kernels import Parameters, sub
-from forcegp.gp.likelihood import Conditioned, condition, target_of
+from forcegp.gp.likelihood import Conditioned, condition, require_exact_fits, target_of
 from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors
-from forcegp.gp.structured_covariance import Block, Process, cross_gram, gram
+from forcegp.gp.structured_covariance import Block, Process, chunked, cross_gram, gram
+
+CHUNK_COLUMNS = 700
+"""Columns of the triangular solve that are held at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,11 @@ class ExactPosterior:
         """Factorisation of the covariance of the rows, computed when first needed after loading."""
         require_exact_fits(self.blocks, learning=False)
         return condition(self.processes, self.params, self.blocks)
+
+    @property
+    def jitter(self) -> float:
+        """Added to the diagonal to factorise, relative to unit noise."""
+        return self.conditioned.jitter
 
     def updated(self, blocks: Sequence[Block]) -> ExactPosterior:
         """Conditioned on further rows too: O(r n²) for r of them beside n, where a refit takes O((n + r)³).
@@ -110,6 +117,9 @@ class ExactPosterior:
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
         """Posterior mean of process p at standardized features, `(n, components)`."""
+        if not self.measured[p]:
+            x, components = next(iter(features.values())), self.blocks[0].operators[p].shape[-1]
+            return x.new_zeros(len(x), components)
         parts = [
             (kernel(features) @ w[..., None])[..., 0]
             for kernel, w in zip(self.kernels_to_data[p], self._weights[p], strict=True)
@@ -117,21 +127,20 @@ class ExactPosterior:
         return sum(parts[1:], start=parts[0]).mT
 
     def covariance(self, block: Block) -> Tensor:
-        """Posterior covariance of the rows of each sample of a block, `(n, r, r)`."""
-        n, d = block.target.shape
-        prior = sum(
-            torch.einsum("nak,kn,nbk->nab", W, self._prior_variance(p, block.features[p]), W)
-            for p, W in enumerate(block.operators)
-        )
-        cross = cross_gram(self.processes, self.params, self.blocks, [block])
-        V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
-        V = V.reshape(len(V), n, d).transpose(0, 1)
-        covariance = prior - V.mT @ V
+        """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise."""
+        d = block.target.shape[-1]
+        parts = [block.target.new_zeros(0, d, d)]
+        for own in chunked([block], max(1, CHUNK_COLUMNS // max(d, 1))):
+            cross = cross_gram(self.processes, self.params, self.blocks, [own])
+            V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
+            V = V.reshape(len(V), -1, d).transpose(0, 1)
+            prior = V.new_zeros(())
+            for process, x, W in zip(self.processes, own.features, own.operators, strict=True):
+                variance = process.kernel.diagonal(sub(self.params, process.prefix), x)
+                prior = prior + torch.einsum("nak,kn,nbk->nab", W, variance, W)
+            parts.append(prior - V.mT @ V)
+        covariance = torch.cat(parts)
         return 0.5 * (covariance + covariance.mT)
-
-    def _prior_variance(self, p: int, features: Features) -> Tensor:
-        process = self.processes[p]
-        return process.kernel.diagonal(sub(self.params, process.prefix), features)
 
     def log_likelihood(self) -> Tensor:
         """log p(y) of the rows without their constant, −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π."""

@@ -9,12 +9,11 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from forcegp.gp.blocks import points
 from forcegp.gp.decomposition import split
 from forcegp.gp.features import Features, stacked
-from forcegp.gp.kernels import Kernel, Linear, Parameters, Product, Sum, sub
+from forcegp.gp.kernels import Kernel, Linear, Parameters, Product, Stationary, Sum, sub
 from forcegp.gp.pathwise import Basis
-from forcegp.gp.stationary import Stationary
+from forcegp.gp.structured_covariance import points
 
 
 def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> list[tuple[Basis, Tensor]]:

@@ -16,12 +16,22 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.draws import ConstantDraw, FunctionDraw, LinearDraw, OuterDraw, ProductDraw, SumDraw
+from forcegp.gp.draws import (
+    ConstantDraw,
+    FourierDraw,
+    FunctionDraw,
+    LinearDraw,
+    OuterDraw,
+    ProductDraw,
+    SumDraw,
+)
 from forcegp.gp.features import Features, stacked
 
 Parameters = Mapping[str, Tensor]
 Initial = dict[str, Tensor]
 
+LARGEST_EXPONENT = 300.0
+"""exp(−300) is far below rounding and far above the denormal numbers that slow processors down."""
 LINEAR_PAIRS = 8
 """How many times fewer random features a factor of a product has for each linear factor of the other one."""
 
@@ -33,6 +43,9 @@ def sub(params: Parameters, prefix: str) -> dict[str, Tensor]:
 
 class Kernel(ABC):
     """A covariance function of `k` independent outputs."""
+
+    is_finite: bool = False
+    """Whether k(x, x′) = φ(x)ᵀφ(x′) with a finite number of features φ."""
 
     @abstractmethod
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
@@ -104,6 +117,8 @@ class Linear(Kernel):
     shared: bool = False
     offset: float | None = None
 
+    is_finite = True
+
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = width_of(self.inputs, widths)
         # Standardized inputs have unit variance: every column and the bias get the same share.
@@ -148,6 +163,8 @@ class Constant(Kernel):
 
     group: int = 1
 
+    is_finite = True
+
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         return {"log_scale": torch.zeros(outputs // self.group, dtype=torch.float64)}
 
@@ -166,6 +183,108 @@ class Constant(Kernel):
 
 
 @dataclass(frozen=True)
+class Stationary(Kernel):
+    """σ² g(r) of the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination).
+
+    With `shared=True` the length-scales are those of all outputs, each with its own σ: fewer hyperparameters
+    to overfit, and one distance to compute.
+    """
+
+    inputs: tuple[str, ...] | None = None
+    shared: bool = False
+
+    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
+        width = width_of(self.inputs, widths)
+        scale = math.log(math.sqrt(width))
+        return {
+            "log_lengthscale": torch.full((1 if self.shared else outputs, width), scale, dtype=torch.float64),
+            "log_std": torch.zeros(outputs, dtype=torch.float64) + log_std,
+        }
+
+    @abstractmethod
+    def profile(self, r2: Tensor) -> Tensor:
+        """g as a function of r²."""
+
+    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        return self.towards(params, x2)(x1)
+
+    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
+        inverse = torch.exp(-params["log_lengthscale"])[:, None, :]
+        b = stacked(x2, self.inputs) * inverse
+        squares = (b * b).sum(-1)[:, None, :]
+        variance = torch.exp(2.0 * params["log_std"])[:, None, None]
+
+        def covariance(x1: Features) -> Tensor:
+            a = stacked(x1, self.inputs) * inverse
+            r2 = torch.baddbmm((a * a).sum(-1)[:, :, None] + squares, a, b.mT, alpha=-2.0)
+            return variance * self.profile(r2)
+
+        return covariance
+
+    def diagonal(self, params: Parameters, x: Features) -> Tensor:
+        n = next(iter(x.values())).shape[0]
+        return torch.exp(2.0 * params["log_std"])[:, None].expand(-1, n)
+
+    @abstractmethod
+    def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        """Draws from the spectral density of g at unit length-scales."""
+
+    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+        lengthscale = params["log_lengthscale"].exp()
+        # Components that share length-scales share frequencies too; their weights are independent.
+        k, width = lengthscale.shape
+        omega = self.frequencies((k, features, width), generator).to(lengthscale) / lengthscale[:, None, :]
+        phase = 2.0 * math.pi * torch.rand(k, features, dtype=torch.float64, generator=generator)
+        return FourierDraw(self.inputs, omega, phase.to(lengthscale), params["log_std"].exp())
+
+
+@dataclass(frozen=True)
+class SquaredExponential(Stationary):
+    """k = σ² exp(−r²/2), a length-scale for each input and, unless shared, output (eq. 31)."""
+
+    def profile(self, r2: Tensor) -> Tensor:
+        return torch.exp((-0.5 * r2).clamp(-LARGEST_EXPONENT, 0.0))
+
+    def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        return torch.randn(shape, dtype=torch.float64, generator=generator)
+
+
+class _Matern(Stationary):
+    degrees: int
+
+    def _radius(self, r2: Tensor) -> Tensor:
+        # The floor keeps the derivative of the square root finite where two inputs coincide.
+        return (self.degrees * r2.clamp(min=1e-30)).sqrt().clamp(max=LARGEST_EXPONENT)
+
+    def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        normal = torch.randn(shape, dtype=torch.float64, generator=generator)
+        chi2 = torch.randn(*shape[:-1], self.degrees, dtype=torch.float64, generator=generator)
+        return normal / ((chi2**2).sum(-1, keepdim=True) / self.degrees).sqrt()
+
+
+@dataclass(frozen=True)
+class Matern32(_Matern):
+    """k = σ² (1 + √3 r) exp(−√3 r)."""
+
+    degrees = 3
+
+    def profile(self, r2: Tensor) -> Tensor:
+        r = self._radius(r2)
+        return (1.0 + r) * torch.exp(-r)
+
+
+@dataclass(frozen=True)
+class Matern52(_Matern):
+    """k = σ² (1 + √5 r + 5r²/3) exp(−√5 r)."""
+
+    degrees = 5
+
+    def profile(self, r2: Tensor) -> Tensor:
+        r = self._radius(r2)
+        return (1.0 + r + r * r / 3.0) * torch.exp(-r)
+
+
+@dataclass(frozen=True)
 class Sum(Kernel):
     """k = k_1 + k_2 (remark 3.2)."""
 
@@ -176,23 +295,36 @@ class Sum(Kernel):
         half = log_std - 0.5 * math.log(2.0)
         return _sides(self.left.initial(outputs, widths, half), self.right.initial(outputs, widths, half))
 
+    @staticmethod
+    def combined(left: Tensor, right: Tensor) -> Tensor:
+        """The covariance from those of the two sides."""
+        return left + right
+
+    @property
+    def is_finite(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.left.is_finite and self.right.is_finite
+
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         left = self.left.covariance(sub(params, "left"), x1, x2)
-        return left + self.right.covariance(sub(params, "right"), x1, x2)
+        return self.combined(left, self.right.covariance(sub(params, "right"), x1, x2))
 
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         left = self.left.towards(sub(params, "left"), x2)
         right = self.right.towards(sub(params, "right"), x2)
-        return lambda x1: left(x1) + right(x1)
+        return lambda x1: self.combined(left(x1), right(x1))
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        return self.left.diagonal(sub(params, "left"), x) + self.right.diagonal(sub(params, "right"), x)
+        left = self.left.diagonal(sub(params, "left"), x)
+        return self.combined(left, self.right.diagonal(sub(params, "right"), x))
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return SumDraw(
-            self.left.draw(sub(params, "left"), features, generator),
-            self.right.draw(sub(params, "right"), features, generator),
-        )
+        return SumDraw(*self._sides_drawn(params, features, generator))
+
+    def _sides_drawn(
+        self, params: Parameters, features: int, generator: torch.Generator
+    ) -> tuple[FunctionDraw, FunctionDraw]:
+        left = self.left.draw(sub(params, "left"), features, generator)
+        return left, self.right.draw(sub(params, "right"), features, generator)
 
 
 @dataclass(frozen=True)
@@ -202,17 +334,9 @@ class Product(Sum):
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         return _sides(self.left.initial(outputs, widths, log_std), self.right.initial(outputs, widths))
 
-    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        left = self.left.covariance(sub(params, "left"), x1, x2)
-        return left * self.right.covariance(sub(params, "right"), x1, x2)
-
-    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
-        left = self.left.towards(sub(params, "left"), x2)
-        right = self.right.towards(sub(params, "right"), x2)
-        return lambda x1: left(x1) * right(x1)
-
-    def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        return self.left.diagonal(sub(params, "left"), x) * self.right.diagonal(sub(params, "right"), x)
+    @staticmethod
+    def combined(left: Tensor, right: Tensor) -> Tensor:
+        return left * right
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         # A sum is multiplied out: its terms have features of unequal number and size, and those of a term
@@ -231,13 +355,9 @@ class Product(Sum):
         if linear:
             # A linear factor has few features and all of them matter, so the other one is given fewer.
             few = max(1, features // (LINEAR_PAIRS * linear))
-            return OuterDraw(
-                self.left.draw(sub(params, "left"), few, generator),
-                self.right.draw(sub(params, "right"), few, generator),
-            )
+            return OuterDraw(*self._sides_drawn(params, few, generator))
         # Features of the two factors are paired at random, so that their number does not multiply.
-        left = self.left.draw(sub(params, "left"), features, generator)
-        right = self.right.draw(sub(params, "right"), features, generator)
+        left, right = self._sides_drawn(params, features, generator)
         return ProductDraw(left, right, features, int(torch.randint(2**31, (1,), generator=generator)))
 
 

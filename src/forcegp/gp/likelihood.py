@@ -1,18 +1,30 @@
-"""Exact marginal likelihood of whitened rows, with its gradient in closed form (eqs. 10 and 11)."""
+"""Exact marginal likelihood of whitened rows, with its gradient in closed form (eqs. 10 and 11).
+
+Exact inference takes memory that grows with the square of the rows: what would not fit is refused beforehand.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from forcegp.errors import ModelError
 from forcegp.gp.kernels import Parameters
-from forcegp.gp.structured_covariance import Block, GramGradient, Process, gram, gram_gradient
+from forcegp.gp.structured_covariance import Block, Gradient, Place, Process, gram, gram_gradient
 from forcegp.linalg import cholesky, cholesky_inverse_
+from forcegp.memory import announce_memory, free_memory
+
+MATRICES_TO_LEARN = 3.0
+"""Square matrices of all rows that learning holds at once: the covariance, its factor and a copy."""
+MATRICES_TO_CONDITION = 2.0
+"""Those that conditioning holds: the covariance and its factor."""
+SHARE = 0.8
+"""Fraction of the free memory that exact inference may take."""
 
 
 @dataclass(frozen=True)
@@ -45,73 +57,16 @@ def condition(priors: Sequence[Process], params: Parameters, blocks: Sequence[Bl
     Raises:
         NumericalError: the covariance is not positive definite.
     """
+    y = target_of(blocks)
     L, jitter = cholesky(gram(priors, params, blocks))
-    alpha = torch.cholesky_solve(target_of(blocks)[:, None], L)[:, 0]
+    alpha = torch.cholesky_solve(y[:, None], L)[:, 0]
     return Conditioned(L, alpha, jitter)
 
 
-class _NegativeLogLikelihood(torch.autograd.Function):
-    """½ yᵀK⁻¹y + ½ log|K| + ½ n log 2π; forward computes the gradient too, from one factorisation."""
-
-    @staticmethod
-    def forward(ctx: Any, priors: Sequence[Process], layout: _Layout, *tensors: Tensor) -> Tensor:
-        params, blocks = layout.unpack(tensors)
-        fit = condition(priors, params, blocks)
-        value = fit.negative_log_likelihood(target_of(blocks))
-        needs = ctx.needs_input_grad[2:]
-        if any(needs):
-            K_inv = cholesky_inverse_(fit.L)
-            deep = any(needs[len(layout.params) :])
-            gradient = gram_gradient(priors, params, blocks, K_inv, fit.alpha, deep)
-            ctx.save_for_backward(*layout.pack_gradient(gradient, fit.alpha, blocks))
-        layout.jitter = fit.jitter
-        return value
-
-    @staticmethod
-    def backward(ctx: Any, *grad: Tensor) -> tuple[Any, ...]:
-        return (None, None, *(grad[0] * g for g in ctx.saved_tensors))
-
-
-class _Layout:
-    """Flattens hyperparameters and blocks into the list of tensors that autograd wants, and back."""
-
-    def __init__(self, params: Parameters, blocks: Sequence[Block]) -> None:
-        self.params = list(params)
-        self.names = [[list(f) for f in block.features] for block in blocks]
-        self.jitter = 0.0
-
-    @staticmethod
-    def pack(params: Parameters, blocks: Sequence[Block]) -> list[Tensor]:
-        tensors = list(params.values())
-        for block in blocks:
-            tensors += [x for f in block.features for x in f.values()]
-            tensors += [*block.operators, block.target]
-        return tensors
-
-    def unpack(self, tensors: Sequence[Tensor]) -> tuple[dict[str, Tensor], list[Block]]:
-        flow = iter(t.detach() for t in tensors)
-        params = {key: next(flow) for key in self.params}
-        blocks = []
-        for names in self.names:
-            features = tuple({key: next(flow) for key in keys} for keys in names)
-            operators = tuple(next(flow) for _ in names)
-            blocks.append(Block(features, operators, next(flow)))
-        return params, blocks
-
-    @staticmethod
-    def pack_gradient(gradient: GramGradient, alpha: Tensor, blocks: Sequence[Block]) -> list[Tensor]:
-        tensors = list(gradient.params.values())
-        for g, block in enumerate(blocks):
-            tensors += [x for f in gradient.features[g] for x in f.values()]
-            own, alpha = alpha[: block.rows], alpha[block.rows :]
-            tensors += [*gradient.operators[g], own.reshape(block.target.shape)]
-        return tensors
-
-
-def negative_log_likelihood(
-    priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]
-) -> tuple[Tensor, float]:
+def negative_log_likelihood(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
     """Negative log marginal likelihood of whitened rows, differentiable in all that it is made of.
+
+    Value and gradient come from one factorisation.
 
     Args:
         priors: the force priors.
@@ -119,11 +74,128 @@ def negative_log_likelihood(
         blocks: whitened rows.
 
     Returns:
-        The scalar, and the jitter that the factorisation needed.
+        The scalar.
 
     Raises:
         NumericalError: the covariance is not positive definite.
     """
-    layout = _Layout(params, blocks)
-    value = _NegativeLogLikelihood.apply(priors, layout, *layout.pack(params, blocks))
-    return value, layout.jitter  # pyright: ignore[reportReturnType]
+
+    def value(params: Parameters, blocks: Sequence[Block]) -> Valued:
+        fit = condition(priors, params, blocks)
+
+        def gradient(deep: bool) -> Gradient:
+            return gram_gradient(priors, params, blocks, cholesky_inverse_(fit.L), fit.alpha, deep)
+
+        return fit.negative_log_likelihood(target_of(blocks)), gradient
+
+    return with_gradient(value, params, blocks)
+
+
+Valued = tuple[Tensor, Callable[[bool], Gradient]]
+"""A value, and what gives its derivatives: those for hyperparameters alone, or for rows too (deep)."""
+
+
+def with_gradient(
+    function: Callable[[Parameters, Sequence[Block]], Valued], params: Parameters, blocks: Sequence[Block]
+) -> Tensor:
+    """The value of a function that knows its own derivatives, as a node of the autograd graph.
+
+    Args:
+        function: of detached hyperparameters and rows; its derivatives are asked for right after the value.
+        params, blocks: what it is evaluated at.
+    """
+    named = dict(_tensors_of(params, blocks))
+    return _WithGradient.apply(function, list(named), *named.values())  # pyright: ignore[reportReturnType]
+
+
+class _WithGradient(torch.autograd.Function):
+    """Computes the gradient beside the value, while what both need is at hand."""
+
+    @staticmethod
+    def forward(ctx: Any, function: Any, places: list[Place], *tensors: Tensor) -> Tensor:
+        params, blocks = _from_tensors(dict(zip(places, (t.detach() for t in tensors), strict=True)))
+        value, gradient_of = function(params, blocks)
+        ctx.wanted = [i for i, need in enumerate(ctx.needs_input_grad[2:]) if need]
+        if ctx.wanted:
+            gradient = gradient_of(any(places[i][0] != "param" for i in ctx.wanted))
+            own = (gradient.get(places[i]) for i in ctx.wanted)
+            pairs = zip(ctx.wanted, own, strict=True)
+            ctx.save_for_backward(*(torch.zeros_like(tensors[i]) if g is None else g for i, g in pairs))
+        return value
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Any, ...]:
+        gradients: list[Tensor | None] = [None] * len(ctx.needs_input_grad)
+        for i, saved in zip(ctx.wanted, ctx.saved_tensors, strict=True):
+            gradients[2 + i] = grad[0] * saved
+        return tuple(gradients)
+
+
+def _tensors_of(params: Parameters, blocks: Sequence[Block]) -> Iterator[tuple[Place, Tensor]]:
+    """Every tensor that a likelihood depends on, by its place."""
+    for key, value in params.items():
+        yield ("param", key), value
+    for g, block in enumerate(blocks):
+        for p, (features, W) in enumerate(zip(block.features, block.operators, strict=True)):
+            for name, x in features.items():
+                yield ("feature", g, p, name), x
+            yield ("operator", g, p), W
+        yield ("target", g), block.target
+
+
+def _from_tensors(named: Mapping[Place, Tensor]) -> tuple[dict[str, Tensor], list[Block]]:
+    """Hyperparameters and blocks of the tensors of `_tensors_of`."""
+    params = {place[1]: x for place, x in named.items() if place[0] == "param"}
+    features: dict[int, dict[int, dict[str, Tensor]]] = {}
+    operators: dict[int, list[Tensor]] = {}
+    for place, x in named.items():
+        if place[0] == "feature":
+            features.setdefault(place[1], {}).setdefault(place[2], {})[place[3]] = x
+        elif place[0] == "operator":
+            operators.setdefault(place[1], []).append(x)
+    blocks = [
+        Block(tuple(features[g][p] for p in range(len(own))), tuple(own), named["target", g])
+        for g, own in operators.items()
+    ]
+    return params, blocks
+
+
+def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
+    """Bytes of memory that exact inference on whitened rows takes at its peak.
+
+    Args:
+        blocks: whitened rows.
+        learning: whether hyperparameters are learned, or the rows conditioned on only.
+    """
+    rows = sum(block.target.numel() for block in blocks)
+    components = sum(W.shape[-1] for W in blocks[0].operators) if blocks else 0
+    samples = [len(block.target) for block in blocks]
+    kernels = max((n * n for n in samples), default=0) * components
+    item = blocks[0].target.element_size() if blocks else 8
+    return int(item * ((MATRICES_TO_LEARN if learning else MATRICES_TO_CONDITION) * rows**2 + kernels))
+
+
+def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available: int | None = None) -> None:
+    """Refuse exact inference that would not fit into memory, and announce what takes most of it.
+
+    Args:
+        blocks: whitened rows.
+        learning: whether hyperparameters are learned.
+        available: bytes that may be taken; by default `SHARE` of what is free.
+
+    Raises:
+        ModelError: it takes more.
+    """
+    free = free_memory()
+    allowed = (None if free is None else int(SHARE * free)) if available is None else available
+    needed = exact_bytes(blocks, learning)
+    rows = sum(block.target.numel() for block in blocks)
+    samples = sum(len(block.target) for block in blocks)
+    if allowed is not None and needed > allowed:
+        raise ModelError(
+            f"exact inference on {samples} samples ({rows} rows) does not fit into memory",
+            expected=f"at most {allowed / 2**30:.1f} GiB",
+            got=f"{needed / 2**30:.1f} GiB",
+            hint='use inference="sparse", or fewer samples',
+        )
+    announce_memory(needed, f"exact inference on {samples} samples ({rows} rows)")

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis, latent_basis
-from forcegp.gp.blocks import chunked, components_of
 from forcegp.gp.diagnostics import Diagnostics
 from forcegp.gp.drift import drifted
 from forcegp.gp.factor import extended
@@ -24,7 +23,7 @@ from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.pathwise import FEATURES, FunctionSamples
 from forcegp.gp.sparse_draws import draw_functions
-from forcegp.gp.structured_covariance import Block, Process
+from forcegp.gp.structured_covariance import Block, Process, chunked, components_of
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 from forcegp.linalg import cholesky
 

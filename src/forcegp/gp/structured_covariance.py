@@ -7,9 +7,10 @@ form of H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by bl
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from itertools import pairwise
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -18,6 +19,13 @@ from forcegp.gp.kernels import Features, Kernel, Parameters, sub
 
 CHUNK_ELEMENTS = 400_000
 """Size of the intermediate arrays of one chunk of samples; they should stay in the processor's cache."""
+
+
+Place = tuple[Any, ...]
+"""("param", name), ("feature", block, process, name), ("operator", block, process) or ("target", block)."""
+
+Gradient = dict[Place, Tensor]
+"""Derivatives by place."""
 
 
 @runtime_checkable
@@ -55,6 +63,32 @@ class Block:
         return self.target.numel()
 
 
+def points(features: Features) -> int:
+    """Number of inputs in a dictionary of features."""
+    return len(next(iter(features.values())))
+
+
+def components_of(block: Block) -> list[int]:
+    """Number of components of each process."""
+    return [W.shape[-1] for W in block.operators]
+
+
+def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
+    """The samples of blocks in blocks of at most so many."""
+    for block in blocks:
+        for first in range(0, len(block.target), samples):
+            yield rows_of(block, slice(first, first + samples))
+
+
+def rows_of(block: Block, own: slice | Tensor) -> Block:
+    """Some of the samples of a block."""
+    return Block(
+        tuple({name: x[own] for name, x in f.items()} for f in block.features),
+        tuple(W[own] for W in block.operators),
+        block.target[own],
+    )
+
+
 def offsets(blocks: Sequence[Block]) -> list[int]:
     """First row of each block, and the number of rows."""
     starts = [0]
@@ -79,62 +113,50 @@ def _add_rows(out: Tensor, W1: Tensor, k: Tensor, W2: Tensor, lower: bool) -> No
         out[i * r : j * r, : n * W2.shape[1]] += (W1[i:j] @ weighted.flatten(2)).flatten(0, 1)
 
 
-def _silent(one: Block, two: Block, p: int) -> bool:
-    """Whether prior p contributes nothing between two blocks."""
-    return not (bool(one.operators[p].any()) and bool(two.operators[p].any()))
+def _pairs(
+    priors: Sequence[Process],
+    params: Parameters,
+    blocks1: Sequence[Block],
+    blocks2: Sequence[Block],
+    lower: bool,
+) -> Iterator[tuple[int, dict[str, Tensor], int, int]]:
+    """Each prior with its hyperparameters, and the pairs of blocks between which it contributes."""
+    for p, prior in enumerate(priors):
+        heard1, heard2 = ([bool(b.operators[p].any()) for b in blocks] for blocks in (blocks1, blocks2))
+        own = sub(params, prior.prefix)
+        for g in range(len(blocks1)):
+            for h in range(g + 1 if lower else len(blocks2)):
+                if heard1[g] and heard2[h]:
+                    yield p, own, g, h
 
 
 def cross_gram(
-    priors: Sequence[Process], params: Parameters, blocks1: Sequence[Block], blocks2: Sequence[Block]
+    priors: Sequence[Process],
+    params: Parameters,
+    blocks1: Sequence[Block],
+    blocks2: Sequence[Block] | None = None,
 ) -> Tensor:
-    """Covariance between the rows of two lists of blocks, `(rows1, rows2)`."""
+    """Covariance between the rows of two lists of blocks, `(rows1, rows2)`.
+
+    Without a second list it is that of the first with itself, of which the lower triangle is valid.
+    """
+    lower, blocks2 = blocks2 is None, blocks1 if blocks2 is None else blocks2
     starts1, starts2 = offsets(blocks1), offsets(blocks2)
     like = blocks1[0].target
     K = torch.zeros(starts1[-1], starts2[-1], dtype=like.dtype, device=like.device)
-    for p, prior in enumerate(priors):
-        own = sub(params, prior.prefix)
-        for g, one in enumerate(blocks1):
-            for h, two in enumerate(blocks2):
-                if _silent(one, two, p):
-                    continue
-                k = prior.kernel.covariance(own, one.features[p], two.features[p])
-                part = K[starts1[g] : starts1[g + 1], starts2[h] : starts2[h + 1]]
-                _add_rows(part, one.operators[p], k, two.operators[p], lower=False)
+    for p, own, g, h in _pairs(priors, params, blocks1, blocks2, lower):
+        one, two = blocks1[g], blocks2[h]
+        k = priors[p].kernel.covariance(own, one.features[p], two.features[p])
+        part = K[starts1[g] : starts1[g + 1], starts2[h] : starts2[h + 1]]
+        _add_rows(part, one.operators[p], k, two.operators[p], lower=lower and g == h)
     return K
 
 
 def gram(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
     """Covariance of the rows of blocks with unit white noise, `(rows, rows)`; the lower triangle is valid."""
-    starts = offsets(blocks)
-    like = blocks[0].target
-    K = torch.zeros(starts[-1], starts[-1], dtype=like.dtype, device=like.device)
-    for p, prior in enumerate(priors):
-        own = sub(params, prior.prefix)
-        for g, one in enumerate(blocks):
-            for h in range(g + 1):
-                two = blocks[h]
-                if _silent(one, two, p):
-                    continue
-                k = prior.kernel.covariance(own, one.features[p], two.features[p])
-                part = K[starts[g] : starts[g + 1], starts[h] : starts[h + 1]]
-                _add_rows(part, one.operators[p], k, two.operators[p], lower=g == h)
+    K = cross_gram(priors, params, blocks)
     K.diagonal().add_(1.0)
     return K
-
-
-@dataclass
-class GramGradient:
-    """Derivatives of a scalar with respect to what a Gram matrix is made of.
-
-    Attributes:
-        params: by hyperparameter name.
-        features: by block, prior and input name.
-        operators: by block and prior.
-    """
-
-    params: dict[str, Tensor]
-    features: list[list[dict[str, Tensor]]]
-    operators: list[list[Tensor]]
 
 
 def gram_gradient(
@@ -143,8 +165,8 @@ def gram_gradient(
     blocks: Sequence[Block],
     K_inv: Tensor,
     alpha: Tensor,
-    with_operators: bool,
-) -> GramGradient:
+    deep: bool,
+) -> Gradient:
     """Derivatives of ½ log|K| + ½ yᵀK⁻¹y, from dK = ½(K⁻¹ − ααᵀ) in closed form.
 
     With G = K⁻¹ − ααᵀ the derivative for the kernel between samples i and j is ½ W_iᵀ G_ij W_j; only
@@ -154,40 +176,32 @@ def gram_gradient(
         priors, params, blocks: as given to `gram`.
         K_inv: `(rows, rows)`, the lower triangle is read.
         alpha: `(rows,)` K⁻¹ y.
-        with_operators: whether to compute derivatives for operators and features too.
+        deep: whether to compute derivatives for targets, operators and features too.
     """
-    starts = offsets(blocks)
-    result = GramGradient(
-        {key: torch.zeros_like(value) for key, value in params.items()},
-        [[{n: torch.zeros_like(x) for n, x in f.items()} for f in block.features] for block in blocks],
-        [[torch.zeros_like(W) for W in block.operators] for block in blocks],
-    )
-    for p, prior in enumerate(priors):
-        own = sub(params, prior.prefix)
-        for g, one in enumerate(blocks):
-            for h in range(g + 1):
-                two = blocks[h]
-                if _silent(one, two, p):
-                    continue
-                leaves, k = _kernel_with_leaves(prior, own, one.features[p], two.features[p], with_operators)
-                into = (result.operators[g][p], result.operators[h][p]) if with_operators else None
-                dk = _kernel_gradient(
-                    K_inv[starts[g] : starts[g + 1], starts[h] : starts[h + 1]],
-                    (alpha[starts[g] : starts[g + 1]], alpha[starts[h] : starts[h + 1]]),
-                    (one.operators[p], two.operators[p]),
-                    k.detach(),
-                    g == h,
-                    into,
-                )
-                grads = torch.autograd.grad(k, list(leaves.values()), dk, allow_unused=True)
-                for (kind, key), grad in zip(leaves, grads, strict=True):
-                    if grad is None:
-                        continue
-                    if kind == "param":
-                        result.params[f"{prior.prefix}.{key}"] += grad
-                    else:
-                        result.features[g if kind == "one" else h][p][key] += grad
-    return result
+    rows = [slice(*pair) for pair in pairwise(offsets(blocks))]
+    total: Gradient = {}
+    if deep:
+        for g, block in enumerate(blocks):
+            total["target", g] = alpha[rows[g]].reshape(block.target.shape)
+            total |= {("operator", g, p): torch.zeros_like(W) for p, W in enumerate(block.operators)}
+    for p, own, g, h in _pairs(priors, params, blocks, blocks, lower=True):
+        one, two = blocks[g], blocks[h]
+        leaves, k = _kernel_with_leaves(priors[p], own, one.features[p], two.features[p], deep)
+        dk = _kernel_gradient(
+            K_inv[rows[g], rows[h]],
+            (alpha[rows[g]], alpha[rows[h]]),
+            (one.operators[p], two.operators[p]),
+            k.detach(),
+            g == h,
+            (total["operator", g, p], total["operator", h, p]) if deep else None,
+        )
+        grads = torch.autograd.grad(k, list(leaves.values()), dk, allow_unused=True)
+        for (kind, key), grad in zip(leaves, grads, strict=True):
+            where = ("feature", g if kind == "one" else h, p, key)
+            place = ("param", f"{priors[p].prefix}.{key}") if kind == "param" else where
+            if grad is not None:
+                total[place] = total[place] + grad if place in total else grad
+    return total
 
 
 def _kernel_with_leaves(

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.blocks import chunked
-from forcegp.gp.structured_covariance import Block
+from forcegp.gp.structured_covariance import Block, chunked
 
 CHUNK_SAMPLES = 1024
 """Samples whose basis functions are held at a time."""

@@ -16,10 +16,9 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
-from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import Measurement, Observation, measurement_of
-from forcegp.forces.projection import prior_mean
-from forcegp.forces.quantities import affine_maps, flat_states, stack
+from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.forces.quantities import affine_maps, flat_states, states
 from forcegp.gp.optimise import Learned, LearningOptions, minimise
 from forcegp.models.base import FitProgress, FitResult, FittedModel, ForceField, Model, Prediction
 from forcegp.models.minibatch import BatchOptions, Loss, train
@@ -229,9 +228,10 @@ class AnalyticalFit(FittedModel):
         values: list[Tensor] = []
         parts: dict[str, slice] = {}
         for first in range(0, max(len(flat.q), 1), CHUNK_STATES):
-            at = flat.rows(slice(first, first + CHUNK_STATES)).at(system)
-            z, parts = stack(affine_maps(system, at, quantity))
-            values.append(prior_mean(system, at, z, AnalyticalMean()))
+            own = flat.rows(slice(first, first + CHUNK_STATES))
+            at = states(system, own.q, own.qd, own.tau, own.active)
+            z, parts = affine_maps(system, at, quantity)
+            values.append(z.o + (z.B_Q @ AnalyticalMean()(system, at)[..., None])[..., 0])
         mean = torch.cat(values)
         return Prediction(mean.reshape(*flat.batch, mean.shape[-1]), None, parts)
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
+from forcegp.forces.linearization import ForceLinearization, linearize_field
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Prediction
 from forcegp.models.show import fit_table, model_line
@@ -91,6 +92,34 @@ class Predictor(ABC):
         raise ModelError(
             f"a {self.kind!r} model has no function samples", hint="use StructuredGP, or samples=0"
         )
+
+    def linearize(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        *,
+        active: Tensor | None = None,
+        system: ConstrainedSystem | None = None,
+    ) -> ForceLinearization:
+        """Mean acceleration and multiplier with their Jacobians by q, q̇ and τ, for control and filters.
+
+        Args:
+            q, qd, tau: `(*batch, nq)` states.
+            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            system: another system to predict on.
+
+        Raises:
+            ModelError: the model knows no forces.
+            ShapeError: an argument does not fit the system.
+        """
+        force = self.force_field()
+        if force is None:
+            raise ModelError(
+                f"a {self.kind!r} model has no force field to linearize",
+                hint="use StructuredGP or AnalyticalModel",
+            )
+        return linearize_field(force, system or self.system, q, qd, tau, active)
 
     def rollout(
         self,

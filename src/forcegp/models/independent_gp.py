@@ -17,7 +17,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
-from forcegp.forces.measurements import NoiseStd, Observation, measurement_of
+from forcegp.forces.measurements import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import flat_states
 from forcegp.forces.start import bounds_of, initial_hyperparameters, negative_log_prior
@@ -187,7 +187,7 @@ def _learn(
     constant = training.constant(joint)
 
     def objective(tensors: dict[str, Tensor]) -> Tensor:
-        value, _ = negative_log_likelihood([prior], tensors, blocks)
+        value = negative_log_likelihood([prior], tensors, blocks)
         return value + constant + negative_log_prior(tensors, start)
 
     recorded = objective if saved is None else saved.recorded(objective)
@@ -308,8 +308,7 @@ class IndependentFit(FittedModel):
         return Prediction(mean, torch.diag_embed(torch.cat(variances).reshape(mean.shape)), parts)
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
-        noise = None if self.noise_std is None else torch.as_tensor(self.noise_std).tolist()
-        settings = IndependentSettings(noise_std=tuple(noise) if isinstance(noise, list) else noise)
+        settings = IndependentSettings(noise_std=plain(self.noise_std))
         tensors = {f"training.{name}": value for name, value in self.training.features.items()}
         tensors |= {"training.qdd": self.training.qdd, "training.noise_std": self.training.noise_std}
         tensors |= {f"hyperparameters.{name}": value for name, value in self.hyperparameters.items()}

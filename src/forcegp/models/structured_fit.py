@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,20 +14,20 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.coulomb import coupled
-from forcegp.forces.inference import forces_and_constant, jitter_of, log_likelihood
-from forcegp.forces.learn import Problem, analytical_parameters
+from forcegp.forces.identifiability import doubts_of
+from forcegp.forces.inference import forces_and_constant, log_likelihood
+from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, flat_states, stack
+from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
 from forcegp.forces.samples import draw_samples
-from forcegp.forces.torque_noise import TORQUE_NOISE, stick_variance
+from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
-from forcegp.models.doubts import constant_inputs, doubts, inference_of, mean_correlation
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
 
@@ -102,26 +103,27 @@ class StructuredFit(FittedModel):
             ShapeError: a state or `active` does not fit the system.
         """
         system = system or self.system
-        flat = flat_states(system, q, qd, tau, active)
-        at = self._with_acceleration(system, flat.at(system)) if covariance else flat.at(system)
-        z, parts = stack(affine_maps(system, at, quantity))
-        mean = self.posterior.read_mean(system, at, z)
-        spread = self.posterior.read_covariance(system, at, z) if covariance else None
-        if spread is not None:
-            z = coupled(system, at, z, self.posterior.coulomb)
-            spread = spread + _carried(z, stick_variance(self.hyperparameters, at))
+        at, batch = states_at(system, q, qd, tau, active)
+        if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
+            at = self._with_acceleration(system, at)
+        z, parts = affine_maps(system, at, quantity)
+        rows = self.posterior.rows(system, at, z)
+        mean, spread = self.posterior.mean_of(rows), None
+        if covariance:
+            spread = self.posterior.latent.covariance(rows)
+            z = coupled(system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
+            if STICK_NOISE in self.hyperparameters:
+                spread = spread + _carried(z, stick_variance(self.hyperparameters, at))
             if noise:
                 spread = spread + self._noise_covariance(z, parts)
         return Prediction(
-            mean.reshape(*flat.batch, z.o.shape[-1]),
-            None if spread is None else spread.reshape(*flat.batch, *spread.shape[-2:]),
+            mean.reshape(*batch, z.o.shape[-1]),
+            None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
             parts,
         )
 
     def _with_acceleration(self, system: ConstrainedSystem, at: States) -> States:
         """The states with the predicted acceleration, which errors of the inertia are multiplied by."""
-        if not any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
-            return at
         qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
         return dataclasses.replace(at, qdd=qdd)
 
@@ -265,12 +267,11 @@ class StructuredFit(FittedModel):
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
             sensor: whether the noise of the quantity's own sensor counts beside that of the torque.
         """
-        flat = flat_states(self.system, q, qd, tau, active)
-        at = flat.at(self.system)
-        z, parts = stack(affine_maps(self.system, at, quantity))
-        z = coupled(self.system, at, z, self.posterior.coulomb)
+        at, batch = states_at(self.system, q, qd, tau, active)
+        z, parts = affine_maps(self.system, at, quantity)
+        z = coupled(self.system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
         noise = self._noise_covariance(z, parts if sensor else {}).diagonal(dim1=-2, dim2=-1)
-        return noise.reshape(*flat.batch, z.o.shape[-1])
+        return noise.reshape(*batch, z.o.shape[-1])
 
 
 def _carried(z: AffineMap, variance: Tensor) -> Tensor:
@@ -285,14 +286,6 @@ def _sparse(posterior: ForcePosterior) -> SparsePosterior:
             hint='make the model with inference="sparse", or condition it on the data that count',
         )
     return posterior.latent
-
-
-def learned_system(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> ConstrainedSystem:
-    """The system with the learned robot, detached."""
-    if not analytical_parameters(hyperparameters):
-        return problem.system
-    with torch.no_grad():
-        return problem.system_at(hyperparameters)
 
 
 @torch.no_grad()
@@ -319,31 +312,51 @@ def conditioned(
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
+    names = enumerate(problem.training.quantities)
+    noise = {quantity: typical(problem.noise_at(hyperparameters, i)) for i, quantity in names}
     posterior, constant = forces or forces_and_constant(problem, hyperparameters)
-    system = learned_system(problem, hyperparameters)
-    likelihood = log_likelihood(posterior) - float(constant)
+    likelihood, jitter = log_likelihood(posterior) - float(constant), posterior.latent.jitter
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
-    jitter = jitter_of(posterior)
+    training, system = problem.training, problem.system_at(hyperparameters)
+    doubts, lost = doubts_of(posterior, system, training), _lost(posterior)
     result = FitResult.of(
         learned,
         log_marginal_likelihood=likelihood,
         jitter=jitter,
-        constant_inputs=constant_inputs(problem.priors, problem.training),
-        force_correlation=mean_correlation(posterior, system, problem.training),
-        warnings=(*warnings, *doubts(posterior, system, problem.training, jitter)),
-        samples=problem.training.all_samples,
+        constant_inputs=tuple(
+            f"{prior.name}.{name}"
+            for prior, scale in zip(problem.priors, training.scales, strict=True)
+            for name in scale.constant
+        ),
+        force_correlation=doubts.correlation,
+        warnings=(*warnings, *doubts.warnings, *_more_points(lost)),
+        samples=training.all_samples,
         learned_on=learned_on,
-        **inference_of(posterior),
+        **lost,
     )
-    noise = typical_noise(problem, hyperparameters)
     return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)
 
 
-def typical_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Standard deviation of a measurement of each measured quantity, `(d,)`; the last one where two measure
-    it."""
-    found = {}
-    for i, quantity in enumerate(problem.training.quantities):
-        std = problem.noise_at(hyperparameters, i)
-        found[quantity] = std if std.ndim == 1 else std.square().mean(0).sqrt()
-    return found
+def _lost(posterior: ForcePosterior) -> dict[str, Any]:
+    """Which inference a posterior has, and what a sparse one loses by its inducing points."""
+    if not isinstance(posterior.latent, SparsePosterior):
+        return {"inference": "exact"}
+    found = posterior.latent.diagnostics
+    return {
+        "inference": "sparse",
+        "basis_functions": found.size,
+        "determined": found.learned,
+        "missed": found.missed,
+        "more_points_would_help": found.more_points_would_help,
+    }
+
+
+def _more_points(lost: Mapping[str, Any]) -> tuple[str, ...]:
+    """A warning where inducing points miss much of what the data could tell."""
+    if not lost.get("more_points_would_help"):
+        return ()
+    return (
+        f"more inducing points would help: {lost['basis_functions']} basis functions miss a variance of "
+        f"{lost['missed']:.3g} in units of the noise, where noise leaves {lost['determined']:.3g}; raise "
+        "inducing_points",
+    )

@@ -13,16 +13,23 @@ from typing import Any
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.footprint import announce_states
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.inference import check_method
-from forcegp.forces.learn import Problem, Search
-from forcegp.forces.mean import AnalyticalMean, mean_of
+from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior, check_priors
+from forcegp.forces.priors.base import (
+    ANALYTICAL,
+    COULOMB,
+    NOISE,
+    AnalyticalMean,
+    ForcePrior,
+    check_priors,
+    mean_of,
+)
 from forcegp.forces.priors.default import default_priors
+from forcegp.forces.start import Search, initial
 from forcegp.forces.state_noise import state_std_of
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions, Progress
@@ -36,8 +43,8 @@ from forcegp.storage.system import pack_system
 
 FIT_COPIES = 3.0
 """Memory of a fit besides the matrices of its inference, in that of the equations of motion."""
-WITH_PARAMETERS = LearningOptions(tolerance=1e-9)
-"""Default options where θ_A is learned too: L-BFGS then stalls on its way for a step or two."""
+OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
+"""Default options, also where θ_A is learned too: L-BFGS then stalls on its way for a step or two."""
 
 
 class StructuredGP(Model[StructuredFit]):
@@ -196,10 +203,10 @@ class StructuredGP(Model[StructuredFit]):
         if self._fitted is None:
             self.specification = self.specification.for_data(known)
         spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
-        options = options or (LearningOptions() if spec.parameters is None else WITH_PARAMETERS)
-        chosen = self._chosen(learn)
-        training, doubts = in_motion(spec, self._training(known, chosen))
-        announce_states(spec.system, training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
+        options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
+        chosen = None if learn is None else self._chosen(learn)
+        training, doubts = self._training(known, chosen)
+        spec.system.announce_states(training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
         log = None
         if sample is not None:
             training = dataclasses.replace(training, part_of=sample.count)
@@ -212,7 +219,8 @@ class StructuredGP(Model[StructuredFit]):
                 saved = Checkpoint(file, _key(spec, problem, search, begin))
                 saved.read(search.start)
                 search = dataclasses.replace(search, recorded=saved.recorded)
-            lesson = solve(spec, problem, search, _reported(progress, options), begin, neighbours)
+            report = None if progress is None else _reported(progress, options)
+            lesson = solve(spec, problem, search, report, begin, neighbours)
             if saved is not None:
                 saved.write()
         else:
@@ -230,10 +238,12 @@ class StructuredGP(Model[StructuredFit]):
                     kept.remove()
         return fitted
 
-    def _search(self, problem: Problem, chosen: Sequence[str], options: LearningOptions) -> Search:
+    def _search(self, problem: Problem, chosen: Sequence[str] | None, options: LearningOptions) -> Search:
         """What is learned of a problem, from where, and what keeps its values."""
         spec = self.specification
-        start = problem.initial(spec.learn_noise, spec.learns_torque_noise)
+        start = initial(problem, spec.learn_noise, spec.learns_torque_noise)
+        if chosen is None:
+            return Search(start, {}, options)
         before = {} if self._fitted is None else self._fitted.hyperparameters
         current = {key: before.get(key, value) for key, value in start.items()}
         held = {key: value for key, value in current.items() if key.split(".")[0] not in chosen}
@@ -254,7 +264,7 @@ class StructuredGP(Model[StructuredFit]):
             ModelError: the model has not been fitted, or the data do not fit it.
         """
         fitted = self.fitted
-        training = self._training(data, learned=())
+        training, doubts = self._training(data, learned=())
         if self.specification.learn_noise and training.quantities != fitted.training.quantities:
             raise ModelError(
                 "the learned noise belongs to other measurements",
@@ -263,8 +273,8 @@ class StructuredGP(Model[StructuredFit]):
                 hint='call fit(data, learn=["noise"]), which learns the noise alone',
             )
         values = fitted.hyperparameters if hyperparameters is None else hyperparameters
-        spec, (moving, doubts) = self.specification, in_motion(self.specification, training)
-        problem = prepared(spec, dataclasses.replace(fitted.problem, training=moving), values)
+        spec = self.specification
+        problem = prepared(spec, dataclasses.replace(fitted.problem, training=training), values)
         return self.adopt(conditioned(spec, problem, values, warnings=doubts))
 
     def update(self, data: Dataset | Sequence[Observation]) -> StructuredFit:
@@ -281,7 +291,7 @@ class StructuredGP(Model[StructuredFit]):
             ModelError: the model has not been fitted, or the data measure something else.
         """
         fitted = self.fitted
-        training, _ = in_motion(self.specification, self._training(data, learned=()))
+        training, _ = self._training(data, learned=())
         if training.quantities != tuple(fitted.noise):
             raise ModelError(
                 "an update measures other quantities than the fit",
@@ -308,25 +318,29 @@ class StructuredGP(Model[StructuredFit]):
         """
         if isinstance(what, int | float):
             return self.adopt(self.fitted.forgetting(float(what), priors))
-        training, _ = in_motion(self.specification, self._training(what, learned=()))
+        training, _ = self._training(what, learned=())
         return self.adopt(self.fitted.without(training))
 
-    def _chosen(self, learn: Iterable[str] | None) -> tuple[str, ...]:
+    def _chosen(self, learn: Iterable[str]) -> tuple[str, ...]:
         """What is learned, by prefix of its tensors."""
         names = (*(prior.name for prior in self.force_priors), NOISE, ANALYTICAL, COULOMB)
-        chosen = names if learn is None else tuple(learn)
+        chosen = tuple(learn)
         for name in chosen:
             if name not in names:
                 raise UnknownNameError("force prior to learn", name, names)
         return chosen
 
-    def _training(self, data: Dataset | Sequence[Observation], learned: Sequence[str]) -> Training:
-        spec = self.specification
-        kept = {}
-        if self._fitted is not None:
+    def _training(
+        self, data: Dataset | Sequence[Observation], learned: Sequence[str] | None
+    ) -> tuple[Training, tuple[str, ...]]:
+        """What is learned from, with doubts about it; priors that are not learned (`None`: all are) keep the
+        scales of their inputs."""
+        spec, kept, measured = self.specification, {}, self.specification.learns_torque_noise
+        if self._fitted is not None and learned is not None:
             scales = zip(spec.priors, self._fitted.training.scales, strict=True)
             kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
-        return training_of(data, spec.system, spec.priors, spec.noise_std, kept)
+        training = training_of(data, spec.system, spec.priors, spec.noise_std, kept)
+        return in_motion(spec, training) if measured else (training, ())
 
     def adopt(self, fitted: StructuredFit) -> StructuredFit:
         """Predict with this fit from now on."""
@@ -365,12 +379,8 @@ class StructuredGP(Model[StructuredFit]):
         return self.fitted.training
 
 
-def _reported(progress: FitProgress | None, options: LearningOptions) -> Progress:
-    def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
-        if progress is not None:
-            progress(evaluations, options.max_evaluations, value)
-
-    return report
+def _reported(progress: FitProgress, options: LearningOptions) -> Progress:
+    return lambda evaluations, value, _: progress(evaluations, options.max_evaluations, value)
 
 
 def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:

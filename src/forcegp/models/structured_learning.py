@@ -28,12 +28,13 @@ from forcegp.forces.inference import (
     with_inducing,
     without_inducing,
 )
-from forcegp.forces.learn import Problem, Search
+from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.start import Search
 from forcegp.forces.torque_noise import TORQUE_NOISE
-from forcegp.gp.capacity import require_exact_fits
+from forcegp.gp.likelihood import require_exact_fits
 from forcegp.gp.optimise import Learned, Progress
 from forcegp.gp.structured_covariance import Block
 from forcegp.models.structured_spec import Specification

@@ -12,9 +12,9 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem, kernel_parameters
-from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.sparse_tensors import posterior_of_tensors

@@ -15,10 +15,9 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.learn import Problem, analytical_parameters
-from forcegp.forces.mean import AnalyticalMean
-from forcegp.forces.measurements import NoiseStd, Observation, Training, is_simulated, states_noise
+from forcegp.forces.measurements import NoiseStd, Observation, Training, is_simulated, plain, states_noise
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.default import measured_priors
 from forcegp.forces.priors.inertial import InertialPrior
@@ -28,7 +27,7 @@ from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.payload import PayloadPrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.state_noise import state_std_of
-from forcegp.gp import kernels, stationary
+from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.inducing import LIMIT
 from forcegp.gp.sparse import SparsePosterior
@@ -40,9 +39,9 @@ from forcegp.storage.folder import Settings
 from forcegp.storage.system import robot_tensors
 
 CLASSES: dict[str, type] = {
-    "squared_exponential": stationary.SquaredExponential,
-    "matern32": stationary.Matern32,
-    "matern52": stationary.Matern52,
+    "squared_exponential": kernels.SquaredExponential,
+    "matern32": kernels.Matern32,
+    "matern52": kernels.Matern52,
     "linear": kernels.Linear,
     "sum": kernels.Sum,
     "product": kernels.Product,
@@ -101,7 +100,8 @@ class Specification:
         spec = self
         if spec.automatic and not is_simulated(data):
             spec = dataclasses.replace(spec, priors=measured_priors(spec.system), torque_noise="learn")
-        if spec.learns_torque_noise and spec.noise_std is None and not states_noise(data):
+        learns = isinstance(spec.torque_noise, str)
+        if learns and spec.noise_std is None and not states_noise(data):
             spec = dataclasses.replace(spec, learn_noise=True)
         return dataclasses.replace(spec, automatic=False)
 
@@ -116,7 +116,7 @@ class Specification:
         std = None
         if noise is not None and not isinstance(noise, str):
             std = torch.as_tensor(noise, dtype=robot.dtype, device=robot.device).expand(robot.nq)
-        state_std = state_std_of(self.state_noise, robot)
+        state_std = None if self.state_noise is None else state_std_of(self.state_noise, robot)
         return Problem(
             self.system, self.priors, self.mean, training, self.parameters, std, state_std=state_std
         )
@@ -207,10 +207,10 @@ def pack(
     exact = isinstance(latent, ExactPosterior)
     settings = StructuredSettings(
         mean=spec.mean.terms,
-        noise_std=_plain(spec.noise_std),
+        noise_std=plain(spec.noise_std),
         learn_noise=spec.learn_noise,
-        torque_noise=_plain(spec.torque_noise),
-        state_noise=None if spec.state_noise is None else tuple(map(_plain, spec.state_noise)),  # pyright: ignore[reportArgumentType]
+        torque_noise=plain(spec.torque_noise),
+        state_noise=None if spec.state_noise is None else tuple(map(plain, spec.state_noise)),  # pyright: ignore[reportArgumentType]
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
         inducing_points=spec.inducing_points,
         power=problem.power,
@@ -249,14 +249,6 @@ def _tensors_of(training: Training) -> dict[str, Tensor]:
         tensors |= {f"data.{i}.{name}": getattr(m, name) for name in COLUMNS}
         tensors[f"data.{i}.noise_std"] = std
     return tensors
-
-
-def _plain(noise: Any) -> Any:
-    """A noise as what JSON can hold."""
-    if noise is None or isinstance(noise, str):
-        return noise
-    values = torch.as_tensor(noise).tolist()
-    return tuple(values) if isinstance(values, list) else values
 
 
 def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ import torch
 
 from forcegp.destination import check_destination
 from forcegp.files import write_text
-from forcegp.gp.capacity import MATRICES_TO_LEARN
+from forcegp.gp.likelihood import MATRICES_TO_LEARN
 from forcegp.memory import announce_memory
 from forcegp.paper.figures import all_figures
 from forcegp.paper.fits import Fit, noise_std_of, score_fit

@@ -16,13 +16,12 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, split_by_stretches
 from forcegp.forces.identifiability import force_correlation
-from forcegp.forces.mean import AnalyticalMean
 from forcegp.forces.measurements import Observation
+from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import States, states
-from forcegp.gp.kernels import Linear
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Linear, SquaredExponential
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.simulate import SimulationConfig, simulate
 

@@ -14,10 +14,9 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.rollout.conformal import widening
-from forcegp.rollout.forward import rollout_model
+from forcegp.rollout.forward import RolloutOptions, rollout_model
 from forcegp.rollout.integrate import Progress
 from forcegp.rollout.law import ForwardModel
-from forcegp.rollout.options import RolloutOptions
 from forcegp.rollout.trajectory import Bands, Rollout
 
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 10.0)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from contextlib import nullcontext
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
-from forcegp.constraints.footprint import announce_states
 from forcegp.constraints.unilateral import any_row, can_open
+from forcegp.errors import ForceGPError, UnknownNameError
 from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
 from forcegp.rollout.law import ForceLaw, ForwardModel, Law, Problem, State, law_of
-from forcegp.rollout.options import RolloutOptions
 from forcegp.rollout.trajectory import FIELDS, DivergedError, Rollout
 from forcegp.threads import one_thread
 
@@ -31,6 +31,70 @@ FEW = 8
 
 COMPILED_STEPS = 1000
 """Steps from which compiled mechanics save more time than compiling takes."""
+STABILIZATIONS = ("none", "baumgarte", "projection")
+ON_DIVERGENCE = ("raise", "keep")
+
+
+@dataclass(frozen=True)
+class RolloutOptions:
+    """How a rollout is computed.
+
+    Args:
+        dt: step, period of the output, and sampling period of torques passed as an array [s]. By default
+            the sampling period of the torques where they have one (a log, a controller), and 1/240 s for
+            a feedback law; an array has none, so it needs `dt`.
+        method: `semi_implicit_euler` (the simulators' step), `rk4`, or, adaptive within each step,
+            `rk45` and `dop853` of SciPy.
+        stabilization: `none`, `baumgarte` (the system's own terms, or the default ones), other
+            `Baumgarte` terms, or `projection` of q and q̇ onto the manifold after each step.
+        unilateral: whether contacts with a surface open where they would pull, and close again.
+        interpolation: of a torque array between its samples, `hold` or `linear`.
+        speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
+        torque_noise: whether function samples are driven by torques with noise drawn anew for each of them,
+            where the model has learned the noise of logged torques and its correlation in time.
+        on_divergence: `raise` a `DivergedError` that holds the trajectories, or `keep` them.
+
+    Example:
+        >>> RolloutOptions(method="rk4", stabilization="projection", dt=0.002).method
+        'rk4'
+
+    Raises:
+        ForceGPError: a value is out of range.
+        UnknownNameError: unknown method, stabilization or `on_divergence`.
+    """
+
+    dt: float | None = None
+    method: str = "semi_implicit_euler"
+    stabilization: str | Baumgarte = "baumgarte"
+    unilateral: bool = False
+    interpolation: str = "hold"
+    speed_limit: float = 100.0
+    torque_noise: bool = True
+    on_divergence: str = "raise"
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "speed_limit"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < float("inf"):
+                raise ForceGPError(
+                    f"the rollout's {name} is out of range", expected="a positive finite number", got=value
+                )
+        if self.method not in METHODS:
+            raise UnknownNameError("method of integration", self.method, METHODS)
+        if self.on_divergence not in ON_DIVERGENCE:
+            raise UnknownNameError("on_divergence", self.on_divergence, ON_DIVERGENCE)
+        if not isinstance(self.stabilization, Baumgarte) and self.stabilization not in STABILIZATIONS:
+            raise UnknownNameError("stabilization", self.stabilization, STABILIZATIONS)
+
+    def stabilized(self, system: ConstrainedSystem) -> ConstrainedSystem:
+        """The system with the stabilization terms of the rollout in its right-hand side."""
+        terms = self.stabilization if isinstance(self.stabilization, Baumgarte) else None
+        if self.stabilization == "baumgarte":
+            terms = system.baumgarte or Baumgarte()
+        return system if terms == system.baumgarte else dataclasses.replace(system, baumgarte=terms)
+
+
+DEFAULT = RolloutOptions()
 
 
 def rollout(
@@ -70,7 +134,7 @@ def rollout(
         ShapeError: an argument does not fit the robot.
         ModelError: contacts can open but the law has no multiplier, or the period of the torques is missing.
     """
-    options = options or RolloutOptions()
+    options = options or DEFAULT
     batch = torch.broadcast_shapes(q0.shape[:-1], qd0.shape[:-1])
     return _checked(_run(law, system, (q0, qd0), tau, duration, batch, active, options, progress), options)
 
@@ -109,7 +173,7 @@ def rollout_model(
         DivergedError: a trajectory diverged; the error holds what was computed.
         ModelError: the model is not fitted, has no function samples, or cannot leave its own system.
     """
-    options = options or RolloutOptions()
+    options = options or DEFAULT
     batch = torch.broadcast_shapes(q0.shape[:-1], qd0.shape[:-1])
     law, system = law_of(model, system), system or model.system
     shares, start = (2 if samples else 1), (q0, qd0)
@@ -143,8 +207,8 @@ def _run(
     noise: tuple[Tensor, torch.Generator] | None = None,
 ) -> Rollout:
     """Flatten the batch, integrate, and give the result the shape of the whole batch."""
+    n, system = whole.numel(), options.stabilized(system)
     system.robot.check_state(q0=start[0], qd0=start[1])
-    n = whole.numel()
     unilateral = options.unilateral and len(system.contacts) > 0
     inputs = inputs_of(tau, whole if batch is None else batch, n, options.dt, options.interpolation)
     dt = options.dt or inputs.period or STEP
@@ -152,10 +216,14 @@ def _run(
     if noise is not None:
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
     mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
-    problem = Problem(options.stabilized(mechanics), law, inputs, unilateral)
-    announce_states(system, n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
+    problem = Problem(mechanics, law, inputs, unilateral)
+    system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
-    closed = _closed(problem, q, qd) if active is None else active.expand(*whole, -1).reshape(n, -1)
+    closed = torch.ones(n, len(system.contacts), dtype=torch.bool, device=q.device)
+    if active is not None:
+        closed = active.expand(*whole, -1).reshape(n, -1)
+    elif unilateral:
+        closed = _touching(system, q, qd)
     with one_thread() if n <= FEW else nullcontext():
         found = integrate(
             problem,
@@ -171,18 +239,14 @@ def _run(
         name: getattr(found, name).unflatten(0, whole) if whole else getattr(found, name)[0]
         for name in FIELDS
     }
-    return dataclasses.replace(found, system=options.stabilized(system), **shaped)
+    return dataclasses.replace(found, system=system, **shaped)
 
 
-def _closed(problem: Problem, q: Tensor, qd: Tensor) -> Tensor:
-    """Contacts closed at the start `(n, n_contacts)`."""
-    system = problem.system
-    closed = torch.ones(len(q), len(system.contacts), dtype=torch.bool, device=q.device)
-    if not problem.unilateral:
-        return closed
+def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
+    """Contacts that touch, or cannot open `(n, n_contacts)`."""
     with torch.no_grad():
         apart = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
-    return closed & ~(apart & can_open(system, apart))
+    return ~(apart & can_open(system, apart))
 
 
 def _share(progress: Progress | None, part: int, parts: int) -> Progress | None:

@@ -143,7 +143,7 @@ def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
     Raises:
         ModelError: a model of accelerations alone is asked for the motion of another system.
     """
-    force, own = model.force_field(), model.system
+    own, force = model.system, model.force_field()
     if force is not None:
         return ForceLaw(force)
     if system is not None and (system.robot is not own.robot or [*system.contacts] != [*own.contacts]):

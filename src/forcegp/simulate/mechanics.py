@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from forcegp import dynamics
 from forcegp.compiled.mechanics import CompiledMechanics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import Anchor, Constraint, ContactPoint, MovingPoint
@@ -22,7 +23,6 @@ from forcegp.constraints.gauss import RANK_TOLERANCE
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import POTRF, POTRS, ToolMotion, tool_motion
 from forcegp.errors import MissingDependencyError
-from forcegp.friction import JointFriction
 
 Vector = NDArray[np.floating]
 Blocks = Callable[[Vector, Vector], Sequence[Vector]]
@@ -95,7 +95,6 @@ class Mechanics:
         self._anchors = [tool, *(a for contact in system.contacts for a in contact.anchors if a != tool)]
         self._places = [[self._anchors.index(a) for a in contact.anchors] for contact in system.contacts]
         self._rows = np.array([contact.rows for contact in system.contacts], dtype=int)
-        self._friction = JointFriction.of(system.robot)
         self._blocks, self.compiled = _blocks(system, self._anchors)
 
     def equations(self, q: Vector, qd: Vector, active: NDArray[np.bool_] | None = None) -> StateEquations:
@@ -115,7 +114,7 @@ class Mechanics:
         if self._system.baumgarte is not None:
             b = self._system.baumgarte.stabilized(*(torch.from_numpy(x) for x in (b, c, cd))).numpy()
         rows = np.ones(len(b)) if active is None else np.repeat(active, self._rows)
-        Q_D = self._friction.force(torch.from_numpy(qd)).numpy()
+        Q_D = dynamics.damping_force(self._system.robot, torch.from_numpy(qd)).numpy()
         rotation, position, jacobian, bias = frames[0]
         return StateEquations(
             M=M,

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.footprint import announce_states
 from forcegp.constraints.unilateral import any_row, contact_forces, land
 from forcegp.control.plan import Plan, make_plan
 from forcegp.control.task_space import Target, control_torque
@@ -59,7 +58,7 @@ def simulate(
         MemoryLimitError: the log needs more memory than is free.
     """
     system = system.with_robot(system.robot.to(device="cpu"))
-    announce_states(system, config.steps, 1.0, f"a simulation of {config.steps:,} steps")
+    system.announce_states(config.steps, 1.0, f"a simulation of {config.steps:,} steps")
     generator = torch.Generator().manual_seed(config.seed)
     with torch.no_grad(), one_thread():
         plan = make_plan(system, config, generator)

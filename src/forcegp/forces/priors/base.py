@@ -1,15 +1,23 @@
-"""Gaussian-process priors on unknown forces: where a force acts, on what it depends, how it varies."""
+"""What is known of forces before data: the prior mean of Q, and Gaussian-process priors on unknown forces.
+
+A prior says where a force acts, on what it depends and how it varies.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.quantities import States
+from forcegp.forces.quantities import AffineMap, States
+from forcegp.gp.features import Standardization
 from forcegp.gp.kernels import Kernel
+from forcegp.gp.structured_covariance import Block
 from forcegp.robot.model import RobotModel
 
 JOINT, CONTACT, CONSTRAINT = "joint", "contact", "constraint"
@@ -18,6 +26,56 @@ against the constraint (the range of Aᵀ), which no acceleration in contact sho
 NOISE, ANALYTICAL, COULOMB = "noise", "analytical", "coulomb"
 RESERVED = (NOISE, ANALYTICAL, COULOMB)
 """Prefixes of what is learned beside the hyperparameters of the priors."""
+
+ForceMean = Callable[[ConstrainedSystem, States], Tensor]
+"""Prior mean of the joint force Q at states, `(n, nq)`."""
+TERMS = ("bias", "gravity", "friction", "actuation")
+"""Q_C, Q_G, Q_D and Q_u: the known parts of Q."""
+
+
+@dataclass(frozen=True)
+class AnalyticalMean:
+    """m(x; θ_A) = Q_K, the sum of some of Q_C, Q_G, Q_D and Q_u.
+
+    Args:
+        terms: which of `bias`, `gravity`, `friction`, `actuation` are known; none is the zero mean.
+
+    Example:
+        >>> AnalyticalMean(("gravity", "actuation")).terms
+        ('gravity', 'actuation')
+
+    Raises:
+        UnknownNameError: a term does not exist.
+        ModelError: a term is named twice.
+    """
+
+    terms: tuple[str, ...] = TERMS
+
+    def __post_init__(self) -> None:
+        for term in self.terms:
+            if term not in TERMS:
+                raise UnknownNameError("term of the analytical mean", term, TERMS)
+            if self.terms.count(term) > 1:
+                raise ModelError(f"term {term!r} of the analytical mean is named twice", got=self.terms)
+
+    def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
+        """The mean of Q at states, `(n, nq)` [N m, N]."""
+        known = {"bias": at.eom.Q_C, "gravity": at.eom.Q_G, "friction": at.eom.Q_D, "actuation": at.tau}
+        return sum((known[term] for term in self.terms), start=torch.zeros_like(at.q))
+
+
+def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
+    """`"zero"`, `"analytical"` or a mean of one's own.
+
+    Raises:
+        UnknownNameError: a name that is neither.
+    """
+    if isinstance(mean, AnalyticalMean):
+        return mean
+    named = {"zero": AnalyticalMean(()), "analytical": AnalyticalMean()}
+    if mean not in named:
+        raise UnknownNameError("mean", mean, named)
+    return named[mean]
 
 
 class ForcePrior(ABC):
@@ -30,6 +88,8 @@ class ForcePrior(ABC):
     name: str
     kernel: Kernel
     target: str
+    coupled: bool = False
+    """Whether Coulomb friction that is proportional to the multiplier goes with the prior."""
     vectors: tuple[str, ...] = ()
     """Inputs whose components are standardized by one scale, as turning the axes must change nothing."""
     centred: bool = True
@@ -88,3 +148,33 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
             )
     for prior in priors:
         prior.check(system)
+
+
+def prior_rows(
+    priors: Sequence[ForcePrior],
+    scales: Sequence[Standardization],
+    mean: ForceMean,
+    system: ConstrainedSystem,
+    at: States,
+    z: AffineMap,
+) -> Block:
+    """What priors say of a quantity z = B_Q Q + B_z Q_z + o at states.
+
+    Args:
+        priors, scales: the force priors and the standardization of their inputs.
+        mean: prior mean m of Q.
+        system: robot and contacts.
+        at: n states.
+        z: the quantity.
+
+    Returns:
+        Kernel inputs and operators B(x) E(x) of each prior, with o(x) + B(x) m(x) as target.
+    """
+    target = z.o + (z.B_Q @ mean(system, at)[..., None])[..., 0]
+    by_target = {CONTACT: z.B_z, CONSTRAINT: z.B_N}
+    features, operators = [], []
+    for prior in priors:
+        features.append(prior.features(system, at))
+        operators.append(by_target.get(prior.target, z.B_Q) @ prior.operator(system, at))
+    standard = (scale.apply(x) for scale, x in zip(scales, features, strict=True))
+    return Block(tuple(standard), tuple(operators), target)

@@ -1,15 +1,113 @@
-"""A prior on any force at a contact that is tangential to the surface."""
+"""Priors on the tangential force at a contact with a surface, whose inputs are those of the surface.
+
+What touches knows no world axes: vectors along the surface have two coordinates in a tangent frame that turns
+with the surface. The frame at normal n is (R e_x, R e_y), with the smallest rotation R that takes e_z to n.
+So what is learned on one surface holds on one that is raised, tilted or curved.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from abc import abstractmethod
+from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.priors.surface_force import SurfaceForcePrior, tangent_frame
+from forcegp.constraints.contact import ContactPoint, SurfaceContact
+from forcegp.errors import ModelError
+from forcegp.forces.priors.base import CONTACT, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
+from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
+
+WIDTHS = {"position": 2, "velocity": 2, "speed": 1}
+"""Columns of each input: tangential coordinates of the touching point [m] and of its velocity [m/s], and how
+fast it slides [m/s]."""
+FACING_DOWN = 1e-6
+"""A normal is −e_z where 1 + n_z is below this; the smallest rotation has no direction there."""
+
+
+def tangent_frame(n: Tensor) -> Tensor:
+    """Two unit vectors along the surface at unit normals n `(*batch, 3)`, `(*batch, 3, 2)`.
+
+    The columns are R e_x and R e_y with R e_z = n and the smallest rotation R = 1 + [w]ₓ + [w]ₓ²/(1 + n_z),
+    w = e_z × n; at n = −e_z, half a turn about e_x.
+    """
+    x, y, z = n.unbind(-1)
+    down = 1.0 + z < FACING_DOWN
+    share = torch.where(down, 0.0, 1.0 / torch.where(down, 1.0, 1.0 + z))
+    first = torch.stack([1.0 - x * x * share, -x * y * share, -x], dim=-1)
+    second = torch.stack([-x * y * share, torch.where(down, -1.0, 1.0) - y * y * share, -y], dim=-1)
+    return torch.stack([first, second], dim=-1)
+
+
+def sliding(at: States, contact: str) -> tuple[Tensor, Tensor]:
+    """Jacobian `(n, 3, nq)` and velocity `(n, 3)` of the touching point along the surface.
+
+    J and v = J q̇ are those of the point, with the part along the normal left out.
+    """
+    point = at.eom.contact_points[contact]
+    normal = normalize(point.normal, dim=-1)[..., None]
+    J = point.jacobian - normal @ (normal.mT @ point.jacobian)
+    return J, (J @ at.qd[..., None])[..., 0]
+
+
+@dataclass(frozen=True)
+class SurfaceForcePrior(ForcePrior):
+    """A force at a contact with a surface, where it is closed."""
+
+    contact: str
+    kernel: Kernel = field(default_factory=SquaredExponential)
+    inputs: tuple[str, ...] = ("position", "velocity")
+    name: str = ""
+    target: str = CONTACT
+
+    vectors = ("position", "velocity")
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or f"contact_{self.contact}")
+        check_inputs(self.name, self.inputs, tuple(WIDTHS))
+
+    def check(self, system: ConstrainedSystem) -> None:
+        if not isinstance(system.contact(self.contact), SurfaceContact):
+            raise ModelError(
+                f"contact {self.contact!r} has no surface, so no tangential force",
+                expected="a SurfaceContact",
+                got=type(system.contact(self.contact)).__name__,
+            )
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        if not system.contacts:
+            return {name: at.q.new_zeros(len(at.q), WIDTHS[name]) for name in self.inputs}
+        point = self._touching(system, at)
+        frame = tangent_frame(self.normal(at))
+        along = {name: (frame.mT @ getattr(point, name)[..., None])[..., 0] for name in self.vectors}
+        # The floor keeps the derivative of the root finite at rest.
+        along["speed"] = along["velocity"].square().sum(-1, keepdim=True).clamp(min=1e-30).sqrt()
+        return {name: along[name] for name in self.inputs}
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        if not system.contacts:
+            return at.q.new_zeros(*at.q.shape, self.outputs(system.robot))
+        self._touching(system, at)
+        closed = at.active[:, system.contact_names.index(self.contact)]
+        return torch.where(closed[:, None, None], self.directions(system, at), 0.0)
+
+    @abstractmethod
+    def directions(self, system: ConstrainedSystem, at: States) -> Tensor:
+        """E(x) `(n, nq, outputs)` where the contact is closed."""
+
+    def _touching(self, system: ConstrainedSystem, at: States) -> ContactPoint:
+        """The touching point; errors as of `check` where the contact has none."""
+        if self.contact not in at.eom.contact_points:
+            self.check(system)
+        return at.eom.contact_points[self.contact]
+
+    def normal(self, at: States) -> Tensor:
+        """Unit normal of the surface `(n, 3)`."""
+        return normalize(at.eom.contact_points[self.contact].normal, dim=-1)
 
 
 @dataclass(frozen=True)

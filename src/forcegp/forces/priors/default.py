@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.forces.mean import AnalyticalMean, mean_of
-from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.base import AnalyticalMean, ForcePrior, mean_of
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
-from forcegp.gp.kernels import Kernel, Linear
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
 
 PAPER = SquaredExponential()
 """The paper's kernel of a joint force (eq. 31)."""

@@ -10,8 +10,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.priors.base import JOINT, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
-from forcegp.gp.kernels import Kernel
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
 
 
@@ -26,7 +25,7 @@ class JointForcePrior(ForcePrior):
         name: prefix of the hyperparameters.
 
     Example:
-        >>> from forcegp.gp.stationary import SquaredExponential
+        >>> from forcegp.gp.kernels import SquaredExponential
         >>> JointForcePrior(SquaredExponential(("q", "qd"))).name
         'joint'
 

@@ -10,7 +10,6 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.priors.base import CONSTRAINT, ForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import States
-from forcegp.gp.kernels import Kernel
 from forcegp.robot.model import RobotModel
 
 
@@ -34,13 +33,9 @@ class NormalForcePrior(ForcePrior):
     like: JointForcePrior = field(default_factory=JointForcePrior)
     target: str = CONSTRAINT
 
-    @property
-    def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return f"{self.like.name}_normal"
-
-    @property
-    def kernel(self) -> Kernel:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.like.kernel
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", f"{self.like.name}_normal")
+        object.__setattr__(self, "kernel", self.like.kernel)
 
     @property
     def prefix(self) -> str:

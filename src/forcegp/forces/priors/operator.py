@@ -11,8 +11,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import JOINT, ForcePrior
 from forcegp.forces.quantities import States
-from forcegp.gp.kernels import Kernel
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
 
 

@@ -18,10 +18,9 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import check_inputs
-from forcegp.forces.priors.surface_force import SurfaceForcePrior, sliding
+from forcegp.forces.priors.contact import SurfaceForcePrior, sliding
 from forcegp.forces.quantities import States
-from forcegp.gp.kernels import Kernel
-from forcegp.gp.stationary import SquaredExponential
+from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
 
 TERMS = ("viscous", "dry", "coulomb", "stribeck", "torsion")
