@@ -58,6 +58,20 @@ def test_a_pass_goes_on_where_it_stopped(tmp_path: Path) -> None:
         assert torch.equal(a.q, b.q) and torch.equal(a.segment, b.segment)
 
 
+def test_the_shares_of_processes_are_the_log(tmp_path: Path) -> None:
+    log = segmented()
+    log.write(tmp_path / "a.parquet")
+    read = StreamedDataset((tmp_path / "a.parquet",))
+    whole = list(read.pieces(start=1))
+    shares = [list(read.pieces(1, (rank, 2))) for rank in (0, 1)]
+    assert [len(piece) for piece in shares[0]][:2] == [0, len(whole[1])], "pieces are counted from the first"
+    for own, *both in zip(whole, *shares, strict=True):
+        filled = [piece for piece in both if len(piece)]
+        assert len(filled) == 1
+        assert torch.equal(filled[0].q, own.q)
+        assert torch.equal(filled[0].segment, own.segment)
+
+
 @pytest.mark.parametrize("length", [77, 41, 13])
 def test_derivatives_do_not_reach_across_trajectories_nor_stop_at_pieces(tmp_path: Path, length: int) -> None:
     path = tmp_path / "a.parquet"

@@ -95,11 +95,12 @@ class StreamedDataset:
         """The log with its joints reordered, or only some of them."""
         return dataclasses.replace(self, joints=tuple(joints))
 
-    def pieces(self, start: int = 0) -> Iterator[Dataset]:
+    def pieces(self, start: int = 0, share: tuple[int, int] = (0, 1)) -> Iterator[Dataset]:
         """The log in order, `PIECE_ROWS` rows at a time; segments are numbered throughout.
 
         Args:
             start: number of pieces to skip.
+            share: (r, k) leaves every piece but the r-th of each k empty, as it belongs to another process.
 
         Raises:
             DataError: a file is damaged or not a valid log, or differs from the first one in its columns.
@@ -110,12 +111,15 @@ class StreamedDataset:
             for piece in pieces_of(path, PIECE_ROWS, window, number):
                 number = piece.last_segment
                 count += 1
-                if count > start or first is None:
+                own = count > start and (count - 1) % share[1] == share[0]
+                if own or first is None:
                     data = self._dataset(path, piece)
                     first = data[:1] if first is None else first
                     _check_alike(path, first, data)
-                    if count > start:
+                    if own:
                         yield data
+                if count > start and not own:
+                    yield first[:0]
             number += 1
 
     def _dataset(self, path: Path, piece: Piece) -> Dataset:

@@ -43,7 +43,7 @@ class Standardization:
     A column that hardly varies says nothing of the scale on which a function varies along it. So no scale is
     below `FLOOR` times the root mean square of the standard deviations of all columns of its input, and the
     columns of a vector share that mean: neither turning its axes nor a step off a plane changes much.
-    Features whose zero means something, such as the friction of a joint that rests, are scaled but not shifted.
+    Features whose zero means something, such as a joint at rest, are scaled but not shifted.
 
     Columns that are constant to rounding keep the scale 1, or that of their vector, and are listed in
     `constant`.

@@ -171,10 +171,8 @@ class Pass:
         """The samples of this process, a piece at a time; a piece of another process has none."""
         rank, processes = (dist.get_rank(), dist.get_world_size()) if self.distributed else (0, 1)
         kept = kept_scales(problem.priors, problem.training)
-        for number, piece in enumerate(self.sample.log.pieces(start), start):
-            if number % processes != rank:
-                piece = piece[:0]
-            elif self.sample.moving:
+        for piece in self.sample.log.pieces(start, (rank, processes)):
+            if self.sample.moving:
                 piece = piece[moving_rows(piece)]
             if len(piece) == 0:
                 yield problem.training.of_rows([torch.arange(0)] * len(problem.training.measurements))

@@ -26,7 +26,7 @@ SPEEDS = (0.02, 0.1, 0.5)
 """Velocities at which the Coulomb features saturate [rad/s, m/s]: a sharp step, and two slower
 transitions."""
 OFFSET = 0.3
-"""Standard deviation of a torque sensor's offset, as a fraction of that of a friction weight, at the start."""
+"""Where the standard deviation of an offset starts, as a fraction of that of a friction weight."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class JointFrictionPrior(ForcePrior):
     `Linear(ard=False, offset=0.3) + SquaredExponential(("velocity",))`, adds a smooth remainder.
 
     Args:
-        kernel: covariance of each component; linear in the features by default, which are scaled, not shifted.
+        kernel: covariance of each component; linear in the features by default.
         speeds: v_1, v_2, … [rad/s, m/s].
         load: whether friction proportional to the load |Q_G,i| is a feature.
         name: prefix of the hyperparameters.
