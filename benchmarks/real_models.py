@@ -18,6 +18,8 @@ from forcegp.models.minibatch import BatchOptions
 
 GP_SAMPLES, NETWORK_SAMPLES, NETWORK_EPOCHS = 200, 5000, 200
 """Training samples, evenly spaced among those in motion, of the models that are blind to mechanics."""
+FEW = 400
+"""Training samples, evenly spaced among those in motion, of a structured GP that does not see all."""
 CHUNK = 1000
 """States predicted at a time."""
 LEAST_SQUARES = ("least squares", "least squares, in motion")
@@ -58,11 +60,11 @@ def constant(case: Case) -> Fitted:
     return Fitted(lambda data: Predicted(mean.expand_as(data.qdd), None, case.system), 0.0)
 
 
-def structured(case: Case, with_inertia: bool | None = None) -> Fitted:
-    """The structured GP with its defaults, which choose; or with a prior on inertial parameters; or not."""
-    priors = [JointFrictionPrior(), InertialPrior()] if with_inertia else [JointFrictionPrior()]
-    priors = None if with_inertia is None else priors
-    fit = forcegp.StructuredGP(case.system, "analytical", force_priors=priors).fit(case.train)
+def structured(case: Case, samples: int | None = None, with_inertia: bool = False) -> Fitted:
+    """The structured GP with its defaults, which are friction of joints; or with a prior on inertia too."""
+    priors = [JointFrictionPrior(), InertialPrior()] if with_inertia else None
+    train = case.train if samples is None else evenly(moving(case.train), samples)
+    fit = forcegp.StructuredGP(case.system, "analytical", force_priors=priors).fit(train)
 
     def predict(data: forcegp.Dataset) -> Predicted:
         parts = [
@@ -121,6 +123,6 @@ def models(case: Case) -> dict[str, Callable[[], Fitted]]:
         "independent GP": lambda: independent_gp(case),
         "network": lambda: network(case),
         "structured GP, defaults": lambda: structured(case),
-        "structured GP, friction": lambda: structured(case, with_inertia=False),
+        f"structured GP, {FEW} samples": lambda: structured(case, FEW),
         "structured GP, friction and inertia": lambda: structured(case, with_inertia=True),
     }

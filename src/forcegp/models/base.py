@@ -389,3 +389,18 @@ def check_acceleration_only(predictor: Predictor, quantity: object, system: Cons
             f"a {predictor.kind!r} model knows no forces, so it cannot predict on another system",
             hint="use StructuredGP, or leave out `system`",
         )
+
+
+def require_double(system: ConstrainedSystem) -> None:
+    """Refuse a robot in single precision, whose covariance matrices are not positive definite after rounding.
+
+    Raises:
+        ModelError: the robot is not float64.
+    """
+    if system.robot.dtype != torch.float64:
+        raise ModelError(
+            f"Gaussian processes of {system.robot.name!r} need double precision",
+            expected=torch.float64,
+            got=system.robot.dtype,
+            hint="convert the robot and the data, robot.to(dtype=torch.float64)",
+        )

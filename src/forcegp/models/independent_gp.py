@@ -34,6 +34,7 @@ from forcegp.models.base import (
     Model,
     Prediction,
     check_acceleration_only,
+    require_double,
 )
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.folder import ModelHeader, Settings, settings_of
@@ -89,6 +90,9 @@ class IndependentGP(Model["IndependentFit"]):
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states, else 0.1.
 
+    Raises:
+        ModelError: the robot is not float64.
+
     Example:
         >>> import forcegp, torch
         >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
@@ -104,6 +108,7 @@ class IndependentGP(Model["IndependentFit"]):
     kind = KIND
 
     def __init__(self, system: ConstrainedSystem, noise_std: NoiseStd | None = None) -> None:
+        require_double(system)
         self.specified = system
         self.noise_std = noise_std
 

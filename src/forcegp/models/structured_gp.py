@@ -33,7 +33,7 @@ from forcegp.forces.start import Search, initial
 from forcegp.forces.state_noise import state_std_of
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions, Progress
-from forcegp.models.base import FitProgress, Model
+from forcegp.models.base import FitProgress, Model, require_double
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Lesson, in_motion, prepared, solve
 from forcegp.models.structured_spec import Specification, torque_noise_of
@@ -83,7 +83,7 @@ class StructuredGP(Model[StructuredFit]):
         torch.Size([20, 2])
 
     Raises:
-        ModelError, UnknownNameError: the priors do not fit the system.
+        ModelError, UnknownNameError: the priors do not fit the system, or the robot is not float64.
     """
 
     kind = KIND
@@ -102,6 +102,7 @@ class StructuredGP(Model[StructuredFit]):
         inducing_points: int = LIMIT,
         state_noise: tuple[NoiseStd, NoiseStd] | None = None,
     ) -> None:
+        require_double(system)
         form = mean_of(mean)
         priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
         check_priors(priors, system)
