@@ -45,7 +45,7 @@ def covariance(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict) ->
 
 def _of_component(params: dict[str, Tensor], k: int) -> dict[str, Tensor]:
     """The hyperparameters of one component, and those that all of them share."""
-    return {name: v if name.endswith("log_offset") else v[k : k + 1] for name, v in params.items()}
+    return {name: v if len(v) == 1 else v[k : k + 1] for name, v in params.items()}
 
 
 def squared_exponential(params: dict[str, Tensor], x1: Tensor, x2: Tensor) -> Tensor:

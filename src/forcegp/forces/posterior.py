@@ -4,44 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
-import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombFriction, coupled, with_coulomb
 from forcegp.forces.priors.base import ForceMean, ForcePrior, prior_rows
 from forcegp.forces.quantities import AffineMap, States
+from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Features, Standardization
-from forcegp.gp.pathwise import FunctionSamples
+from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block
 
-
-@runtime_checkable
-class LatentPosterior(Protocol):
-    """Latent processes conditioned on rows, exactly or through inducing points."""
-
-    @property
-    def jitter(self) -> float:
-        """Added to the diagonal to factorise, relative to unit noise."""
-        ...
-
-    def is_measured(self, p: int) -> bool:
-        """Whether any row depends on process p; where none does, its posterior is its prior."""
-        ...
-
-    def latent_mean(self, p: int, features: Features) -> Tensor:
-        """Posterior mean of process p, `(n, components)`."""
-        ...
-
-    def covariance(self, block: Block) -> Tensor:
-        """Posterior covariance of the rows of each sample of a block, `(n, r, r)`."""
-        ...
-
-    def draw(self, count: int, generator: torch.Generator, features: int) -> FunctionSamples:
-        """Functions from the posterior."""
-        ...
+LatentPosterior = ExactPosterior | SparsePosterior
+"""Latent processes conditioned on rows, exactly or through inducing points."""
 
 
 @dataclass(frozen=True, eq=False)

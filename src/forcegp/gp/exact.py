@@ -128,9 +128,11 @@ class ExactPosterior:
 
     def covariance(self, block: Block) -> Tensor:
         """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise."""
-        d = block.target.shape[-1]
+        n, d = block.target.shape
+        if d == 0:  # such as the multiplier of a system without contacts
+            return block.target.new_zeros(n, 0, 0)
         parts = [block.target.new_zeros(0, d, d)]
-        for own in chunked([block], max(1, CHUNK_COLUMNS // max(d, 1))):
+        for own in chunked([block], max(1, CHUNK_COLUMNS // d)):
             cross = cross_gram(self.processes, self.params, self.blocks, [own])
             V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
             V = V.reshape(len(V), -1, d).transpose(0, 1)

@@ -33,12 +33,13 @@ OFFSET = 0.3
 class JointFrictionPrior(ForcePrior):
     """Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)).
 
-    The weights w_i and the offset c_i are Gaussian and marginalised. One standard deviation per joint is
-    learned for all weights, and for the offsets one fraction of it: a joint that moved in one direction only
-    does not tell its offset from its friction, and what separates them is that friction is the rule. With a
-    standard deviation for each weight, learning takes most of them for zero, and the joint is overconfident
-    where it does something new. A kernel with a smooth part, such as
-    `Linear(ard=False, offset=0.3) + SquaredExponential(("velocity",))`, adds a smooth remainder.
+    The weights w_i and the offset c_i are Gaussian and marginalised. Three things are learned: how large the
+    friction of each joint is, which features matter, and how large offsets are beside friction; the last two
+    are the same for all joints. A joint that moved in one direction only does not tell its offset from its
+    friction, but the other joints show which is likely. With a standard deviation for each weight alone,
+    learning takes most of them for zero, and the joint is overconfident where it does something new. A kernel
+    with a smooth part, such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))`, adds a
+    smooth remainder.
 
     Args:
         kernel: covariance of each component; linear in the features by default.
@@ -57,7 +58,7 @@ class JointFrictionPrior(ForcePrior):
         ModelError: a speed is not positive and finite.
     """
 
-    kernel: Kernel = field(default_factory=lambda: Linear(ard=False, offset=OFFSET))
+    kernel: Kernel = field(default_factory=lambda: Linear(shared=True, offset=OFFSET))
     speeds: tuple[float, ...] = SPEEDS
     load: bool = True
     name: str = "joint_friction"
