@@ -36,22 +36,29 @@ def in_contact(data: forcegp.Dataset) -> torch.Tensor:
 
 @pytest.mark.slow
 def test_the_normal_force_is_found_without_a_force_sensor() -> None:
+    """On the last six seconds of three logs: a stroke has one error, and six seconds hold few strokes."""
     scene = load_scene("ur5_wiping")
-    log = simulate(scene.system(), replace(scene.simulation, duration=24.0)).data
-    train, test = log[: 18 * 250 : EVERY], log[18 * 250 :]
-    test = test[in_contact(test)]
-    model = create("sgp-real", scene.system())
-    fit = model.fit(train)
-    read = fit.predict(test.q, test.qd, test.tau, "multiplier", active=test.active(("table",)), noise=True)
-    truth = test.multiplier["table"]
-    error = read.mean[:, 0] - truth
-    assert abs(float(error.mean())) < 0.4 and float(error.std()) < 1.0
-    assert float(torch.corrcoef(torch.stack([read.mean[:, 0], truth]))[0, 1]) > 0.95
-    assert 0.9 <= float((error.abs() <= 2.0 * read.std[:, 0]).double().mean()) <= 0.98
-    scored = evaluate(model, test, compare=False).multipliers[0]
-    assert scored.coverage is not None and 0.9 <= scored.coverage <= 0.98
-    coefficient = float(fit.hyperparameters[coulomb_keys("table")[0]].exp())
-    assert coefficient == pytest.approx(scene.simulation.solver.friction, rel=0.05)
+    errors, inside, read, truth = [], [], [], []
+    for seed in range(3):
+        log = simulate(scene.system(), replace(scene.simulation, duration=24.0, seed=seed)).data
+        train, test = log[: 18 * 250 : EVERY], log[18 * 250 :]
+        test = test[in_contact(test)]
+        model = create("sgp-real", scene.system())
+        fit = model.fit(train)
+        found = fit.predict(
+            test.q, test.qd, test.tau, "multiplier", active=test.active(("table",)), noise=True
+        )
+        truth.append(test.multiplier["table"])
+        read.append(found.mean[:, 0])
+        errors.append(read[-1] - truth[-1])
+        inside.append((errors[-1].abs() <= 2.0 * found.std[:, 0]).double())
+        assert abs(float(errors[-1].mean())) < 0.4 and float(errors[-1].std()) < 1.0
+        coefficient = float(fit.hyperparameters[coulomb_keys("table")[0]].exp())
+        assert coefficient == pytest.approx(scene.simulation.solver.friction, rel=0.05)
+        scored = evaluate(model, test, compare=False).multipliers[0]
+        assert scored.coverage == pytest.approx(float(inside[-1].mean()))
+    assert float(torch.corrcoef(torch.stack([torch.cat(read), torch.cat(truth)]))[0, 1]) > 0.95
+    assert 0.9 <= float(torch.cat(inside).mean()) <= 0.98
 
 
 @pytest.mark.slow
