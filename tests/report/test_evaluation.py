@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
+
+import pytest
 
 from forcegp import AnalyticalModel, evaluate
 from forcegp.report.evaluation import error_tables, score_table, write_evaluation
@@ -59,3 +62,10 @@ def test_text_from_outside_is_escaped_and_nothing_is_fetched(tmp_path: Path) -> 
     assert "<script>" not in text and "<b>log" not in text
     addresses = re.findall(r'(?:src|href)="([^"]*)"', text)
     assert addresses and all(address.startswith("data:") for address in addresses)
+
+
+def test_logs_that_count_seconds_from_1970_keep_their_digits() -> None:
+    later = data.replace(t=data.t + 1.7e9)
+    shown = predicted_window(model, opening(later, 0.2), model.kind)
+    assert shown.t[0] == 0.0 and shown.seconds == pytest.approx(window.seconds, abs=1e-6)
+    assert all(b > a for a, b in pairwise(shown.t))

@@ -192,11 +192,10 @@ def _block(scene: str, run: Stage, log: Stage, fits: dict[str, Stage]) -> Block:
     for variant in ("torques", "sensor"):
         mean, std = force_of(fits[variant], test)
         bands.append(_band(NAMES[variant], mean, std, force, closed))
-    open_spans = spans(test.t, ~closed)
+    t = test.t - test.t[0]  # of seconds since 1970, a series would keep too few digits
+    open_spans = spans(t, ~closed)
     zero = series(torch.zeros_like(force))
-    drawn = MultiplierData(
-        t=series(test.t), c=zero, simulated=series(force), held_out=open_spans, bands=bands
-    )
+    drawn = MultiplierData(t=series(t), c=zero, simulated=series(force), held_out=open_spans, bands=bands)
     caption = (
         f"Normal force in {scene} on the first held-out stretches; the contact is open where it is grey."
     )

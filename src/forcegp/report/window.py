@@ -28,7 +28,7 @@ class WindowData(Header):
     Attributes:
         model: registry name or kind.
         noise_std: of the measured accelerations [rad/s²], if known.
-        t: [s].
+        t: time from the first sample [s].
         joint_names: one per series.
         measured, clean, mean, std: accelerations by joint [rad/s²]; `clean` and `std` may be unknown.
     """
@@ -85,7 +85,8 @@ def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
     return WindowData(
         model=name,
         noise_std=data.header.noise_std,
-        t=series(data.t),
+        # Measured logs count seconds from 1970, of which a series would keep too few digits.
+        t=series(data.t - data.t[0]),
         joint_names=list(data.joint_names),
         measured=columns(data.qdd),
         clean=None if clean is None else columns(clean),
@@ -158,7 +159,7 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
         axes.locator_params(axis="y", nbins=4)
         if limit is not None:
             axes.set_ylim(-limit, limit)
-    rows[-1].set_xlabel("time [s]")
+    rows[-1].set_xlabel("time from the first sample [s]")
     figure.align_ylabels()
     handles, names = rows[0].get_legend_handles_labels()
     legend = figure.legend(handles, names, loc="outside upper center", ncols=len(names))
