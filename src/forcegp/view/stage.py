@@ -186,7 +186,7 @@ def force_text(force: Force, k: int) -> str:
     value, std = force.value[k], force.std[k]
     if not np.isfinite(value):
         return f"{force.contact}: open"
-    return f"{force.contact}: {value:.1f}" + (f" ± {2.0 * std:.1f} N" if std > 0.0 else " N")
+    return f"{force.contact}: {value:.1f}" + (f" ± {2.0 * std:.2g} N" if std > 0.0 else " N")
 
 
 def quaternions(rotations: Array) -> NDArray[np.float64]:
