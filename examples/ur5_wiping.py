@@ -26,8 +26,9 @@ fit = forcegp.StructuredGP(system, "analytical", measured_priors(system)).fit(tr
 print(fit)
 
 # %% The normal force of the last three seconds beside MuJoCo's, which the model has never seen
+# The band counts the noise of the torque that the force is read from.
 closed = test.contact["table"]
-force = fit.predict(test.q, test.qd, test.tau, "multiplier", active=closed[:, None])
+force = fit.predict(test.q, test.qd, test.tau, "multiplier", active=closed[:, None], noise=True)
 error = (force.mean[:, 0] - test.multiplier["table"])[closed]
 inside = error.abs() <= 2.0 * force.std[closed, 0]
 alone = forcegp.AnalyticalModel(system).predict(test.q, test.qd, test.tau, "multiplier")

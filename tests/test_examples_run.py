@@ -71,7 +71,7 @@ def test_ur5_wiping(tmp_path: Path) -> None:
     (file,) = numbers(r"robot file alone: bias \S+ N, standard deviation ([\d.]+)", text)
     bias, std, inside = numbers(r"model: bias (\S+) N, standard deviation ([\d.]+) N, .* (\d+)%", text)
     assert std < 0.8 * file and abs(bias) < std
-    assert inside >= 75
+    assert inside >= 90
 
 
 def test_payload_followed_online(tmp_path: Path) -> None:
