@@ -16,8 +16,14 @@ SPEED = Linear(("qd",), shared=True)
 KERNELS = [
     Linear(("q",)) + SquaredExponential(("q",), shared=True),
     SPEED * SPEED * SquaredExponential(("q",), shared=True) + Matern32(("qd",), shared=True),
+    Linear(("qd",), shared=True, offset=0.3) * SquaredExponential(("q",), shared=True),
     Constant() + SquaredExponential() + Linear(("q",)) * SquaredExponential(("qd",)),
 ]
+
+
+kernels = pytest.mark.parametrize(
+    "kernel", KERNELS, ids=["finite and rest", "products", "offset", "no common functions"]
+)
 
 
 def _case(kernel: Kernel) -> tuple[dict, dict, dict, torch.Generator]:
@@ -33,7 +39,7 @@ def _case(kernel: Kernel) -> tuple[dict, dict, dict, torch.Generator]:
     return params, X, x, generator
 
 
-@pytest.mark.parametrize("kernel", KERNELS, ids=["finite and rest", "products", "no common functions"])
+@kernels
 def test_terms_of_a_kernel_add_up_to_its_covariance(kernel: Kernel) -> None:
     params, X, x, generator = _case(kernel)
     w = torch.randn(K, N, S, dtype=torch.float64, generator=generator)
@@ -41,7 +47,7 @@ def test_terms_of_a_kernel_add_up_to_its_covariance(kernel: Kernel) -> None:
     torch.testing.assert_close(terms, kernel.covariance(params, x, X) @ w, rtol=SAME, atol=SAME)
 
 
-@pytest.mark.parametrize("kernel", KERNELS, ids=["finite and rest", "products", "no common functions"])
+@kernels
 def test_terms_of_random_features_are_the_same_functions(kernel: Kernel) -> None:
     params, _, x, generator = _case(kernel)
     draw = kernel.draw(params, 64, generator)

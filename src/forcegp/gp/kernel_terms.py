@@ -62,15 +62,15 @@ def _common(kernel: Kernel, params: Parameters, X: Features) -> _Common | None:
         g = kernel.towards({**params, "log_std": torch.zeros_like(params["log_std"][:1])}, X)
         return _Common(lambda x: [g(x)], [torch.exp(2.0 * params["log_std"])])
     if isinstance(kernel, Linear) and len(params["log_slope_std"]) == 1:
-        slope = torch.exp(2.0 * params["log_slope_std"])
+        slope, bias = torch.exp(2.0 * params["log_slope_std"]), kernel.bias_std(params).square()
         to = (stacked(X, kernel.inputs) * slope).mT
-        std = params["log_std"] if kernel.shared else torch.zeros_like(params["log_bias_std"])
+        size = torch.exp(2.0 * params["log_std"]) if kernel.shared else torch.ones_like(bias)
         return _Common(
             lambda x: [
                 (stacked(x, kernel.inputs) @ to)[None],
                 to.new_ones(1, 1, 1).expand(1, points(x), to.shape[1]),
             ],
-            [torch.exp(2.0 * std), torch.exp(2.0 * params["log_bias_std"])],
+            [size, bias],
         )
     if isinstance(kernel, Product):
         left, right = (_common(getattr(kernel, side), sub(params, side), X) for side in ("left", "right"))

@@ -133,28 +133,28 @@ class Linear(Kernel):
             return slopes | {"log_bias_std": share}
         return slopes | {"log_offset": share.new_tensor([math.log(self.offset)])}
 
-    def _slope_std(self, params: Parameters) -> Tensor:
+    def slope_std(self, params: Parameters) -> Tensor:
         """s σ_d `(k, w)`, or `(k, 1)` where all inputs have one."""
         log = params["log_slope_std"]
         return torch.exp(log + params["log_std"][:, None] if self.shared else log)
 
-    def _bias_std(self, params: Parameters) -> Tensor:
+    def bias_std(self, params: Parameters) -> Tensor:
         """σ_0 `(k,)`."""
         if self.offset is None:
             return torch.exp(params["log_bias_std"])
-        return torch.exp(params["log_offset"]) * self._slope_std(params).square().mean(-1).sqrt()
+        return torch.exp(params["log_offset"]) * self.slope_std(params).square().mean(-1).sqrt()
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        slope = self._slope_std(params)[:, None, :]
+        slope = self.slope_std(params)[:, None, :]
         product = (stacked(x1, self.inputs) * slope) @ (stacked(x2, self.inputs) * slope).mT
-        return product + self._bias_std(params).square()[:, None, None]
+        return product + self.bias_std(params).square()[:, None, None]
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        scaled = stacked(x, self.inputs) * self._slope_std(params)[:, None, :]
-        return (scaled * scaled).sum(-1) + self._bias_std(params).square()[:, None]
+        scaled = stacked(x, self.inputs) * self.slope_std(params)[:, None, :]
+        return (scaled * scaled).sum(-1) + self.bias_std(params).square()[:, None]
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return LinearDraw(self.inputs, self._slope_std(params), self._bias_std(params))
+        return LinearDraw(self.inputs, self.slope_std(params), self.bias_std(params))
 
 
 @dataclass(frozen=True)

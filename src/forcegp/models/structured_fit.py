@@ -23,7 +23,6 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
 from forcegp.forces.samples import draw_samples
 from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
-from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
@@ -144,8 +143,7 @@ class StructuredFit(FittedModel):
         problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
         latent, central = self.posterior.latent, self.posterior.central
-        assert isinstance(latent, SparsePosterior | ExactPosterior)
-        if isinstance(central, SparsePosterior | ExactPosterior):
+        if central is not None:
             known = problem.of_means().rows(self.hyperparameters).blocks
             central = central.updated(problem.silenced(known))
         posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows), central=central)

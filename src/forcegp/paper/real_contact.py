@@ -171,10 +171,9 @@ def force_of(stage: Stage, test: Dataset) -> tuple[torch.Tensor, torch.Tensor]:
     if "multiplier" in fit.noise:
         return force_from_sensor(fit, test)
     states = test.q, test.qd, test.tau
-    found = fit.predict(*states, "multiplier", active=active)
-    assert found.variance is not None
-    variance = found.variance + fit.noise_variance(*states, "multiplier", active)
-    return found.mean[:, 0], variance[:, 0].sqrt()
+    found = fit.predict(*states, "multiplier", active=active, noise=True)
+    assert found.std is not None
+    return found.mean[:, 0], found.std[:, 0]
 
 
 def numbers_of(stage: Stage, name: str) -> dict[str, Any]:
