@@ -25,6 +25,7 @@ LAYERS = (
         "destination",
         "memory",
         "linalg",
+        "robust",
         "batchlast",
         "threads",
         "optional",

@@ -51,9 +51,9 @@ def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
 def test_a_pipe_or_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", Path(os.devnull)):
-        with pytest.raises(DestinationError, match="is no regular file"):
+        with pytest.raises(DestinationError, match="is not a regular file"):
             check_destination(path)
-        with pytest.raises(DestinationError, match="is no regular file"):
+        with pytest.raises(DestinationError, match="is not a regular file"):
             write_text(path, "lost")
         assert not stat.S_ISREG(path.stat().st_mode)
 

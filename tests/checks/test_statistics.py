@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from forcegp.checks.statistics import describe, intervals, robust_std, spikes
+from forcegp.checks.statistics import describe, intervals, spikes
+from forcegp.robust import robust_std
 
 
 @given(st.lists(st.booleans(), max_size=40))

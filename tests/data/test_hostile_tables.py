@@ -147,7 +147,7 @@ def test_numbers_beyond_all_mechanics_are_refused(value: float) -> None:
 def test_a_segment_is_an_integer_that_float64_holds(value: float, tmp_path: Path) -> None:
     table = valid_columns().append_column("segment", pa.array([value] * 60))
     pq.write_table(table, tmp_path / "log.parquet")
-    with pytest.raises(DataError, match="'segment' is no number of a trajectory in row 0"):
+    with pytest.raises(DataError, match="'segment' is not a trajectory number in row 0"):
         Dataset.read(tmp_path / "log.parquet")
 
 

@@ -1,4 +1,4 @@
-"""Data sets made of what is no tensor; run as a script by test_hostile_tables.py."""
+"""Data sets made of what is not a tensor; run as a script by test_hostile_tables.py."""
 
 from logs import random_log
 from raw_errors import outcomes

@@ -72,7 +72,7 @@ def test_a_hostile_mapping_is_a_mapping_error() -> None:
 def test_names_of_joints_are_checked_against_the_robot() -> None:
     mapping = parse_mapping(GOOD.encode(), "m.toml")
     with pytest.raises(
-        MappingError, match=r"m.toml:6: joints.elbow: 'elbow' is no joint(?s:.*)'elbow_joint'"
+        MappingError, match=r"m.toml:6: joints.elbow: 'elbow' is not a joint(?s:.*)'elbow_joint'"
     ):
         mapping.columns_of("position", ("shoulder", "elbow_joint"))
     with pytest.raises(MappingError, match="joint 'wrist' has no column"):

@@ -120,7 +120,7 @@ def test_with_the_sensor_at_each_state_the_force_is_better_than_either(logs: dic
     expected = (alone.mean[:, 0] / w2 + sensed_force(test, SYSTEM) / FORCE_NOISE**2) / precision
     np.testing.assert_allclose(mean, expected, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(std, precision**-0.5, rtol=1e-9)
-    with pytest.raises(ModelError, match="no measurement of this model"):
+    with pytest.raises(ModelError, match="not fitted to a force sensor"):
         force_from_sensor(model.fitted, truth)
 
 

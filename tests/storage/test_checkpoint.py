@@ -143,7 +143,7 @@ def test_a_folder_or_a_huge_or_damaged_file_is_refused(
 ) -> None:
     saved = fresh()
     saved.path.mkdir()
-    with pytest.raises(ModelError, match="is no file"):
+    with pytest.raises(ModelError, match="is not a file"):
         saved.read(START)
     saved.path.rmdir()
     written(saved)

@@ -6,9 +6,10 @@ import numpy as np
 
 from forcegp.checks.finding import Finding
 from forcegp.checks.log import Log
-from forcegp.checks.statistics import describe, intervals, robust_std
+from forcegp.checks.statistics import describe, intervals
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.derivative import UNIFORM_TOLERANCE
+from forcegp.robust import robust_std
 
 Outcome = tuple[list[Finding], Log]
 """What a check returns: its findings, and the log as those after it should see it."""

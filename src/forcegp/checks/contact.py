@@ -12,8 +12,9 @@ from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding, Intervals
 from forcegp.checks.log import Log
 from forcegp.checks.residual import CHUNK, tensors
-from forcegp.checks.statistics import Array, describe, intervals, robust_std
+from forcegp.checks.statistics import Array, describe, intervals
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
+from forcegp.robust import robust_std
 
 OFFSET = 5e-4
 """Displacement of a surface that is reported [m]."""

@@ -187,7 +187,7 @@ def _fit(problem: Problem, hypothesis: Hypothesis, kept: Array, prior: Array) ->
 
 
 def _significant(gain: tuple[float, float], concerned: int) -> bool:
-    """Whether a drop of the score matters for the number of joints concerned, and is no chance."""
+    """Whether a drop of the score matters for the number of joints concerned, and is not due to chance."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     return gain[0] > least and gain[0] > SIGNIFICANT * gain[1]
 

@@ -12,8 +12,9 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import Array, blocks_of
 from forcegp.checks.log import Log
 from forcegp.checks.residual import residual
-from forcegp.checks.statistics import intervals, robust_std
+from forcegp.checks.statistics import intervals
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.robust import robust_std
 
 ROWS = 4000
 """Contact rows whose force is computed."""

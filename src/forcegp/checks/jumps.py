@@ -7,9 +7,10 @@ import numpy as np
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.log import Log
-from forcegp.checks.statistics import Array, any_row, describe, intervals, robust_std
+from forcegp.checks.statistics import Array, any_row, describe, intervals
 from forcegp.checks.values import resolution
 from forcegp.constraints import ConstrainedSystem
+from forcegp.robust import robust_std
 
 JUMP = 30.0
 """Robust standard deviations beyond which a step is a jump, not noise: fifteen at each of two rows."""

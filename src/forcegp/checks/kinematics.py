@@ -15,8 +15,9 @@ from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.limits import DEGREE
 from forcegp.checks.log import Log
-from forcegp.checks.statistics import Array, robust_std
+from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
+from forcegp.robust import robust_std
 
 WINDOW = 0.05
 """Length of a window [s]; long enough that noise averages out, short against the motion."""
@@ -133,7 +134,7 @@ def _check_long_step(log: Log) -> Outcome:
         return _clock_finding(log, factor) if near else ([], log)
     if log.dt < 1.0:
         return [], log
-    text = f"rows are {log.dt:.4g} apart, which in seconds is no sampling period of a robot's log"
+    text = f"rows are {log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
     return [Finding("time-unit", text, log.all_rows, evidence={"period": log.dt})], log
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from forcegp.checks.statistics import Array, intervals, robust_std
+from forcegp.checks.statistics import Array, intervals
 from forcegp.data.columns import parse
 from forcegp.data.compatible import check_joints
 from forcegp.data.dataset import Dataset
@@ -22,6 +22,7 @@ from forcegp.data.header import DataHeader
 from forcegp.data.table import read_table
 from forcegp.errors import DataError
 from forcegp.robot.model import RobotModel
+from forcegp.robust import robust_std
 
 GAP = 1.5
 """A step is a gap from this multiple of the median step on: half a sample is missing."""
@@ -107,7 +108,7 @@ class Log:
 
     @cached_property
     def longest_step(self) -> float:
-        """Longest time step that is no gap [s]."""
+        """Longest time step that does not count as a gap [s]."""
         forward = self.steps[self.steps > 0.0]
         spread = float(robust_std(forward)) if len(forward) else 0.0
         return max(GAP * self.dt, self.dt + CLOCK_SPREAD * spread)

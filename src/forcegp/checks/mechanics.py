@@ -15,9 +15,10 @@ from forcegp.checks.hypotheses import LAGS, contact_friction_columns, friction_c
 from forcegp.checks.log import Log
 from forcegp.checks.residual import projector, residual
 from forcegp.checks.smooth import smoothed
-from forcegp.checks.statistics import MAD_TO_STD, any_row, describe, intervals
+from forcegp.checks.statistics import any_row, describe, intervals
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
+from forcegp.robust import robust_std
 
 LEAST_ROWS = 200
 """Rows from which dynamics are judged."""
@@ -177,11 +178,11 @@ def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Fi
     width = max(1, round(DISTURBANCE_SECONDS / stride))
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
-    # An arm at rest leaves little unexplained; it is no measure for one that moves.
+    # An arm at rest leaves little unexplained; it says nothing of one that moves.
     speed = np.abs(log.qd[rows]).max(axis=1)
     moving = level[speed >= MOVING * np.percentile(speed, 99)]
     middle = np.median(moving)
-    spread = max(MAD_TO_STD * np.median(np.abs(moving - middle)), 0.2)
+    spread = max(float(robust_std(moving)), 0.2)
     visible = any_row(np.abs(trace) > VISIBLE * told.problem.size)
     bad = level > min(middle + DISTURBANCE * spread, np.percentile(moving, 90) + 2.0 * np.log(LOUD))
     spans = intervals(bad, join=width)

@@ -12,8 +12,9 @@ import numpy as np
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.log import Log
-from forcegp.checks.statistics import Array, robust_std
+from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
+from forcegp.robust import robust_std
 
 WEIGHTS = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
 """The departure, with signs: it vanishes on cubics."""
@@ -52,7 +53,7 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
     filtered = top < FILTERED * middle
     evidence = {"white_noise_std": float(np.median(top)), "std_at_a_third": float(np.median(middle))}
     if stated is None:
-        # Without a claim of white noise a filter is no contradiction, but a likelihood has to know.
+        # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
         weight = "note"
     else:
         evidence["stated_std"] = stated

@@ -7,16 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MAD_TO_STD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
-
 Array = NDArray[Any]
-
-
-def robust_std(x: Array, axis: int = 0) -> Array:
-    """Standard deviation of the bulk of the values, from the median absolute deviation."""
-    centre = np.median(x, axis=axis, keepdims=True)
-    return np.asarray(MAD_TO_STD * np.median(np.abs(x - centre), axis=axis))
 
 
 def intervals(mask: NDArray[np.bool_], join: int = 0) -> tuple[tuple[int, int], ...]:

@@ -7,9 +7,10 @@ import numpy as np
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.log import Log
-from forcegp.checks.statistics import Array, describe, intervals, robust_std, spikes
+from forcegp.checks.statistics import Array, describe, intervals, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.fields import JOINT_VECTORS
+from forcegp.robust import robust_std
 
 HELD_RUN = 2
 """A logger that fails to update repeats a row at least this often before it is reported as held."""

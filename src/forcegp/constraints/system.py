@@ -177,7 +177,7 @@ class ConstrainedSystem:
         if active is None:
             return torch.ones(*batch, self.m, dtype=torch.bool, device=device)
         if not isinstance(active, Tensor):
-            raise ShapeError("active is no tensor", expected="a bool tensor", got=type(active).__name__)
+            raise ShapeError("active is not a tensor", expected="a bool tensor", got=type(active).__name__)
         sizes = zip(reversed(active.shape), reversed((*batch, n)), strict=False)
         fits = (
             0 < active.ndim <= len(batch) + 1 and active.shape[-1] == n and all(a in (1, b) for a, b in sizes)

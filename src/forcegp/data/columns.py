@@ -116,7 +116,7 @@ def _contact(source: str, left: Columns, name: str) -> NDArray[np.bool_]:
     wrong = np.flatnonzero((values != 0) & (values != 1))
     if len(wrong):
         raise DataError(
-            f"{source}: column {name!r} is no flag in row {wrong[0]}",
+            f"{source}: column {name!r} is not a flag in row {wrong[0]}",
             expected="true or false, or 1 or 0",
             got=values[wrong[0]],
         )
@@ -129,7 +129,7 @@ def _segment(source: str, left: Columns, n: int) -> NDArray[np.int64]:
     wrong = np.flatnonzero(~(np.abs(numbers) <= SEGMENT_NUMBER) | (numbers != np.floor(numbers)))
     if len(wrong):
         raise DataError(
-            f"{source}: column 'segment' is no number of a trajectory in row {wrong[0]}",
+            f"{source}: column 'segment' is not a trajectory number in row {wrong[0]}",
             expected=f"an integer between ±{SEGMENT_NUMBER}",
             got=values[wrong[0]],
         )

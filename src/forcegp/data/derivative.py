@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.errors import DataError
+from forcegp.robust import MAD_TO_STD
 
 UNIFORM_TOLERANCE = 0.02
 """Largest departure of a time step from the median step, as a fraction: clocks jitter, gaps do not pass."""
-MAD_TO_STD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
 
 
 @dataclass(frozen=True)

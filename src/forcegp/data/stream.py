@@ -40,7 +40,7 @@ class StreamedDataset:
         dtype, device: of the tensors.
 
     Raises:
-        DataError: there is no file, one does not exist, or one is not Parquet.
+        DataError: there is not a file, one does not exist, or one is not Parquet.
 
     Example:
         >>> import tempfile, torch

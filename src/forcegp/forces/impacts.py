@@ -11,11 +11,10 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Measurement, Training
+from forcegp.robust import MAD_TO_STD
 
 FAR = 6.0
-"""Robust standard deviations of A q̈ − b beyond which a sample is no persistent contact."""
-NORMAL = 1.4826
-"""Standard deviation of normal numbers per median of their magnitude."""
+"""Robust standard deviations of A q̈ − b beyond which a sample is not in persistent contact."""
 
 
 def without_impacts(training: Training, system: ConstrainedSystem) -> tuple[Training, int]:
@@ -47,6 +46,6 @@ def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
     for row in range(ratio.shape[-1]):
         own = closed[:, row]
         if bool(own.any()):
-            scale = max(1.0, NORMAL * float(ratio[own, row].median()))
+            scale = max(1.0, MAD_TO_STD * float(ratio[own, row].median()))
             good &= ratio[:, row] <= FAR * scale
     return good

@@ -304,7 +304,7 @@ def training_of(
     observations = [Observation(data)] if isinstance(data, Dataset) else data
     if not isinstance(observations, Sequence) or not all(isinstance(o, Observation) for o in observations):
         raise ModelError(
-            "these are no data to learn from",
+            "cannot learn from this type of data",
             expected="a Dataset, or a list of Observation",
             got=type(data).__name__,
         )

@@ -14,9 +14,8 @@ from forcegp.logs.mapping import Mapping
 from forcegp.logs.report import Report
 from forcegp.logs.sections import ContactSection
 from forcegp.logs.signals import Array, Signals, runs
+from forcegp.robust import robust_std
 
-MAD_TO_STD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
 SEPARATION = 6.0
 """Least distance between the two levels of force, in standard deviations of the open one."""
 RELEASE_STD = 4.0
@@ -225,4 +224,4 @@ def level_and_spread(values: Array) -> tuple[float, float]:
     if not len(values):
         return float("nan"), float("nan")
     middle = float(np.median(values))
-    return middle, MAD_TO_STD * float(np.median(np.abs(values - middle)))
+    return middle, float(robust_std(values))

@@ -135,7 +135,7 @@ class _Gathering:
                 wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
                 if len(wrong):
                     raise DataError(
-                        f"{self.table.source}: column {section.column!r} is no flag in row {wrong[0]}",
+                        f"{self.table.source}: column {section.column!r} is not a flag in row {wrong[0]}",
                         expected="0 or 1",
                         got=values[wrong[0]],
                     )

@@ -50,7 +50,7 @@ class Mapping:
             joints: the robot's joints.
 
         Raises:
-            MappingError: a joint has no column, or a name is no joint of the robot.
+            MappingError: a joint has no column, or a name is not a joint of the robot.
         """
         section = self.quantity(name)
         assert section is not None
@@ -100,7 +100,7 @@ class Mapping:
                 hint = f"did you mean {near[0]!r}?" if near else None
                 raise self.error(
                     (*key, joint),
-                    f"{joint!r} is no joint of the robot",
+                    f"{joint!r} is not a joint of the robot",
                     expected=", ".join(joints),
                     hint=hint,
                 )

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from forcegp.logs.signals import Array
+from forcegp.robust import robust_std
 
-MAD_TO_STD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
 LEAST_POINTS = 20
 """Points that a fit needs."""
 ROUNDING = 1e-9
@@ -39,11 +38,11 @@ def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> So
     """
     robust = start
     for _ in range(2):
-        scale = max(spread(residual(robust)), ROUNDING)
+        scale = max(float(robust_std(residual(robust))), ROUNDING)
         found = least_squares(residual, robust, loss="soft_l1", f_scale=scale, x_scale="jac")
         robust = found.x
     first = residual(robust)
-    inside = np.abs(first - np.median(first)) <= OUTLIER_STD * max(spread(first), ROUNDING)
+    inside = np.abs(first - np.median(first)) <= OUTLIER_STD * max(float(robust_std(first)), ROUNDING)
     final = least_squares(lambda x: residual(x)[inside], robust, x_scale="jac")
     residuals = residual(final.x)[inside]
     effective = len(residuals) / correlation_time(residuals)
@@ -67,8 +66,3 @@ def correlation_time(values: Array) -> float:
     rho = autocorrelation / autocorrelation[0]
     first = int(np.argmax(rho < 0.0)) if (rho < 0.0).any() else n
     return float(min(max(1.0 + 2.0 * rho[1:first].sum(), 1.0), n / LEAST_POINTS if n > LEAST_POINTS else n))
-
-
-def spread(values: Array) -> float:
-    """Standard deviation of a normal distribution with the same median absolute deviation."""
-    return MAD_TO_STD * float(np.median(np.abs(values - np.median(values))))

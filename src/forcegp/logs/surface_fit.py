@@ -91,7 +91,7 @@ def fit_surface(
     """
     known = system.contact(contact)
     if not isinstance(known, SurfaceContact):
-        raise DataError(f"{contact!r} is no contact with a surface")
+        raise DataError(f"{contact!r} is not a contact with a surface")
     rows = data.active([contact])[:, 0].nonzero()[:, 0]
     if len(rows) < LEAST_POINTS:
         raise DataError(

@@ -16,11 +16,10 @@ from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Observation
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.robust import MAD_TO_STD
 
 SENSOR = "F_sensor"
 """Force on the robot at a contact, as `forcegp import` writes it [N]."""
-MAD_TO_STD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
 TINY = 1e-12
 """Smallest variance of a predicted force [N²]."""
 
@@ -118,7 +117,7 @@ def force_from_sensor(fit: StructuredFit, data: Dataset) -> tuple[Tensor, Tensor
     """
     if "multiplier" not in fit.noise or not has_sensor(data, fit.system):
         raise ModelError(
-            "the sensor is no measurement of this model",
+            "this model was not fitted to a force sensor",
             expected="a model fitted with sensor_noise_std, and a log with columns F_sensor",
         )
     active = data.active(fit.system.contact_names)

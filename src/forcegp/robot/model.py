@@ -216,7 +216,7 @@ class RobotModel:
         for name, value in states.items():
             if not isinstance(value, Tensor):
                 raise ShapeError(
-                    f"{name} is no tensor",
+                    f"{name} is not a tensor",
                     expected=f"a tensor of shape (*batch, {self.nq})",
                     got=type(value).__name__,
                     hint=f"call torch.tensor({name}, dtype={self.dtype})",

@@ -65,7 +65,7 @@ def read_urdf(root: Element, label: str) -> Tree:
 
 
 def _uses_undeclared_world(links: tuple[Link, ...], joints: tuple[Joint, ...]) -> bool:
-    """Whether a fixed joint attaches the robot to a `world` that is no link of the file, as in Drake."""
+    """Whether a fixed joint attaches the robot to a `world` that is not a link of the file, as in Drake."""
     attached = any(joint.parent == WORLD and joint.kind == "fixed" for joint in joints)
     return attached and all(link.name != WORLD for link in links)
 

@@ -59,7 +59,7 @@ class ContactSolver:
         """Steps of the engine in a sampling period.
 
         Raises:
-            ForceGPError: `step` is no whole part of it.
+            ForceGPError: it is not a multiple of `step`.
         """
         if self.step is None:
             return math.ceil(dt / LONGEST_STEP - WHOLE)

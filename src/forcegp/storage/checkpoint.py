@@ -198,7 +198,7 @@ def read_keyed(path: Path) -> tuple[dict[str, Tensor], str | None]:
         ModelError: the file is damaged, too large, or is a folder.
     """
     if not path.is_file():
-        raise ModelError(f"{path} is no file", expected="the file of a checkpoint")
+        raise ModelError(f"{path} is not a file", expected="the file of a checkpoint")
     try:
         with path.open("rb") as file:
             data = file.read(CHECKPOINT_BYTES + 1)

@@ -32,7 +32,7 @@ class EpochCheckpoint:
     _written: float = field(default=float("-inf"), init=False)
 
     def read(self, like: Mapping[str, Tensor]) -> dict[str, Tensor] | None:
-        """The state in the file, `None` if there is no file.
+        """The state in the file, `None` if there is not a file.
 
         Args:
             like: a state at the start, whose names, shapes and types the file has too.

@@ -39,7 +39,7 @@ class SumsCheckpoint:
     _written: float = field(default=float("-inf"), init=False)
 
     def read(self) -> dict[str, Tensor]:
-        """The tensors in the file, none where there is no file.
+        """The tensors in the file, none where there is not a file.
 
         Raises:
             ModelError: the file is damaged, or belongs to another fit.

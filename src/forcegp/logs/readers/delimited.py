@@ -28,7 +28,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
     """Read a text table; columns of text are left out with a remark.
 
     Raises:
-        DataError: not a table, a line with another number of fields, or a field that is no number.
+        DataError: not a table, a line with another number of fields, or a field that is not a number.
     """
     dialect = sniff(path)
     chosen = [name for name, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(name)]

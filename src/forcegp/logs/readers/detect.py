@@ -92,7 +92,7 @@ def format_of(path: Path) -> str:
         return _format_of_folder(path)
     if not path.is_file():
         raise DataError(
-            f"{path}: no such log", hint=None if path.parent.is_dir() else f"{path.parent} is no folder"
+            f"{path}: no such log", hint=None if path.parent.is_dir() else f"{path.parent} is not a folder"
         )
     suffix = path.suffix.lower()
     with path.open("rb") as file:

@@ -20,7 +20,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
     Files with the same number of rows share a clock and make one stream.
 
     Raises:
-        DataError: a file is no table of numbers, or the folder is too large.
+        DataError: a file is not a table of numbers, or the folder is too large.
     """
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
     bounds.check_count(str(path), "files", len(files), limits.LOG_FILES)

@@ -23,7 +23,7 @@ def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | N
     where the motors have no names. Images and videos are not read.
 
     Raises:
-        DataError: the folder is no such data set, or is damaged or too large.
+        DataError: the folder is not a LeRobot data set, or is damaged or too large.
     """
     features = _features(path / "meta" / "info.json")
     files = sorted((path / "data").rglob("*.parquet"))

@@ -53,7 +53,7 @@ def sniff(path: Path) -> Dialect:
     """Find out how a text table is written, from its first lines.
 
     Raises:
-        DataError: the file is empty, binary, or has no two lines with the same number of numbers.
+        DataError: the file is empty, binary, or has no two lines with equally many numbers.
     """
     with path.open("rb") as file:
         head = file.read(SAMPLE_BYTES)
@@ -115,7 +115,7 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, st
     width = len(after[0])
     same = sum(len(fields) == width for fields in after) / len(after)
     values = sum(_is_value(f, decimal) for fields in after for f in fields) / len(after)
-    # A comma inside numbers, taken for a separator, leaves fields such as "5;2" that are no values.
+    # A comma inside numbers, taken for a separator, leaves fields such as "5;2" that are not values.
     preferred = 0.01 if decimal == "." else 0.0
     return (values**2 / width + preferred if same == 1.0 else 0.0), separator, decimal, first
 
