@@ -111,7 +111,7 @@ def is_other_than_file(path: Path) -> bool:
 
 def kind_of(path: Path) -> str:
     """What is at a path, in words."""
-    return "a folder" if path.is_dir() else "no regular file"
+    return "a folder" if path.is_dir() else "not a regular file"
 
 
 def _remove_asides(target: Path) -> None:
