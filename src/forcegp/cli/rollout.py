@@ -164,7 +164,7 @@ def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
 
 
 def _spread(q: Tensor) -> Tensor:
-    """Standard deviation `(T, nq)` over the samples `(S, T, nq)` that have not diverged, to where two are left."""
+    """Standard deviation `(T, nq)` over samples `(S, T, nq)` that have not diverged, while two are left."""
     import torch
 
     left = q.isfinite().all(-1)
