@@ -21,8 +21,8 @@ from forcegp.gp.drift import drifted
 from forcegp.gp.factor import extended
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters
-from forcegp.gp.pathwise import FEATURES, FunctionSamples
-from forcegp.gp.sparse_draws import draw_functions
+from forcegp.gp.pathwise import FunctionSamples
+from forcegp.gp.sparse_draws import FEATURES, draw_functions
 from forcegp.gp.structured_covariance import Block, Process, chunked, components_of
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 from forcegp.linalg import cholesky

@@ -24,7 +24,6 @@ from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps
 from forcegp.forces.samples import draw_samples
 from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
 from forcegp.gp.optimise import Learned
-from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
 from forcegp.models.structured_spec import Specification, pack
@@ -132,7 +131,7 @@ class StructuredFit(FittedModel):
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         """Force functions drawn from the posterior."""
-        return draw_samples(self.posterior, samples, generator, FEATURES).total_force
+        return draw_samples(self.posterior, samples, generator).total_force
 
     def updated(self, measurements: Training) -> StructuredFit:
         """The fit with more samples.
