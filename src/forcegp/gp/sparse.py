@@ -83,10 +83,6 @@ class SparsePosterior:
         own = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
         return tuple(bool((diagonal[columns] > 1.0).any()) for columns in own)
 
-    def is_measured(self, p: int) -> bool:
-        """Whether any row depends on process p; where none does, its posterior is its prior."""
-        return self.measured[p]
-
     @cached_property
     def folded(self) -> list[tuple[Tensor, Tensor]]:
         """Posterior mean of each process as weights of k(x, Z) and of the exact features."""
