@@ -42,7 +42,7 @@ class MovingPoint(NamedTuple):
 
     @classmethod
     def of(cls, position: Tensor, jacobian: Tensor, bias: Tensor, qd: Tensor) -> MovingPoint:
-        """From the position, [ω; ṗ] = J q̇ and its bias `(*batch, 6)` as of `kinematics.point_motion`, and q̇."""
+        """From what `kinematics.point_motion` gives, and q̇."""
         rate = (jacobian @ qd[..., None])[..., 0]
         return cls(
             position, rate[..., 3:], bias[..., 3:], jacobian[..., 3:, :], rate[..., :3], jacobian[..., :3, :]

@@ -14,18 +14,15 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from forcegp.errors import ModelError
-from forcegp.gp.basis import LatentBasis, latent_basis
+from forcegp.gp.basis import LatentBasis
 from forcegp.gp.diagnostics import Diagnostics
 from forcegp.gp.drift import drifted
-from forcegp.gp.factor import extended
+from forcegp.gp.factor import cholesky, extended
 from forcegp.gp.features import Features
-from forcegp.gp.kernels import Parameters
 from forcegp.gp.pathwise import FEATURES, FunctionSamples
 from forcegp.gp.sparse_draws import draw_functions
-from forcegp.gp.structured_covariance import Block, Process, chunked, components_of
+from forcegp.gp.structured_covariance import Block, chunked
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
-from forcegp.linalg import cholesky
 
 CHUNK_PREDICTIONS = 256
 """Samples whose covariance is computed at a time."""
@@ -208,29 +205,3 @@ class SparsePosterior:
             NumericalError: the samples were not among them.
         """
         return SparsePosterior.of(self.basis, self.sums - accumulate(self.basis, blocks))
-
-
-def condition_sparse(
-    processes: Sequence[Process],
-    params: Parameters,
-    blocks: Sequence[Block],
-    inducing: Sequence[Features],
-) -> SparsePosterior:
-    """Condition processes on whitened rows through given inducing points.
-
-    Args:
-        processes: the processes.
-        params: log-hyperparameters.
-        blocks: whitened rows, of one block at least.
-        inducing: kernel inputs of the inducing points of each process.
-
-    Raises:
-        ModelError: there is no block.
-        NumericalError: the sums are not finite.
-    """
-    if not blocks:
-        raise ModelError(
-            "there is nothing to condition on", expected="at least one block of rows", got="none"
-        )
-    basis = latent_basis(processes, params, inducing, components_of(blocks[0]))
-    return SparsePosterior.of(basis, accumulate(basis, blocks))
