@@ -72,17 +72,9 @@ class ForcePosterior:
     def read(self, system: ConstrainedSystem, at: States, z: AffineMap) -> tuple[Tensor, Tensor]:
         """Posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, without measurement noise."""
         rows = self.rows(system, at, z)
-        if self.central is None and isinstance(self.latent, ExactPosterior):
-            moved, covariance = self.latent.read(rows)
-            return rows.target + moved, covariance
-        return self._mean(rows), self.latent.covariance(rows)
+        return rows.target + (self.central or self.latent).mean(rows), self.latent.covariance(rows)
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
         """Posterior mean o + B(m + Σ E f) of a quantity at states, `(n, d)`."""
-        return self._mean(self.rows(system, at, z))
-
-    def _mean(self, rows: Block) -> Tensor:
-        mean, means = rows.target, self.central or self.latent
-        for p, W in enumerate(rows.operators):
-            mean = mean + (W @ means.latent_mean(p, rows.features[p])[..., None])[..., 0]
-        return mean
+        rows = self.rows(system, at, z)
+        return rows.target + (self.central or self.latent).mean(rows)

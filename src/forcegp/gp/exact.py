@@ -122,23 +122,21 @@ class ExactPosterior:
         ]
         return sum(parts[1:], start=parts[0]).mT
 
+    def mean(self, block: Block) -> Tensor:
+        """Posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
+        mean = torch.zeros_like(block.target)
+        for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
+            mean = mean + (W @ self.latent_mean(p, x)[..., None])[..., 0]
+        return mean
+
     def covariance(self, block: Block) -> Tensor:
         """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise."""
-        return self.read(block)[1]
-
-    def read(self, block: Block) -> tuple[Tensor, Tensor]:
-        """Posterior mean `(n, d)` and covariance `(n, d, d)` of rows, of one covariance with the data.
-
-        Args:
-            block: kernel inputs and operators of each process; the targets are not read.
-        """
         n, d = block.target.shape
         if d == 0:  # such as the multiplier of a system without contacts
-            return block.target.new_zeros(n, 0), block.target.new_zeros(n, 0, 0)
-        means, parts = [block.target.new_zeros(0, d)], [block.target.new_zeros(0, d, d)]
+            return block.target.new_zeros(n, 0, 0)
+        parts = [block.target.new_zeros(0, d, d)]
         for own in chunked([block], max(1, CHUNK_COLUMNS // d)):
             cross = cross_gram(self.processes, self.params, self.blocks, [own])
-            means.append((cross.mT @ self.alpha).reshape(-1, d))
             V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
             V = V.reshape(len(V), -1, d).transpose(0, 1)
             prior = V.new_zeros(())
@@ -147,7 +145,7 @@ class ExactPosterior:
                 prior = prior + torch.einsum("nak,kn,nbk->nab", W, variance, W)
             parts.append(prior - V.mT @ V)
         covariance = torch.cat(parts)
-        return torch.cat(means), 0.5 * (covariance + covariance.mT)
+        return 0.5 * (covariance + covariance.mT)
 
     def log_likelihood(self) -> Tensor:
         """log p(y) of the rows without their constant, −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π."""

@@ -97,6 +97,13 @@ class SparsePosterior:
             mean = mean + part.finite.basis(features) @ on_features
         return mean[..., 0].mT
 
+    def mean(self, block: Block) -> Tensor:
+        """Posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
+        mean = torch.zeros_like(block.target)
+        for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
+            mean = mean + (W @ self.latent_mean(p, x)[..., None])[..., 0]
+        return mean
+
     @cached_property
     def _inverse_factor(self) -> list[Tensor]:
         """L⁻ᵀ by process, a block of rows for each component `(components, width, size)`.
