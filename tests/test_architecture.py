@@ -50,6 +50,7 @@ LAYERS = (
     ("report", "sweep"),
     ("paper",),
     ("cli",),
+    ("__main__",),
 )
 """From the lowest to the highest: a part imports parts of its own row and of rows above it in this list."""
 
