@@ -24,7 +24,6 @@ LAYERS = (
         "files",
         "destination",
         "memory",
-        "linalg",
         "robust",
         "batchlast",
         "threads",

@@ -105,8 +105,8 @@ def forces_and_constant(
     if problem.pinned:
         known = problem.silenced(problem.of_means().rows(hyperparameters).blocks)
         central = ExactPosterior.of(problem.priors, params, known)
-    coulomb, offsets = problem.coulomb(hyperparameters), problem.offsets
-    posterior = ForcePosterior(problem.priors, scales, problem.mean, latent, offsets, central, coulomb)
+    coulomb = problem.coulomb(hyperparameters)
+    posterior = ForcePosterior(problem.priors, scales, problem.mean, latent, central, coulomb)
     return posterior, rows.constant
 
 

@@ -76,10 +76,6 @@ class ExactPosterior:
         result.__dict__["conditioned"] = Conditioned(L, alpha, max(old.jitter, jitter))
         return result
 
-    def is_measured(self, p: int) -> bool:
-        """Whether any row depends on process p; where none does, its posterior is its prior."""
-        return self.measured[p]
-
     @cached_property
     def measured(self) -> tuple[bool, ...]:
         """Whether any row depends on each process; the data change nothing about the others."""
@@ -125,6 +121,13 @@ class ExactPosterior:
             for kernel, w in zip(self.kernels_to_data[p], self._weights[p], strict=True)
         ]
         return sum(parts[1:], start=parts[0]).mT
+
+    def mean(self, block: Block) -> Tensor:
+        """Posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
+        mean = torch.zeros_like(block.target)
+        for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
+            mean = mean + (W @ self.latent_mean(p, x)[..., None])[..., 0]
+        return mean
 
     def covariance(self, block: Block) -> Tensor:
         """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise."""

@@ -105,10 +105,11 @@ class StructuredFit(FittedModel):
         if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
             at = self._with_acceleration(system, at)
         z, parts = affine_maps(system, at, quantity)
-        rows = self.posterior.rows(system, at, z)
-        mean, spread = self.posterior.mean_of(rows), None
-        if covariance:
-            spread = self.posterior.latent.covariance(rows)
+        spread = None
+        if not covariance:
+            mean = self.posterior.read_mean(system, at, z)
+        else:
+            mean, spread = self.posterior.read(system, at, z)
             z = coupled(system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
             if STICK_NOISE in self.hyperparameters:
                 spread = spread + _carried(z, stick_variance(self.hyperparameters, at))
