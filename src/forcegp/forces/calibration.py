@@ -207,8 +207,9 @@ def _held_out(
     at = m.at(system)
     z = affine_map(system, at, "qdd")
     M, P = at.eom.M, at.eom.P
-    residual = (M @ (m.values - posterior.read_mean(system, at, z))[..., None])[..., 0]
-    spread = (M @ posterior.read_covariance(system, at, z) @ M.mT).diagonal(dim1=-2, dim2=-1)
+    mean, covariance = posterior.read(system, at, z)
+    residual = (M @ (m.values - mean)[..., None])[..., 0]
+    spread = (M @ covariance @ M.mT).diagonal(dim1=-2, dim2=-1)
     std = noise_std if noise_std.ndim == 1 else noise_std.square().mean(0).sqrt()
     stick = (P**2 @ stick_variance(hyperparameters, at)[..., None])[..., 0]
     return residual, spread + (M**2 @ std**2) + stick, P

@@ -7,8 +7,8 @@ Stretches of the log that an estimate has not seen say whether it predicts torqu
 Torques do not settle everything. In a closed loop the noise of the torque sensor exceeds the torque
 that accelerates a light joint; divided by the inertia of the file it predicts accelerations that are larger
 than all that were measured. Where that is so, the drives get the inertia that maximises
-−½ Σ ε²/s² + v Σ log |M| with the smallest v ≤ 1 at which accelerations are predicted as well as by their mean,
-as long as the error of no joint's torque on held-out stretches grows by more than 2 %.
+−½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
+mean, as long as the error of no joint's torque on held-out stretches grows by more than 2 %.
 """
 
 from __future__ import annotations

@@ -348,12 +348,12 @@ class StructuredGP(Model[StructuredFit]):
     ) -> tuple[Training, tuple[str, ...]]:
         """What is learned from, with doubts about it; priors that are not learned (`None`: all are) keep the
         scales of their inputs."""
-        spec, kept, measured = self.specification, {}, self.specification.learns_torque_noise
+        spec, kept = self.specification, {}
         if self._fitted is not None and learned is not None:
             scales = zip(spec.priors, self._fitted.training.scales, strict=True)
             kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
         training = training_of(data, spec.system, spec.priors, spec.noise_std, kept)
-        return in_motion(spec, training) if measured else (training, ())
+        return in_motion(spec.system, training) if spec.learns_torque_noise else (training, ())
 
     def adopt(self, fitted: StructuredFit) -> StructuredFit:
         """Predict with this fit from now on."""

@@ -175,7 +175,7 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
         kept = {name: _below(tensors, name + ".") for name in ("sparse", "central")}
         latent = posterior_of_tensors(problem.priors, params, kept["sparse"])
         central = posterior_of_tensors(problem.priors, params, kept["central"]) if kept["central"] else None
-        return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central, coulomb)
+        return ForcePosterior(problem.priors, scales, problem.mean, latent, central, coulomb)
     blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
     rows = sum(block.rows for block in blocks)
     if alpha.shape != (rows,):
@@ -183,4 +183,4 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
     if problem.pinned:
         return force_posterior(problem, hyper)
     latent = ExactPosterior(problem.priors, params, blocks, alpha)
-    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, coulomb=coulomb)
+    return ForcePosterior(problem.priors, scales, problem.mean, latent, coulomb=coulomb)

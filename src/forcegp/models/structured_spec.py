@@ -16,7 +16,15 @@ from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.inertia import inertia_of
 from forcegp.forces.learn import Problem, analytical_parameters
-from forcegp.forces.measurements import NoiseStd, Observation, Training, is_simulated, plain, states_noise
+from forcegp.forces.measurements import (
+    NoiseStd,
+    Observation,
+    Training,
+    is_simulated,
+    observations_of,
+    plain,
+    states_noise,
+)
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
@@ -102,12 +110,11 @@ class Specification:
         Around the analytical forces of a measured robot the default priors are `measured_priors`. The noise
         of accelerations is learned with that of the torque where nobody states it.
         """
-        spec = self
-        if spec.automatic and not is_simulated(data):
+        spec, observations = self, observations_of(data)
+        if spec.automatic and not is_simulated(observations):
             priors = measured_priors(spec.system)
             spec = dataclasses.replace(spec, priors=priors, torque_noise="learn", inertia="auto")
-        learns = isinstance(spec.torque_noise, str)
-        if learns and spec.noise_std is None and not states_noise(data):
+        if spec.learns_torque_noise and spec.noise_std is None and not states_noise(observations):
             spec = dataclasses.replace(spec, learn_noise=True)
         return dataclasses.replace(spec, automatic=False)
 
