@@ -225,13 +225,13 @@ class StructuredFit(FittedModel):
 
     @property
     def torque_disturbance(self) -> Tensor | None:
-        """s √T of torque noise with standard deviation s that is correlated for a time T, [N m √s].
+        """s √T of torque noise with standard deviation s that is correlated for a time T, `(nq,)` [N m √s].
 
         Over times longer than T it acts like white noise with this root of a spectral density.
         """
-        if self.torque_std is None or self.problem.correlation_time == 0.0:
+        if self.torque_std is None or self.problem.correlation is None:
             return None
-        return self.torque_std * self.problem.correlation_time**0.5
+        return self.torque_std * self.problem.correlation.sqrt()
 
     def _noise_covariance(self, z: AffineMap, parts: Mapping[str, slice]) -> Tensor:
         """B Σ_τ Bᵀ + Σ_q̈ of a measurement of the quantities, `(n, d, d)`."""

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
-from forcegp.forces.calibration import held_out_torque_std, likelihood_power
+from forcegp.forces.calibration import held_out_torque_std, likelihood_power, residual_times
 from forcegp.forces.impacts import without_impacts
 from forcegp.forces.inference import (
     force_posterior,
@@ -163,9 +163,11 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
     Neighbours in the whole log are closer in time than in the part that was learned on. Of a log that is read
     piece by piece, a few contiguous stretches are looked at.
     """
-    power = part.power if part.training is training else likelihood_power(part, values, training)
+    power, correlation = residual_times(part, values, training)
+    if part.training is training:
+        power = part.power
     share = training.samples / training.all_samples
-    return dataclasses.replace(part, power=power * share, correlation_time=training.period / power)
+    return dataclasses.replace(part, power=power * share, correlation=correlation)
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:

@@ -156,7 +156,7 @@ def _restored(
         spec.problem(training),
         system=spec.system if spec.parameters is not None else system,
         power=settings.power,
-        correlation_time=settings.correlation_time,
+        correlation=_correlation(tensors, settings, system),
         offsets=_below(tensors, "offset."),
         torque_std=tensors.get("torque_std"),
         pinned=settings.pinned,
@@ -170,6 +170,15 @@ def _restored(
     result = FitResult(**settings.result.model_dump(), constant_inputs=constant)
     noise = _below(tensors, "noise_std.")
     return StructuredFit(spec, problem, hyper, posterior, result, system, noise)
+
+
+def _correlation(
+    tensors: Mapping[str, Tensor], settings: StructuredSettings, system: ConstrainedSystem
+) -> Tensor | None:
+    """How long torque noise is correlated; older models have one time for all joints."""
+    if "torque_correlation" in tensors or settings.correlation_time == 0.0:
+        return tensors.get("torque_correlation")
+    return torch.full_like(system.robot.mass, settings.correlation_time)
 
 
 def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
