@@ -13,7 +13,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp.forces.priors.base import AnalyticalMean
-from forcegp.rollout import ForceLaw, RolloutOptions, rollout
+from forcegp.rollout import DivergedError, ForceLaw, RolloutOptions, rollout
 from forcegp.rollout.sticking import dry_friction_force
 
 LIMITS = (2.0, 0.7)
@@ -43,9 +43,9 @@ def pendulum(tmp_path: Path) -> forcegp.ConstrainedSystem:
     return forcegp.ConstrainedSystem(forcegp.load_robot(path))
 
 
-def in_mujoco(q0: Tensor, qd0: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
+def in_mujoco(q0: Tensor, qd0: Tensor, tau: Tensor, xml: str = DOUBLE) -> tuple[Tensor, Tensor]:
     """Position and velocity before each step under torques `(steps, 2)`."""
-    model = mujoco.MjModel.from_xml_string(DOUBLE)  # pyright: ignore[reportAttributeAccessIssue]
+    model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
     data.qpos[:], data.qvel[:] = q0, qd0
     states = []
@@ -99,6 +99,24 @@ def test_smooth_friction_lets_a_joint_creep_that_dry_friction_holds(pendulum) ->
     assert not bool(held.qdd.any())
     creeping = rolled(pendulum, q0, pair(0, 0), tau, sticking=False)
     assert float((creeping.q[-1] - q0).abs().max()) > 1e-3
+
+
+def test_stiff_viscous_friction_is_that_of_mujocos_implicit_step(pendulum) -> None:
+    """A damper that an explicit step would turn round: h D/I = 4.8; MuJoCo takes it at the step's end."""
+    damping = (1.0, 200.0)
+    xml = DOUBLE.replace('<flag eulerdamp="disable"/>', "")
+    for limit, own in zip(LIMITS, damping, strict=True):
+        xml = xml.replace(f'frictionloss="{limit}"', f'damping="{own}"')
+    tau = torch.zeros(300, 2, dtype=torch.float64)
+    tau[:, 0] = 2.0 * torch.sin(torch.arange(300.0) / 30.0)
+    q0, qd0 = pair(0.3, -0.5), pair(0.2, 1.0)
+    q, qd = in_mujoco(q0, qd0, tau, xml)
+    robot = pendulum.robot.replace(damping=pair(*damping), friction=pair(1e-9, 1e-9))
+    found = rolled(dataclasses.replace(pendulum, robot=robot), q0, qd0, tau)
+    assert float((found.q - q).abs().max()) < 1e-7
+    assert float((found.qd - qd).abs().max()) < 1e-7
+    with pytest.raises(DivergedError):
+        rolled(dataclasses.replace(pendulum, robot=robot), q0, qd0, tau, sticking=False)
 
 
 def test_a_block_in_contact_slides_to_rest_in_closed_form(tmp_path: Path) -> None:

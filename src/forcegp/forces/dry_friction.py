@@ -27,6 +27,8 @@ from forcegp.forces.samples import ForceSamples
 SMOOTH = 0.02
 """Speed over which friction that would drive a joint changes sign; it is no friction and cannot stick
 [rad/s, m/s]."""
+NUDGE = 1e-4
+"""Change of speed over which the slope of friction is taken [rad/s, m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +39,13 @@ class DryFriction:
         Q_bar: `(n, nq)` all impressed forces without it [N m, N].
         limit: `(n, nq)` its largest size F ≥ 0 [N m, N].
         response: `(n, nq, nq)` ∂Q̄/∂Q where contacts have Coulomb friction; `None` for the identity.
+        damping: `(n, nq)` D = −∂Q_i/∂q̇_i ≥ 0 of the joints' other friction [N m s/rad, N s/m].
     """
 
     Q_bar: Tensor
     limit: Tensor
     response: Tensor | None
+    damping: Tensor
 
 
 @runtime_checkable
@@ -110,15 +114,17 @@ def split(
     sticking = [p for p, prior in enumerate(priors) if prior.sticks]
     others = [p for p, prior in enumerate(priors) if not prior.sticks]
 
-    def sliding(direction: float) -> Tensor:
-        there = dataclasses.replace(at, slip=torch.full_like(at.qd, direction))
+    def sliding(direction: float, faster: float = 0.0) -> Tensor:
+        there = dataclasses.replace(at, slip=torch.full_like(at.qd, direction), qd=at.qd + faster)
         known = mean(system, there)
         return known if unknown is None else known + unknown.unknown_force(system, there, sticking)
 
+    # Only friction is read at another speed: all else that depends on it stands in the equations of motion.
     forward, backward = sliding(1.0), sliding(-1.0)
+    damping = ((forward - sliding(1.0, NUDGE)) / NUDGE).clamp(min=0.0)
     limit = 0.5 * (backward - forward)
     Q = 0.5 * (forward + backward) + limit.clamp(max=0.0).neg() * torch.tanh(at.qd / SMOOTH)
     if unknown is not None:
         Q = Q + unknown.unknown_force(system, at, others)
     Q_bar = with_coulomb(system, at, Q, coulomb)
-    return DryFriction(Q_bar, limit.clamp(min=0.0), coulomb_response(system, at, coulomb))
+    return DryFriction(Q_bar, limit.clamp(min=0.0), coulomb_response(system, at, coulomb), damping)

@@ -19,7 +19,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.dry_friction import DryFriction, TotalForce, split
 from forcegp.forces.quantities import States
 from forcegp.rollout.inputs import Inputs, Reached
-from forcegp.rollout.sticking import dry_friction_force
+from forcegp.rollout.sticking import at_the_end, dry_friction_force, overshooting
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]
 """The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""
@@ -236,9 +236,14 @@ class Problem:
         if dry is None:
             qdd, multiplier = self.law.motion(self.system, at)
             return Evaluation(tau, qdd, multiplier, eom.c, eom.cd)
-        free = under(eom, dry.Q_bar)
+        free, h = under(eom, dry.Q_bar).qdd, end - state.t
         G = eom.H if dry.response is None else eom.H @ dry.response
-        force, held, stopping = dry_friction_force(free.qdd, G, dry.limit, state.qd, end - state.t)
+        damping = overshooting(G, dry.damping, h)
+        if damping is not None:
+            free, G = at_the_end(free, G, damping, h)
+        force, held, stopping = dry_friction_force(free, G, dry.limit, state.qd, h)
+        if damping is not None:
+            force = force - h * damping * (free + (G @ force[..., None])[..., 0])
         impressed = force if dry.response is None else (dry.response @ force[..., None])[..., 0]
         qdd, multiplier = under(eom, dry.Q_bar + impressed)
         qdd = torch.where(held, stopping, qdd)  # the same but for rounding

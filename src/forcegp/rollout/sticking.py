@@ -9,6 +9,10 @@ contact G = H, so that the contact's force answers to that of joints that stick.
 The problem is solved exactly by block principal pivoting (Júdice and Pires, *A block principal pivoting
 algorithm for large-scale strictly monotone linear complementarity problems*, 1994): guess which joints stick,
 solve for their friction, exchange those that contradict the guess.
+
+Light joints with much viscous friction D are stiff: where h G_ii D_i > 1, an explicit step turns their
+motion round, and above 2 it grows without end. There viscous friction is that at the end of the step,
+q̈ = q̈₀ + G (p − h D q̈), as in MuJoCo's Euler integrator; elsewhere it is that of the start.
 """
 
 from __future__ import annotations
@@ -50,6 +54,47 @@ class Stuck(NamedTuple):
     stopping: Tensor
 
 
+def overshooting(G: Tensor, damping: Tensor, h: Tensor) -> Tensor | None:
+    """The viscous friction D `(n, nq)` of states where it would turn a joint round within the step.
+
+    Args:
+        G: `(n, nq, nq)` acceleration per joint force.
+        damping: `(n, nq)` D ≥ 0 [N m s/rad, N s/m].
+        h: `(n, 1)` step [s].
+
+    Returns:
+        D where h G_ii D_i > 1 for a joint of the state and 0 elsewhere; `None` where no state has one.
+    """
+    rows = (h * G.diagonal(dim1=-2, dim2=-1) * damping > 1.0).any(-1, keepdim=True)
+    return torch.where(rows, damping, 0.0) if bool(rows.any()) else None
+
+
+def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+    """Acceleration and its response to joint forces with viscous friction at the end of a step.
+
+    q̈ = q̈₀ + G (p − h D q̈), so q̈ = (1 + h G D)⁻¹ (q̈₀ + G p).
+
+    Args:
+        qdd: `(n, nq)` q̈₀, with viscous friction at the start of the step [rad/s², m/s²].
+        G: `(n, nq, nq)` acceleration per joint force p.
+        damping: `(n, nq)` D ≥ 0 [N m s/rad, N s/m].
+        h: `(n, 1)` step [s].
+
+    Returns:
+        (1 + h G D)⁻¹ q̈₀ and (1 + h G D)⁻¹ G.
+
+    Example:
+        >>> import torch
+        >>> one = torch.ones(1, 1, dtype=torch.float64)
+        >>> qdd, _ = at_the_end(-2.0 * one, one[None], 3.0 * one, one)
+        >>> qdd.item()
+        -0.5
+    """
+    slowed = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device) + G * (h * damping)[..., None, :]
+    both = torch.linalg.solve(slowed, torch.cat([qdd[..., None], G], dim=-1))
+    return both[..., 0], both[..., 1:]
+
+
 def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Tensor) -> Stuck:
     """The dry friction of joints over a step.
 
@@ -66,7 +111,7 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
     Example:
         >>> import torch
         >>> one = torch.ones(1, 1, dtype=torch.float64)
-        >>> dry_friction_force(3.0 * one, one[None], 5.0 * one, 0.0 * one, one).force.item()
+        >>> round(dry_friction_force(3.0 * one, one[None], 5.0 * one, 0.0 * one, one).force.item(), 6)
         -3.0
     """
     stopping = -torch.where(qd.abs() > STILL, qd, 0.0) / h.clamp(min=INSTANT)
