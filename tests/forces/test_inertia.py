@@ -60,18 +60,11 @@ def test_a_right_file_is_kept(file: RobotModel, seed: int) -> None:
 
 
 def test_inertia_of_drives_that_the_file_lacks_is_found(file: RobotModel) -> None:
-    """Drives about the inertia of the links, which the regressor of links has no column for."""
+    """Not taken for inertia of the links, which would load the other joint too."""
     armature = torch.tensor([0.3, 0.1], dtype=torch.float64)
-    data = log(file.replace(armature=armature))
-    system, prior = forcegp.ConstrainedSystem(file), JointFrictionPrior()
-    result = found(file, data)
-    fit = forcegp.StructuredGP(system, "analytical").fit(data)
-    if not result.learned:
-        torch.testing.assert_close(result.robot.armature, armature, rtol=0.1, atol=0.0)
-    error = fit.predict(data.q, data.qd, data.tau, covariance=False).mean - data.qdd
-    torque = (dynamics.mass_matrix(fit.system.robot, data.q) @ error[..., None])[..., 0]
-    assert bool((torque.square().mean(0).sqrt() < 1.2 * NOISE).all())
-    assert prior.name in fit.hyperparameters or fit.hyperparameters
+    result = found(file, log(file.replace(armature=armature)))
+    assert not result.learned and "drives" in result.doubts[0]
+    torch.testing.assert_close(result.robot.armature, armature, rtol=0.1, atol=0.0)
 
 
 def test_links_that_the_file_describes_wrongly_are_learned(file: RobotModel) -> None:

@@ -159,12 +159,15 @@ def inertia_of(
     before = held_out(drives, lambda _: none)
     every = drives.total()
     noise = every.error(none, every.friction(none)).sqrt()
-    if links_are_wrong(robot, rows, noise, before):
+    M = mass_matrix(robot, rows.q)
+    alone = held_out(drives, lambda given: _drives(given, noise, M, 0.0))
+    helped = is_better(alone, before)
+    if links_are_wrong(robot, rows, noise, alone if helped else before):
         text = (
             "held-out torques ask for other inertial parameters than the robot file's: they are learned too"
         )
         return Inertia(robot, learned=True, doubts=(text,))
-    armature = inertia_of_drives(robot, rows, drives, noise, before)
+    armature = inertia_of_drives(rows, drives, noise, M, alone, helped)
     if not bool(armature.any()):
         return Inertia(robot)
     found = " ".join(f"{a:.2g}" for a in armature.tolist())
@@ -232,7 +235,7 @@ def is_harmless(after: Tensor, before: Tensor) -> bool:
 
 
 def links_are_wrong(robot: RobotModel, rows: Rows, noise: Tensor, before: Tensor) -> bool:
-    """Whether learned inertial parameters predict held-out torques significantly better than the file's.
+    """Whether learned inertial parameters predict held-out torques significantly better than what is known.
 
     They have to do so twice: as free parameters on held-out stretches, and as those of the consistent robot
     that `InertialPrior` moves to.
@@ -268,13 +271,17 @@ def _power(by_stretch: Sums, rows: Rows, columns: Tensor, noise: Tensor) -> floa
 
 
 def inertia_of_drives(
-    robot: RobotModel, rows: Rows, by_stretch: Sums, noise: Tensor, before: Tensor
+    rows: Rows, by_stretch: Sums, noise: Tensor, M: Tensor, alone: Tensor, helped: bool
 ) -> Tensor:
-    """Inertia of drives beyond the file's `(nq,)`, zero where torques and accelerations do not need it."""
-    M = mass_matrix(robot, rows.q)
+    """Inertia of drives beyond the file's `(nq,)`, zero where torques and accelerations do not need it.
 
-    def most_probable(weight: float) -> Estimate:
-        return lambda given: _drives(given, noise, M[:: max(1, len(M) // VOLUME_STATES)], weight)
+    Args:
+        rows, by_stretch: the samples.
+        noise: of the torques `(nq,)`.
+        M: mass matrix of the file at the samples.
+        alone: held-out errors with v = 0.
+        helped: whether these are significantly smaller than with the file's inertia.
+    """
 
     def is_sane(armature: Tensor) -> bool:
         """Whether accelerations are predicted as well as by their mean, by the geometric mean of joints."""
@@ -284,23 +291,22 @@ def inertia_of_drives(
         spread = rows.qdd - rows.qdd.mean(0)
         return float((missed.square().mean(0) / spread.square().mean(0)).log().mean()) <= 0.0
 
-    undamped = most_probable(0.0)
-    least = held_out(by_stretch, undamped)
-    found = undamped(by_stretch.total()) if is_better(least, before) else torch.zeros_like(noise)
+    found = torch.zeros_like(noise)
+    if helped:
+        found = _drives(by_stretch.total(), noise, M, 0.0)
     for weight in WEIGHTS:
         if is_sane(found):
             break
-        estimate = most_probable(weight)
-        if not is_harmless(held_out(by_stretch, estimate), least):
+        if not is_harmless(held_out(by_stretch, lambda given, v=weight: _drives(given, noise, M, v)), alone):
             break
-        found = estimate(by_stretch.total())
+        found = _drives(by_stretch.total(), noise, M, weight)
     return found
 
 
 def _drives(given: Sums, noise: Tensor, M: Tensor, weight: float) -> Tensor:
     """a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a|, both over all samples."""
     H, h = given.quadratic(noise)
-    n = float(given.count)
+    n, M = float(given.count), M[:: max(1, len(M) // VOLUME_STATES)]
     scale = M.diagonal(dim1=-2, dim2=-1).mean(0)
     H, h = (H * scale[:, None] * scale / n).numpy(), (h * scale / n).numpy()
     relative = (M / (scale[:, None] * scale).sqrt()).numpy()
