@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ModelError
+from forcegp.errors import ModelError, UnknownNameError
+from forcegp.forces.inertia import inertia_of
 from forcegp.forces.learn import Problem, analytical_parameters
 from forcegp.forces.measurements import (
     NoiseStd,
@@ -27,7 +28,9 @@ from forcegp.forces.measurements import (
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.coregional import CoregionalPrior
 from forcegp.forces.priors.default import measured_priors
+from forcegp.forces.priors.disturbance import DisturbancePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
@@ -38,6 +41,7 @@ from forcegp.forces.state_noise import state_std_of
 from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.inducing import LIMIT
+from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sparse_tensors import tensors_of_posterior
 from forcegp.models.base import FitResult
@@ -54,8 +58,11 @@ CLASSES: dict[str, type] = {
     "sum": kernels.Sum,
     "product": kernels.Product,
     "constant": kernels.Constant,
+    "ornstein_uhlenbeck": OrnsteinUhlenbeck,
     "joint": JointForcePrior,
     "joint_friction": JointFrictionPrior,
+    "disturbance": DisturbancePrior,
+    "coregional": CoregionalPrior,
     "inertial": InertialPrior,
     "normal": NormalForcePrior,
     "payload": PayloadPrior,
@@ -65,8 +72,12 @@ CLASSES: dict[str, type] = {
 """What can be saved, by the name in the file."""
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
 """A noise that may be zero, as one number or one per joint."""
+INERTIAS = ("file", "auto")
+"""Where the inertia of the robot is from."""
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """What is kept of each measurement."""
+IN_TIME = ("segment", "t")
+"""What is kept beside it where a prior is a function of time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +96,9 @@ class Specification:
         inducing_points: maximum number of inducing points of one prior.
         automatic: whether the priors depend on whether the data are simulated or measured.
         state_noise: standard deviations of the noise of q and of q̇, or `None` for none.
+        inertia: `"file"`, or `"auto"` where the log may show another one.
+        standardize: whether the inputs of kernels are standardized.
+        degrees_of_freedom: ν of noise with heavy tails, or `None` for Gaussian noise.
     """
 
     system: ConstrainedSystem
@@ -98,6 +112,9 @@ class Specification:
     inducing_points: int = LIMIT
     automatic: bool = False
     state_noise: tuple[NoiseStd, NoiseStd] | None = None
+    inertia: str = "file"
+    standardize: bool = True
+    degrees_of_freedom: float | None = None
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
         """The specification with what was left to the data filled in.
@@ -107,7 +124,8 @@ class Specification:
         """
         spec, observations = self, observations_of(data)
         if spec.automatic and not is_simulated(observations):
-            spec = dataclasses.replace(spec, priors=measured_priors(spec.system), torque_noise="learn")
+            priors = measured_priors(spec.system)
+            spec = dataclasses.replace(spec, priors=priors, torque_noise="learn", inertia="auto")
         if spec.learns_torque_noise and spec.noise_std is None and not states_noise(observations):
             spec = dataclasses.replace(spec, learn_noise=True)
         return dataclasses.replace(spec, automatic=False)
@@ -116,6 +134,17 @@ class Specification:
     def learns_torque_noise(self) -> bool:
         """Whether the noise of the motor torque is learned."""
         return isinstance(self.torque_noise, str)
+
+    def with_inertia_of(self, training: Training) -> tuple[Specification, tuple[str, ...]]:
+        """The specification with the inertia that the training samples ask for, and doubts about it."""
+        friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
+        asks = self.inertia == "auto" and "actuation" in self.mean.terms and self.parameters is None
+        if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
+            return self, ()
+        found = inertia_of(self.system, friction, self.mean, training)
+        priors = (*self.priors, InertialPrior()) if found.learned else self.priors
+        system = self.system.with_robot(found.robot)
+        return dataclasses.replace(self, system=system, priors=priors, inertia="file"), found.doubts
 
     def problem(self, training: Training) -> Problem:
         """The learning problem of training data."""
@@ -149,6 +178,17 @@ def torque_noise_of(given: NoiseStd | str | None, priors: Sequence[ForcePrior]) 
     return given
 
 
+def check_inertia(inertia: str) -> str:
+    """Where the inertia of the robot is from.
+
+    Raises:
+        UnknownNameError: neither "file" nor "auto".
+    """
+    if inertia not in INERTIAS:
+        raise UnknownNameError("inertia", inertia, INERTIAS)
+    return inertia
+
+
 class ResultSettings(Settings):
     """How the fit went."""
 
@@ -180,6 +220,8 @@ class StructuredSettings(Settings):
     state_noise: tuple[Stated, Stated] | None
     inference: Literal["auto", "exact", "sparse"]
     inducing_points: PositiveInt = LIMIT
+    standardize: bool = True
+    degrees_of_freedom: float | None = Field(default=None, gt=2.0)
     power: float = Field(gt=0.0, le=1.0)
     correlation_time: float = Field(default=0.0, ge=0.0)
     priors: tuple[dict[str, Any], ...]
@@ -220,8 +262,9 @@ def pack(
         state_noise=None if spec.state_noise is None else tuple(map(plain, spec.state_noise)),  # pyright: ignore[reportArgumentType]
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
         inducing_points=spec.inducing_points,
+        standardize=spec.standardize,
+        degrees_of_freedom=spec.degrees_of_freedom,
         power=problem.power,
-        correlation_time=problem.correlation_time,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
         measured=training.quantities if exact else (),
@@ -233,8 +276,10 @@ def pack(
     tensors |= {f"offset.{name}": value for name, value in problem.offsets.items()}
     if problem.torque_std is not None:
         tensors["torque_std"] = problem.torque_std
+    if problem.correlation is not None:
+        tensors["torque_correlation"] = problem.correlation
     if isinstance(latent, ExactPosterior):
-        tensors |= {"alpha": latent.alpha, **_tensors_of(training)}
+        tensors |= {"alpha": latent.alpha, **_tensors_of(training, any(p.in_time for p in spec.priors))}
     else:
         assert isinstance(latent, SparsePosterior)
         tensors |= {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
@@ -249,12 +294,14 @@ def pack(
     return settings, tensors
 
 
-def _tensors_of(training: Training) -> dict[str, Tensor]:
-    """The data of an exact posterior."""
+def _tensors_of(training: Training, in_time: bool) -> dict[str, Tensor]:
+    """The data of an exact posterior, with their times where a prior reads them."""
     tensors = {}
     for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
-        tensors |= {f"data.{i}.{name}": getattr(m, name) for name in COLUMNS}
+        tensors |= {f"data.{i}.{name}": getattr(m, name) for name in COLUMNS + (IN_TIME if in_time else ())}
         tensors[f"data.{i}.noise_std"] = std
+        if training.weights is not None:
+            tensors[f"data.{i}.weight"] = training.weights[i]
     return tensors
 
 

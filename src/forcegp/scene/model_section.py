@@ -40,6 +40,7 @@ class LearningSection(Section):
     warm_start: Literal[False] | PositiveInt = False
     restarts: NonNegativeInt = 0
     seed: NonNegativeInt = 0
+    hyperpriors: bool = True
     epochs: PositiveInt = 1
     batch: PositiveInt = 1
     held_out: PositiveFloat = 0.1
@@ -63,7 +64,10 @@ class ModelSection(Section):
     state_noise: tuple[State, State] | None = None
     sensor_noise_std: PositiveFloat | None = None
     inference: Literal["auto", "exact", "sparse"] = "auto"
+    inertia: Literal["file", "auto"] = "file"
     inducing_points: PositiveInt = 100
+    standardize: bool = True
+    degrees_of_freedom: PositiveFloat | None = None
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: tuple[dict[str, Any], ...] = ()
     analytical: dict[str, Literal["all"] | tuple[str, ...]] = {}
