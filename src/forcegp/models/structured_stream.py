@@ -240,6 +240,8 @@ def _restored(
     if {k: x.shape for k, x in tensors.items()} != {k: x.shape for k, x in expected.items()}:
         raise ModelError("the checkpoint's sums do not fit the model", hint="remove it to start anew")
     tensors = {name: tensors[name] for name in expected}  # kernel inputs in their order
+    # A kernel that reads all inputs takes them in their order, which a file does not keep.
+    tensors = {name: tensors[name] for name in expected}
     own = basis_of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
     found = {
         name: Sums(*(tensors[f"{name}.{i}"] for i in range(len(fields(Sums)))))
