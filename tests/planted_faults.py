@@ -297,8 +297,10 @@ def _surface(change: Callable[[Plane], Plane]) -> Callable:
 
 
 def _tilt_surface(plane: Plane) -> Plane:
-    a, center = np.radians(1.0), np.array([0.5, 0.0, plane.offset])
-    normal = np.array([np.sin(a), 0.0, np.cos(a)])
+    """The plane turned by 1° about the world's y axis through its point below x = 0.5 m."""
+    a, n = np.radians(1.0), np.array(plane.normal)
+    center = np.array([0.5, 0.0, (plane.offset - 0.5 * n[0]) / n[2]])
+    normal = np.array([np.cos(a) * n[0] + np.sin(a) * n[2], n[1], np.cos(a) * n[2] - np.sin(a) * n[0]])
     return Plane(tuple(normal), float(normal @ center))
 
 

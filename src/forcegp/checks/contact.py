@@ -89,15 +89,15 @@ def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Findin
     if closed.sum() < LEAST_ROWS:
         return []
     found, distance = _placement(contact, path, closed, log)
-    touch = max(TOUCH, ROUGH * float(robust_std(distance[closed])))
-    return [*found, *_labels(contact, path, closed, usable, distance, touch, log)]
+    rough = ROUGH * float(robust_std(distance[closed]))
+    return [*found, *_labels(contact, path, closed, usable, distance, rough, log)]
 
 
 def _placement(
     contact: SurfaceContact, path: Path, closed: np.ndarray, log: Log
 ) -> tuple[list[Finding], Array]:
     """Displacement and tilt of the surface, and the distance from it once they are undone."""
-    offset, tilt, shift = _fit_surface(contact, path, closed)
+    offset, tilt, shift = fit_surface(contact, path, closed)
     rows = intervals(closed)
     name, evidence = contact.name, {"offset_m": offset, "tilt_deg": float(np.degrees(np.linalg.norm(tilt)))}
     distance = path.c - shift
@@ -115,7 +115,7 @@ def _placement(
     return found, distance if found else path.c
 
 
-def _fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
+def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
     """Offset in the middle of the path [m], slope along the surface `(3,)`, distance they make `(n,)`.
 
     Rows that stay off the fit, such as those labelled too early, are trimmed round by round.
@@ -151,10 +151,17 @@ def _labels(
     closed: np.ndarray,
     usable: np.ndarray,
     c: Array,
-    touch: float,
+    rough: float,
     log: Log,
 ) -> list[Finding]:
-    """Rows labelled closed off the surface, by their place in the interval, and open ones that slide."""
+    """Rows labelled closed off the surface, by their place in the interval, and open ones that slide.
+
+    A run is found where the tip is farther off than surfaces and arms give way. It reaches to the row at which the
+    tip moves along the normal no faster than in the rest of the contact.
+    """
+    touch = max(TOUCH, rough)
+    approach = (path.v * path.normal).sum(axis=1)
+    settled = np.abs(approach) <= ROUGH * float(robust_std(approach[closed]))
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     off = closed & (np.abs(c) > touch)
     runs: dict[str, list[tuple[int, int]]] = {"contact-early": [], "contact-late": [], "contact-far": []}
@@ -165,6 +172,8 @@ def _labels(
                 inside = (a > 0 and b < stop - start) or (a == 0 and b == stop - start)
                 if inside and float(np.abs(c[start + a : start + b]).max()) <= max(DRIFT, touch):
                     continue
+                if not inside:
+                    a, b = _until_settled(a, b, settled[start:stop])
                 runs["contact-far" if inside else kind].append((start + a, start + b))
     texts = {
         "contact-early": "labelled closed before the tip touches",
@@ -180,6 +189,13 @@ def _labels(
             text = f"contact {contact.name!r} is {texts[kind]}, {where}"
             found.append(Finding(kind, text, rows, contact=contact.name, evidence={"distance_m": most}))
     return [*found, *_missed(contact, path, usable & ~closed, c, touch, log)]
+
+
+def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
+    """A run at the start or the end of an interval, extended to the rows at which the tip rests on the surface."""
+    if a == 0:
+        return a, b + int(np.argmax(settled[b:])) if settled[b:].any() else b
+    return (a - int(np.argmax(settled[:a][::-1])) if settled[:a].any() else a), b
 
 
 def _missed(

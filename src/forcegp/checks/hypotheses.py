@@ -70,6 +70,13 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
     return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
 
 
+def sharper_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
+    """Declared Coulomb friction at a tenth of its smoothing velocity, less the same as declared, `(n, nq, p)`."""
+    qd, width = log.qd[rows], system.robot.friction_velocity.numpy()
+    sharper = np.tanh(10.0 * qd / width) - np.tanh(qd / width)
+    return _diagonal(sharper)[..., np.flatnonzero(system.robot.friction.numpy() > 0.0)]
+
+
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """Viscous and dry friction of each contact of which only the normal force is taken out, `(n, nq, p)`."""
     touching = [c for c in known_contacts(system, log) if isinstance(c, SurfaceContact)]
@@ -134,7 +141,7 @@ def delayed(log: Log, shift: int) -> Log:
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
     """Signs, orders and delays: explanations without a parameter to fit."""
-    every, motion, lags = tuple(range(log.nq)), ("q", "qd", "qdd"), LAGS if log.stretches else ()
+    every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
         yield Hypothesis("torque-sign", 0, partial(flipped, j=slice(None), names=("tau",)), joints=every)
     for j in every:
@@ -144,7 +151,12 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
     for i, j in combinations(every, 2):
         yield Hypothesis("torque-order", 0, partial(swapped, i=i, j=j, names=("tau",)), joints=(i, j))
         yield Hypothesis("joint-order", 0, partial(swapped, i=i, j=j, names=(*motion, "tau")), joints=(i, j))
-    for shift in (sign * lag for lag in lags for sign in (1, -1)):
+    yield from delays(log)
+
+
+def delays(log: Log) -> Iterator[Hypothesis]:
+    """Torques that are logged before or after the motion."""
+    for shift in (sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)):
         yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
 
 

@@ -10,11 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from forcegp import dynamics
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.limits import DEGREE
 from forcegp.checks.log import Log
+from forcegp.checks.residual import tensors
 from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
@@ -24,7 +27,7 @@ WINDOW = 0.05
 TOLERANCE = 0.05
 """A slope within this of 1 is right: filters and uneven clocks cost a few percent."""
 INSTANT = 0.15
-"""The same for accelerations: at an instant, that of a light damped joint is not its mean over a period."""
+"""The same for accelerations, which change within a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
 EXCHANGED = 0.9
@@ -33,6 +36,10 @@ CLEARLY = 5.0
 """Factor of unexplained variance by which that order must be better."""
 JUMPS = 0.05
 """Largest share of windows that impacts cross: the velocity jumps there, which no acceleration holds."""
+INERTIA_ROWS = 200
+"""Rows at which inertias are computed."""
+ALIKE = 0.02
+"""Slopes of all joints within this of one factor have one cause: the clock."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
 """Seconds over the unit of a clock in ns, µs, ms or ks."""
 UNIT_TOLERANCE = 0.1
@@ -56,10 +63,12 @@ class Match:
     correlation: Array
     moving: np.ndarray
 
-    def right(self, factor: float = 1.0, tolerance: float = TOLERANCE) -> np.ndarray:
-        """`(nq,)` bool, whether a slope can be this factor."""
+    def right(
+        self, factor: float = 1.0, tolerance: float = TOLERANCE, least: Array | float = 1.0
+    ) -> np.ndarray:
+        """`(nq,)` bool, whether a slope can lie between `least` times this factor and the factor."""
         ratio = np.stack([self.low, self.high]) / factor
-        return (ratio.min(axis=0) < 1.0 + tolerance) & (ratio.max(axis=0) > 1.0 - tolerance)
+        return (ratio.min(axis=0) < 1.0 + tolerance) & (ratio.max(axis=0) > least * (1.0 - tolerance))
 
 
 def match(log: Log, value: str, rate: str) -> Match | None:
@@ -131,11 +140,21 @@ def _check_long_step(log: Log) -> Outcome:
         first = match(log, "q", "qd")
         factor = float(np.median(first.low[first.moving])) if first is not None else 1.0
         near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
-        return _clock_finding(log, factor) if near else ([], log)
+        alike = first is not None and _one_factor(first, factor)
+        return _clock_finding(log, factor) if near or alike else ([], log)
     if log.dt < 1.0:
         return [], log
     text = f"rows are {log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
     return [Finding("time-unit", text, log.all_rows, evidence={"period": log.dt})], log
+
+
+def _one_factor(level: Match, factor: float) -> bool:
+    """Whether several joints share one slope that is neither right nor that of degrees."""
+    degrees = any(abs(np.log(abs(factor) * unit)) <= UNIT_TOLERANCE for unit in (DEGREE, 1.0 / DEGREE))
+    if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or degrees or level.moving.sum() < 2:
+        return False
+    related = np.abs(level.correlation[level.moving]) >= EXCHANGED
+    return bool(related.all() and level.right(factor, ALIKE)[level.moving].all())
 
 
 def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -221,6 +240,22 @@ def _follow(log: Log, permutation: np.ndarray) -> Array:
     return log.qdd[:, permutation] if together else log.qdd
 
 
+def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
+    """`(nq,)` mean acceleration over a period in which the torque is held, over that at its start.
+
+    Viscous friction d slows a joint of inertia m as exp(−d t/m), which takes (1 − exp(−x))/x of it at x = d dt/m:
+    sampled right after each change of the torque, the accelerations of light damped joints are larger than the
+    changes of velocity.
+    """
+    (q,) = tensors(log, log.rows(INERTIA_ROWS), "q")
+    if not len(q):
+        return np.ones(log.nq)
+    with torch.no_grad():
+        inverse = torch.linalg.inv(dynamics.mass_matrix(system.robot, q)).diagonal(dim1=-2, dim2=-1)
+    x = np.maximum(system.robot.damping.numpy() * log.dt * inverse.median(dim=0).values.numpy(), 1e-6)
+    return -np.expm1(-x) / x
+
+
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     """Accelerations that are not the derivative of the velocities, beyond what their noise explains."""
     if not log.stretches or log.derived:
@@ -229,7 +264,7 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     if level is None:
         return [], log
     related = np.abs(level.correlation) > 0.3
-    wrong = level.moving & related & ~level.right(tolerance=INSTANT)
+    wrong = level.moving & related & ~level.right(tolerance=INSTANT, least=_held_torque(system, log))
     # An acceleration without relation to the motion shows where its integral is as large as the change.
     size = np.sqrt((level.integral**2).sum(axis=0) / np.maximum((level.change**2).sum(axis=0), 1e-300))
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))
