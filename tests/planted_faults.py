@@ -110,6 +110,7 @@ class Fault:
         contact: whether it needs a contact, cannot be planted in one, or neither.
         joint: joint that the finding must list, by index.
         white: whether it needs a log whose header states its white noise.
+        amount: its size as the evidence of `faults-hidden` counts it: rad, degrees, s, or a share.
     """
 
     name: str
@@ -118,6 +119,7 @@ class Fault:
     contact: bool | None = None
     joint: int | None = None
     white: bool = False
+    amount: float = 0.0
 
 
 def _change(
@@ -406,6 +408,7 @@ FAULTS = (
         "torque-gain",
         _change(tau=lambda g: g.tau * _joint(g, 3, 1.6, 1.0)),
         joint=3,
+        amount=0.6,
     ),
     Fault("current", "torque-current", _change(tau=lambda g: g.tau / np.linspace(14.0, 6.0, g.nq))),
     Fault("a torque offset", "torque-offset", _change(tau=lambda g: g.tau + _joint(g, 3, 3.0)), joint=3),
@@ -413,6 +416,7 @@ FAULTS = (
         "a torque 40 ms late",
         "torque-delay",
         _change(tau=lambda g: np.roll(g.tau, round(0.04 / g.dt), axis=0)),
+        amount=0.04,
     ),
     Fault("torque less gravity", "torque-without-gravity", _without_gravity),
     Fault("torques exchanged", "torque-order", _change(tau=lambda g: g.tau[:, _swap(g, 1, 3)]), joint=1),
@@ -430,18 +434,22 @@ FAULTS = (
         joint=3,
     ),
     Fault(
-        "an encoder off by 0.1 rad", "encoder-offset", _change(q=lambda g: g.q + _joint(g, 3, 0.1)), joint=3
+        "an encoder off by 0.1 rad",
+        "encoder-offset",
+        _change(q=lambda g: g.q + _joint(g, 3, 0.1)),
+        joint=3,
+        amount=0.1,
     ),
     Fault("gravity the wrong way round", "gravity-direction", _gravity(0.0, 0.0, 9.81)),
     Fault("gravity along x", "gravity-direction", _gravity(9.81, 0.0, 0.0)),
-    Fault("a base tilted by 6°", "base-tilted", _robot(_tilted)),
+    Fault("a base tilted by 6°", "base-tilted", _robot(_tilted), amount=6.0),
     Fault(
         "undeclared friction",
         "friction-undeclared",
         _change(tau=lambda g: g.tau + _joint(g, 3, 3.0) * np.tanh(g.qd / 0.01)),
         joint=3,
     ),
-    Fault("masses that do not fit", "masses-mismatch", _robot(_wrong_masses)),
+    Fault("masses that do not fit", "masses-mismatch", _robot(_wrong_masses), amount=0.45),
     Fault("a tool of 1.5 kg missing", "payload-missing", _lighter(1.5)),
     Fault(
         "a push of 0.5 s",

@@ -156,8 +156,8 @@ def _labels(
 ) -> list[Finding]:
     """Rows labelled closed off the surface, by their place in the interval, and open ones that slide.
 
-    A run is found where the tip is farther off than surfaces and arms give way. It reaches to the row at which the
-    tip moves along the normal no faster than in the rest of the contact.
+    A run is found where the tip is farther off than surfaces and arms give way. It reaches to the row
+    at which the tip moves along the normal no faster than in the rest of the contact.
     """
     touch = max(TOUCH, rough)
     approach = (path.v * path.normal).sum(axis=1)
@@ -192,7 +192,7 @@ def _labels(
 
 
 def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
-    """A run at the start or the end of an interval, extended to the rows at which the tip rests on the surface."""
+    """A run at the start or the end of an interval, extended to where the tip settles."""
     if a == 0:
         return a, b + int(np.argmax(settled[b:])) if settled[b:].any() else b
     return (a - int(np.argmax(settled[:a][::-1])) if settled[:a].any() else a), b

@@ -16,7 +16,7 @@ import numpy as np
 
 from forcegp.checks.diagnosis import corrected, finding_of, plausible
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import Fit, Problem, cross_validate, gain_of, pooled_gain_of
+from forcegp.checks.fit import Fit, Problem, cross_validate, gain_of, pooled_gain_of, score_of
 from forcegp.checks.hypotheses import (
     LAGS,
     ROBOT,
@@ -151,7 +151,9 @@ def _best(
     ]
     good = []
     for hypothesis, fit in tried:
-        if _significant(fit, null, len(hypothesis.joints) or log.nq) and plausible(system, hypothesis, fit):
+        if significant(fit.shares, null.shares, len(hypothesis.joints) or log.nq) and plausible(
+            system, hypothesis, fit
+        ):
             good.append((hypothesis, fit))
     if not good:
         return None
@@ -186,7 +188,7 @@ def _fits(
     for hypothesis in tried:
         fit = _fit(problem, hypothesis, kept, prior)
         yield hypothesis, fit
-        if hypothesis.name == "gains" and _significant(fit, null, 1):
+        if hypothesis.name == "gains" and significant(fit.shares, null.shares, 1):
             off += hypothesis.joints
     if len(off) > 1:
         together = gain_hypothesis(log, rows, tuple(off))
@@ -201,10 +203,15 @@ def _fit(problem: Problem, hypothesis: Hypothesis, kept: Array, prior: Array) ->
     return cross_validate(problem, columns, np.concatenate([hypothesis.prior, prior]), gains)
 
 
-def _significant(fit: Fit, null: Fit, concerned: int) -> bool:
-    """Whether a drop of the score matters for the number of joints concerned, and is not due to chance."""
+def significant(better: Array, worse: Array, concerned: int) -> bool:
+    """Whether a drop of the score matters for the number of joints concerned, and is not due to chance.
+
+    Args:
+        better, worse: `(blocks, nq)` errors as shares of the torque.
+        concerned: number of joints.
+    """
     least = max(MATERIAL, MATERIAL_EACH * concerned)
-    gains = gain_of(fit.score, null.score), pooled_gain_of(fit.shares, null.shares)
+    gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
     return gains[0][0] > least and any(gain > SIGNIFICANT * error for gain, error in gains)
 
 

@@ -79,30 +79,24 @@ def cross_validate(
     """
     p = columns.shape[-1] if columns is not None else 0
     A, y, unit, weight = _equations(problem, columns, prior)
+    rest, thetas, whole = _held_out(A, y, weight)
     block = blocks_of(len(y))
-    parts = [(A[block == k].reshape(-1, A.shape[-1]), y[block == k]) for k in range(BLOCKS)]
-    grams = np.stack([a.T @ a for a, _ in parts])
-    sides = np.stack([a.T @ b.ravel() for a, b in parts])
-    whole = _solve(grams.sum(axis=0), sides.sum(axis=0), weight)
-    thetas, errors = [], []
-    for k, (a, b) in enumerate(parts):
-        theta = _solve(grams.sum(axis=0) - grams[k], sides.sum(axis=0) - sides[k], weight)
-        thetas.append(theta)
-        errors.append(np.sqrt(((b - (a @ theta).reshape(b.shape)) ** 2).mean(axis=0)))
+    error = np.stack([np.sqrt((rest[block == k] ** 2).mean(axis=0)) for k in range(BLOCKS)])
     # Jackknife: (K − 1)/K Σ (θ_k − mean)².
-    spread = np.sqrt(BLOCKS - 1.0) * np.std(np.stack(thetas), axis=0)
-    error = np.stack(errors)
+    spread = np.sqrt(BLOCKS - 1.0) * np.std(thetas, axis=0)
     theta = (whole / unit)[:p]
     # An error counts in relation to the torque: a gain of zero explains a noisy torque, and nothing.
     size = problem.size * np.abs(1.0 + gains_of(theta, gains, len(problem.size))) + 1e-12
     relative = error * problem.scale / size
-    score = 0.5 * np.log(relative**2 + FLOOR**2).sum(axis=1)
+    score = score_of(relative)
     typical = np.median(relative, axis=0)
     return Fit(error, theta, (spread / unit)[:p], (whole / unit)[p:], typical, relative, score)
 
 
-def _equations(problem: Problem, columns: Array | None, prior: Array | None) -> tuple[Array, Array, Array, Array]:
-    """Columns of size one and right-hand side, contact forces taken out, with `unit` and weight of the columns."""
+def _equations(
+    problem: Problem, columns: Array | None, prior: Array | None
+) -> tuple[Array, Array, Array, Array]:
+    """Columns of size one and right-hand side without contact forces, unit and weight of the columns."""
     extra = columns if columns is not None else np.zeros((*problem.r.shape, 0))
     p = extra.shape[-1]
     A = np.concatenate([extra, problem.nuisance], axis=-1) / problem.scale[:, None]
@@ -137,6 +131,25 @@ def robust_parameters(problem: Problem, columns: Array, prior: Array) -> Array:
     return theta / unit
 
 
+def _held_out(A: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Residual of each block under the parameters of the others, these parameters, and those of all."""
+    block, rest = blocks_of(len(y)), np.zeros_like(y)
+    parts = [(A[block == k].reshape(-1, A.shape[-1]), y[block == k]) for k in range(BLOCKS)]
+    grams = np.stack([a.T @ a for a, _ in parts])
+    sides = np.stack([a.T @ b.ravel() for a, b in parts])
+    thetas = []
+    for k, (a, b) in enumerate(parts):
+        thetas.append(_solve(grams.sum(axis=0) - grams[k], sides.sum(axis=0) - sides[k], weight))
+        rest[block == k] = b - (a @ thetas[-1]).reshape(b.shape)
+    return rest, np.stack(thetas), _solve(grams.sum(axis=0), sides.sum(axis=0), weight)
+
+
+def held_out(problem: Problem, columns: Array, prior: Array) -> Array:
+    """Held-out residual of each row as a share of the torque `(n, nq)`; it is linear in `problem.r`."""
+    A, y, _, weight = _equations(problem, columns, prior)
+    return _held_out(A, y, weight)[0] * problem.scale / problem.size
+
+
 def gains_of(theta: Array, joints: tuple[int, ...], nq: int) -> Array:
     """Gain less one by joint, from the leading parameters of a hypothesis on gains."""
     gains = np.zeros(nq)
@@ -150,6 +163,11 @@ def _solve(gram: Array, side: Array, weight: Array) -> Array:
     return cho_solve(cho_factor(gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram))), side)
 
 
+def score_of(shares: Array) -> Array:
+    """`(blocks,)` Σ_j log error_j of errors `(blocks, nq)`, with a floor where they do not matter."""
+    return 0.5 * np.log(shares**2 + FLOOR**2).sum(axis=1)
+
+
 def gain_of(better: Array, worse: Array) -> tuple[float, float]:
     """Mean drop of a score by block, and its standard error."""
     drop = worse - better
@@ -159,8 +177,8 @@ def gain_of(better: Array, worse: Array) -> tuple[float, float]:
 def pooled_gain_of(better: Array, worse: Array) -> tuple[float, float]:
     """Drop of Σ_j log of the error over all blocks, and its standard error by the jackknife.
 
-    Where blocks differ in what they show, as free and touching ones do, the mean drop over blocks scatters with
-    that; the ratio of errors over all blocks does not (Cochran, *Sampling Techniques*, 1977, ch. 6).
+    Where blocks differ in what they show, as free and touching ones do, the mean drop over blocks scatters
+    with that; the ratio of errors over all blocks does not (Cochran, *Sampling Techniques*, 1977, ch. 6).
 
     Args:
         better, worse: `(blocks, nq)` errors as shares of the torque.

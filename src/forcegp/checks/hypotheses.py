@@ -71,7 +71,7 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
 
 
 def sharper_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Declared Coulomb friction at a tenth of its smoothing velocity, less the same as declared, `(n, nq, p)`."""
+    """Declared Coulomb friction at a tenth of its smoothing velocity, less that at all of it, `(n, nq, p)`."""
     qd, width = log.qd[rows], system.robot.friction_velocity.numpy()
     sharper = np.tanh(10.0 * qd / width) - np.tanh(qd / width)
     return _diagonal(sharper)[..., np.flatnonzero(system.robot.friction.numpy() > 0.0)]

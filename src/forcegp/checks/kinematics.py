@@ -50,7 +50,8 @@ class Match:
     """Changes and integrals of one level, and the slopes between them.
 
     Attributes:
-        change, integral: `(w, nq)` over windows.
+        change, integral: `(w, nq)` over windows, zero where an impact crosses one.
+        whole: both as they are.
         low, high: `(nq,)` bounds of the slope.
         correlation: `(nq,)`.
         moving: `(nq,)` bool, joints whose change stands out from noise.
@@ -58,6 +59,7 @@ class Match:
 
     change: Array
     integral: Array
+    whole: tuple[Array, Array]
     low: Array
     high: Array
     correlation: Array
@@ -83,7 +85,8 @@ def match(log: Log, value: str, rate: str) -> Match | None:
         integrals.append(np.diff(total[::width], axis=0))
     if sum(map(len, changes)) < 20:
         return None
-    change, integral = _without_jumps(np.concatenate(changes), np.concatenate(integrals))
+    whole = np.concatenate(changes), np.concatenate(integrals)
+    change, integral = _without_jumps(*whole)
     cross, own, other = (
         (a * b).sum(axis=0) for a, b in ((change, integral), (integral, integral), (change, change))
     )
@@ -92,7 +95,7 @@ def match(log: Log, value: str, rate: str) -> Match | None:
     speed = np.sqrt(other)
     moving = speed > 1e-3 * speed.max()
     low, high, correlation = np.nan_to_num((low, high, correlation))
-    return Match(change, integral, low, high, correlation, moving)
+    return Match(change, integral, whole, low, high, correlation, moving)
 
 
 def _without_jumps(change: Array, integral: Array) -> tuple[Array, Array]:
@@ -217,19 +220,19 @@ def _permutation(level: Match) -> np.ndarray | None:
     """The order of rates that fits the changes of all joints where their own does not, if there is one."""
     from scipy.optimize import linear_sum_assignment
 
-    size = np.sqrt((level.change**2).sum(axis=0)), np.sqrt((level.integral**2).sum(axis=0))
+    # Windows without impacts are those in which a joint fits its own rate, which here is the wrong one.
+    change, integral = level.whole
+    size = np.sqrt((change**2).sum(axis=0)), np.sqrt((integral**2).sum(axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        alike = np.nan_to_num(level.change.T @ level.integral / np.outer(*size))
+        alike = np.nan_to_num(change.T @ integral / np.outer(*size))
     _, order = linear_sum_assignment(-alike)
-    moved = order != np.arange(len(order))
+    moved = (order != np.arange(len(order))) & level.moving
     if not moved.any():
         return None
-    fits = alike[np.arange(len(order)), order][moved & level.moving]
-    own = level.correlation[moved & level.moving]
-    if not len(fits) or fits.min() < EXCHANGED:
-        return None
+    fits, own = alike[np.arange(len(order)), order][moved], np.diag(alike)[moved]
     # Joints that move together are alike in any order; the right one leaves far less unexplained.
-    return order if ((1.0 - own**2) > CLEARLY * (1.0 - fits**2)).all() else None
+    better = (1.0 - own**2) > CLEARLY * (1.0 - fits**2)
+    return order if fits.min() >= EXCHANGED and better.all() else None
 
 
 def _follow(log: Log, permutation: np.ndarray) -> Array:
@@ -243,9 +246,8 @@ def _follow(log: Log, permutation: np.ndarray) -> Array:
 def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
     """`(nq,)` mean acceleration over a period in which the torque is held, over that at its start.
 
-    Viscous friction d slows a joint of inertia m as exp(−d t/m), which takes (1 − exp(−x))/x of it at x = d dt/m:
-    sampled right after each change of the torque, the accelerations of light damped joints are larger than the
-    changes of velocity.
+    Viscous friction d slows a joint of inertia m as exp(−d t/m), which leaves (1 − exp(−x))/x, x = d dt/m:
+    right after each change of the torque, light damped joints accelerate more than their velocity will change.
     """
     (q,) = tensors(log, log.rows(INERTIA_ROWS), "q")
     if not len(q):

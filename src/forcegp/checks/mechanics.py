@@ -11,11 +11,18 @@ from forcegp.checks.excitation import still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of, robust_parameters
-from forcegp.checks.hypotheses import LAGS, contact_friction_columns, friction_columns, robot_columns, sharper_friction_columns
+from forcegp.checks.hypotheses import (
+    LAGS,
+    contact_friction_columns,
+    friction_columns,
+    robot_columns,
+    sharper_friction_columns,
+)
 from forcegp.checks.log import Log
 from forcegp.checks.residual import projector, residual
 from forcegp.checks.smooth import smoothed
 from forcegp.checks.statistics import any_row, describe, intervals
+from forcegp.checks.visibility import check_visibility
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
@@ -64,6 +71,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         *_friction(system.robot, _with_other_friction(system, told)),
         *_offsets(told),
         *_unexplained(told),
+        *check_visibility(system, told),
     ]
     for repair in told.repairs:
         log = repair(log)
@@ -113,7 +121,7 @@ def _part(told: Explanation, j: int, columns: list[int]) -> _Part:
 
 
 def _with_other_friction(system: ConstrainedSystem, told: Explanation) -> Explanation:
-    """The explanation beside friction that is not undeclared: of the contacts, and sharper than the file's law."""
+    """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
     columns = np.concatenate(
         [
             contact_friction_columns(system, told.log, told.rows),

@@ -1,8 +1,8 @@
 """Do the joint angles place the tip on the surface where the log says that it touches?
 
 A tip that is centimetres off the surface has one of two causes. Either the surface lies elsewhere: then the
-distance is a plane over the path. Or the angles are wrong: then one change of them, of which the surface knows
-nothing, takes the tip onto the surface in all rows.
+distance is a plane over the path. Or the angles are wrong: then one change of them takes the tip onto the
+surface in all rows.
 """
 
 from __future__ import annotations
@@ -117,7 +117,9 @@ def _finding(log: Log, contact: SurfaceContact, alike: list[Hypothesis]) -> Find
     touches = f"the tip touches {contact.name!r} where the log says so if"
     if alike[0].name == "encoder-offset":
         offset = float(alike[0].columns[0])  # type: ignore[index]
-        text = f"{touches} {offset:+.4f} rad ({np.degrees(offset):+.2f}°) are added to the position of {listed}"
+        text = (
+            f"{touches} {offset:+.4f} rad ({np.degrees(offset):+.2f}°) are added to the position of {listed}"
+        )
         return Finding("encoder-offset", text, log.all_rows, names, contact.name, {"add_rad": offset})
     change = {"joint-sign": "turns the other way", "joint-order": "are exchanged"}[alike[0].name]
     return Finding(alike[0].name, f"{touches} {listed} {change}", log.all_rows, names, contact.name)
