@@ -101,9 +101,9 @@ def visible_sizes(report: Report) -> dict[str, float]:
 
 def least_visible(fault: Fault, log: Log, sizes: dict[str, float]) -> float | None:
     """That size for a planted fault, if the check states one."""
-    names = [fault.kind] + [f"{fault.kind} {log.joint_names[joint(log, fault.joint)]}"] * (
-        fault.joint is not None
-    )
+    names = [fault.kind]
+    if fault.joint is not None:
+        names.append(f"{fault.kind} {log.joint_names[joint(log, fault.joint)]}")
     return next((sizes[name] for name in names if name in sizes), None)
 
 

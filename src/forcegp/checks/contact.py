@@ -26,6 +26,10 @@ TOUCH = 2e-4
 """Distance within which a tip touches, at least: surfaces and arms are no stiffer [m]."""
 ROUGH = 8.0
 """Robust standard deviations of the distance in contact within which a tip touches."""
+LANDING = 5
+"""Rows within which a tip that lands stops."""
+STOPS = 2.0
+"""Factor by which a landing tip is faster than one that rests."""
 DRIFT = 2e-3
 """Distance that a tip may gain and lose while it touches: soft ground, a bent arm, a drift [m]."""
 RUN_SECONDS = 0.02
@@ -160,8 +164,9 @@ def _labels(
     at which the tip moves along the normal no faster than in the rest of the contact.
     """
     touch = max(TOUCH, rough)
-    approach = (path.v * path.normal).sum(axis=1)
-    settled = np.abs(approach) <= ROUGH * float(robust_std(approach[closed]))
+    approach = np.abs((path.v * path.normal).sum(axis=1))
+    slow = ROUGH * float(robust_std(approach[closed]))
+    settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     off = closed & (np.abs(c) > touch)
     runs: dict[str, list[tuple[int, int]]] = {"contact-early": [], "contact-late": [], "contact-far": []}
@@ -174,6 +179,11 @@ def _labels(
                     continue
                 if not inside:
                     a, b = _until_settled(a, b, settled[start:stop])
+                far = float(np.abs(c[start + a : start + b]).max()) > max(DRIFT, touch)
+                # A tip that lands stops at once; a constraint that was missed by a little is approached slowly.
+                landing = approach[start + max(a, b - LANDING) : start + b].max()
+                if kind == "contact-early" and not far and landing <= STOPS * slow:
+                    continue
                 runs["contact-far" if inside else kind].append((start + a, start + b))
     texts = {
         "contact-early": "labelled closed before the tip touches",

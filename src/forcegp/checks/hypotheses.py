@@ -26,6 +26,8 @@ MOMENT_ARM = 0.1
 """How far centres of mass may be off [m]."""
 TOOL_MASS = 5.0
 """How heavy a tool may be that the robot file lacks [kg]."""
+SHARPER = (2.0, 10.0)
+"""Factors by which dry friction may rise more sharply than declared: its law near rest is rarely known."""
 SLOW = 0.01
 """Sliding speed below which dry friction of a contact is smooth [m/s]."""
 GRAVITY = 10.0
@@ -71,10 +73,10 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
 
 
 def sharper_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Declared Coulomb friction at a tenth of its smoothing velocity, less that at all of it, `(n, nq, p)`."""
-    qd, width = log.qd[rows], system.robot.friction_velocity.numpy()
-    sharper = np.tanh(10.0 * qd / width) - np.tanh(qd / width)
-    return _diagonal(sharper)[..., np.flatnonzero(system.robot.friction.numpy() > 0.0)]
+    """Declared Coulomb friction at parts of its smoothing velocity, less that at all of it `(n, nq, p)`."""
+    x, declared = log.qd[rows] / system.robot.friction_velocity.numpy(), system.robot.friction.numpy() > 0.0
+    columns = [_diagonal(np.tanh(k * x) - np.tanh(x))[..., np.flatnonzero(declared)] for k in SHARPER]
+    return np.concatenate(columns, axis=-1)
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:

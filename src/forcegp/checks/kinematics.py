@@ -247,7 +247,7 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
     """`(nq,)` mean acceleration over a period in which the torque is held, over that at its start.
 
     Viscous friction d slows a joint of inertia m as exp(−d t/m), which leaves (1 − exp(−x))/x, x = d dt/m:
-    right after each change of the torque, light damped joints accelerate more than their velocity will change.
+    after a change of the torque, light damped joints accelerate more than their velocity will change.
     """
     (q,) = tensors(log, log.rows(INERTIA_ROWS), "q")
     if not len(q):
