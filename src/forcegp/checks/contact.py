@@ -180,7 +180,7 @@ def _labels(
                 if not inside:
                     a, b = _until_settled(a, b, settled[start:stop])
                 far = float(np.abs(c[start + a : start + b]).max()) > max(DRIFT, touch)
-                # A tip that lands stops at once; a constraint that was missed by a little is approached slowly.
+                # A tip that lands stops at once; a constraint missed by a little is approached slowly.
                 landing = approach[start + max(a, b - LANDING) : start + b].max()
                 if kind == "contact-early" and not far and landing <= STOPS * slow:
                     continue
