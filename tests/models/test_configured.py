@@ -191,14 +191,8 @@ def test_every_prior_and_kernel_of_the_library_can_be_described() -> None:
     """Those that take a function of Python's aside."""
     described = set(CLASSES.values())
     for module, base in ((priors, ForcePrior), (kernels, kernels.Kernel)):
-        found = (
-            [module]
-            if module is kernels
-            else [
-                importlib.import_module(f"{module.__name__}.{info.name}")
-                for info in pkgutil.iter_modules(module.__path__)
-            ]
-        )
+        names = [info.name for info in pkgutil.iter_modules(getattr(module, "__path__", []))]
+        found = [module, *(importlib.import_module(f"{module.__name__}.{name}") for name in names)]
         made = {
             part
             for place in found
