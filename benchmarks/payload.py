@@ -81,7 +81,14 @@ def measure(system: ConstrainedSystem) -> dict[str, dict[str, float]]:
             errors.append(error(model, loaded[first : first + STEP]))
             way(model, loaded[first : first + STEP])
         per = 1e3 * (time.perf_counter() - began) / len(errors)
-        found[name] = {"before": before, "first": errors[0], "ms_per_update_and_prediction": per}
+        latent, one = model.posterior.latent, {"one": torch.zeros(1, 1, dtype=torch.float64)}
+        mass = float(latent.latent_mean(len(priors) - 1, one)[0, 0])
+        found[name] = {
+            "before": before,
+            "first": errors[0],
+            "mass": mass,
+            "ms_per_update_and_prediction": per,
+        }
         for seconds in AFTER:
             last = round(seconds * RATE / STEP)
             found[name][f"after_{seconds:g}_s"] = sum(errors[last : last + 6]) / 6

@@ -24,7 +24,7 @@ import torch
 from real_cases import CASES, Case, evenly, moving
 from real_models import LEAST_SQUARES, Predicted, Predictor, models
 from real_plots import draw_errors
-from real_rollouts import run_rollouts
+from real_rollouts import NAME, run_rollouts
 from results_page import table, write_section
 
 import forcegp
@@ -160,7 +160,7 @@ def markdown(result: dict) -> str:
 def rollouts(found: dict) -> str:
     """The table of open-loop trajectories."""
     columns = ["model", *(f"joint angles after {h:g} s, RMSE [rad]" for h in found["horizons_s"])]
-    names = ("least squares", "structured GP, friction and inertia")
+    names = ("least squares", NAME)
     rows = [[name, *(f"{error:.3f}" for error in found[name])] for name in names]
     share = found["coverage_of_90_%_bands"]
     text = f"{found['starts']} starts; the 90 % bands of {found['samples']} samples hold {share:.1%}."

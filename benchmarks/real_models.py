@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp.evaluation.least_squares import LeastSquares, identify_rigid
+from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.models.minibatch import BatchOptions
@@ -60,9 +61,9 @@ def constant(case: Case) -> Fitted:
     return Fitted(lambda data: Predicted(mean.expand_as(data.qdd), None, case.system), 0.0)
 
 
-def structured(case: Case, samples: int | None = None, with_inertia: bool = False) -> Fitted:
-    """The structured GP with its defaults, which are friction of joints; or with a prior on inertia too."""
-    priors = [JointFrictionPrior(), InertialPrior()] if with_inertia else None
+def structured(case: Case, samples: int | None = None, priors: Sequence[ForcePrior] | None = None) -> Fitted:
+    """The structured GP with its defaults, friction of joints and the inertia that the log asks for; or with
+    given priors."""
     train = case.train if samples is None else evenly(moving(case.train), samples)
     fit = forcegp.StructuredGP(case.system, "analytical", force_priors=priors).fit(train)
 
@@ -124,5 +125,8 @@ def models(case: Case) -> dict[str, Callable[[], Fitted]]:
         "network": lambda: network(case),
         "structured GP, defaults": lambda: structured(case),
         f"structured GP, {FEW} samples": lambda: structured(case, FEW),
-        "structured GP, friction and inertia": lambda: structured(case, with_inertia=True),
+        "structured GP, friction alone": lambda: structured(case, priors=[JointFrictionPrior()]),
+        "structured GP, friction and inertia": lambda: structured(
+            case, priors=[JointFrictionPrior(), InertialPrior()]
+        ),
     }

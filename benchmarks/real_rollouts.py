@@ -11,14 +11,12 @@ from torch import Tensor
 import forcegp
 from forcegp.constraints import ConstrainedSystem
 from forcegp.evaluation.least_squares import LeastSquares, identify_rigid
-from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.quantities import States
 from forcegp.rollout import ForceField, compare
 
 HORIZONS = (0.5, 1.0)
 """Times at which joint angles are compared [s]."""
-NAME = "structured GP, friction and inertia"
+NAME = "structured GP, defaults"
 STARTS, SAMPLES = 40, 50
 LEAST_SPEED = 0.5
 """The log is used up to the last sample in which a joint is faster [rad/s]."""
@@ -54,9 +52,7 @@ def run_rollouts(case: Case) -> dict:
     """Root-mean-square errors of joint angles [rad] by model and horizon, and coverage of the 90 % bands."""
     models = {
         "least squares": Rigid(identify_rigid(case.system, case.train)),
-        NAME: forcegp.StructuredGP(
-            case.system, "analytical", force_priors=[JointFrictionPrior(), InertialPrior()]
-        ).fit(case.train),
+        NAME: forcegp.StructuredGP(case.system, "analytical").fit(case.train),
     }
     log = next(iter(case.tests.values()))
     log = log[: int((log.qd.abs().amax(-1) > LEAST_SPEED).nonzero().max())]

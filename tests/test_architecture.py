@@ -24,7 +24,6 @@ LAYERS = (
         "files",
         "destination",
         "memory",
-        "linalg",
         "robust",
         "batchlast",
         "threads",
@@ -51,6 +50,7 @@ LAYERS = (
     ("report", "sweep"),
     ("paper",),
     ("cli",),
+    ("__main__",),
 )
 """From the lowest to the highest: a part imports parts of its own row and of rows above it in this list."""
 

@@ -151,7 +151,7 @@ def test_reading_mjcf_leaves_the_warning_handler_of_mujoco(tmp_path) -> None:
 INVERSES = """
 import torch
 from threadpoolctl import ThreadpoolController
-from forcegp.linalg import cholesky_inverse_
+from forcegp.gp.likelihood import cholesky_inverse_
 from forcegp.threads import threads_of_pytorch
 torch.set_num_threads(1)
 libraries = ThreadpoolController().select(internal_api="openblas").lib_controllers

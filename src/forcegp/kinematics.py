@@ -272,12 +272,25 @@ def frame_jacobian(
     return jacobian_of_poses(robot, link_poses(robot, q), index, as_point(robot, point))
 
 
+def point_motion(
+    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, point: Tensor
+) -> tuple[Vector3, FrameJacobian, Tensor]:
+    """World position, `frame_jacobian` and `frame_bias_acceleration` of a point, from links already known."""
+    x = _point(robot, poses, index, point)
+    J, bias = _jacobian(robot, poses, index, x), _bias(robot, poses, motion, index, x)
+    moving = (batch_first(part, poses.batch) for part in (x + robot.base_position[:, None], J, bias))
+    return tuple(moving)  # pyright: ignore[reportReturnType]
+
+
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
     """`frame_jacobian` from poses already known."""
-    x = _point(robot, poses, index, point)
+    return batch_first(_jacobian(robot, poses, index, _point(robot, poses, index, point)), poses.batch)
+
+
+def _jacobian(robot: RobotModel, poses: LinkPoses, index: int, x: Tensor) -> Tensor:
+    """J `(6, nq, B)` of the point of a frame that is at x `(3, B)`."""
     linear = poses.linear + batchlast.cross(poses.angular, x[:, None])
-    screws = torch.cat([poses.angular, linear]) * _movers(robot, index)[:, None]
-    return batch_first(screws, poses.batch)
+    return torch.cat([poses.angular, linear]) * _movers(robot, index)[:, None]
 
 
 def point_velocity(
@@ -301,18 +314,15 @@ def frame_bias_acceleration(
     q, qd = common_states(robot, q=q, qd=qd)
     poses = link_poses(robot, q)
     motion = link_motion(robot, poses, qd)
-    return bias_acceleration_of_motion(robot, poses, motion, robot.frame_index(frame), as_point(robot, point))
+    return point_motion(robot, poses, motion, robot.frame_index(frame), as_point(robot, point))[2]
 
 
-def bias_acceleration_of_motion(
-    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, point: Tensor
-) -> Tensor:
-    """`frame_bias_acceleration` from motion already known: a + α × x + ω × (v + ω × x)."""
+def _bias(robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, x: Tensor) -> Tensor:
+    """[α; a + α × x + ω × (v + ω × x)] `(6, B)` of the point of a frame that is at x `(3, B)`."""
     parent = robot.frame_parents[index]
     if parent == BASE:
-        return poses.p.new_zeros(*poses.batch, 6)
-    x = _point(robot, poses, index, point)
+        return poses.p.new_zeros(6, poses.p.shape[-1])
     omega, alpha = motion.omega[:, parent], motion.alpha[:, parent]
     velocity = motion.velocity[:, parent] + batchlast.cross(omega, x)
     turned = batchlast.cross(alpha, x) + batchlast.cross(omega, velocity)
-    return batch_first(torch.cat([alpha, motion.acceleration[:, parent] + turned]), poses.batch)
+    return torch.cat([alpha, motion.acceleration[:, parent] + turned])

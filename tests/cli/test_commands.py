@@ -59,6 +59,8 @@ def test_help_has_examples(command: str) -> None:
 
 def test_version() -> None:
     assert run("--version").startswith("forcegp 0.")
+    module = subprocess.run([sys.executable, "-m", "forcegp", "--version"], capture_output=True, text=True)
+    assert module.stdout == run("--version")
 
 
 def test_select_writes_both_parts_and_their_provenance(log: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from forcegp import dynamics
-from forcegp.errors import UnknownNameError
+from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.priors.payload import PayloadPrior
 from forcegp.forces.quantities import states
 from forces.cases import draw, mixed_contacts, two_contacts
@@ -44,3 +44,36 @@ def _point_inertia(c: torch.Tensor) -> torch.Tensor:
 def test_an_unknown_joint_is_named() -> None:
     with pytest.raises(UnknownNameError, match="joint that carries a payload"):
         PayloadPrior(joint="elbow").check(two_contacts())
+
+
+def test_the_force_of_the_known_payload_is_exact() -> None:
+    system, n, mass = two_contacts(), 6, 1.5
+    robot, (q, qd, tau) = system.robot, draw(n)
+    at = states(system, q, qd, tau, mixed_contacts(n))
+    # A point mass at the origin of the last link: its moment and inertia there are zero.
+    last = torch.eye(robot.nq, dtype=torch.float64)[-1]
+    com = robot.com * (robot.mass / (robot.mass + mass * last))[:, None]
+    about = robot.inertia + robot.mass[:, None, None] * torch.stack([_point_inertia(c) for c in robot.com])
+    heavy = robot.replace(mass=robot.mass + mass * last, com=com)
+    inertia = about - heavy.mass[:, None, None] * torch.stack([_point_inertia(c) for c in com])
+    loaded = states(system.with_robot(heavy.replace(inertia=inertia)), q, qd, tau, mixed_contacts(n)).eom
+    want = loaded.acceleration(loaded.Q_K + tau)
+    delta = last.new_tensor([mass, 0.0, 0.0, 0.0])
+
+    def error(prior: PayloadPrior) -> float:
+        force = at.eom.Q_K + tau + prior.operator(system, at) @ delta
+        return float((at.eom.acceleration(force) - want).abs().max() / want.abs().max())
+
+    prior = PayloadPrior()
+    assert error(prior) > 0.01
+    assert error(prior.around(delta)) < SAME
+
+
+def test_a_payload_that_cannot_be_is_not_known() -> None:
+    prior = PayloadPrior(length=0.1)
+    here, far = torch.tensor([[2.0, 1.0, 0.0, 0.0], [1.0, 4.0, 0.0, 0.0]], dtype=torch.float64)
+    assert prior.around(here).known == pytest.approx((2.0, 0.1, 0.0, 0.0))
+    assert prior.around(far).known == ()
+    assert prior.around(here).around(-here).known == ()
+    with pytest.raises(ModelError, match="no such known payload"):
+        PayloadPrior(known=(0.0, 0.0, 0.0, 0.0))

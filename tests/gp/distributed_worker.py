@@ -9,7 +9,7 @@ import torch.distributed as dist
 from safetensors.torch import save_file
 
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.distributed import accumulate_shards, gather_candidates, shard, share_basis
+from forcegp.gp.distributed import accumulate_shards, shard, share_basis
 from forcegp.gp.structured_covariance import rows_of
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
 
@@ -26,8 +26,6 @@ def run(rank: int, processes: int, folder: str) -> None:
     wrong = {key: value + 0.1 * rank for key, value in parameters().items()}
     mine = latent_basis(PROCESSES, wrong, first(rows(POINTS, seed=5 + rank), POINTS), COMPONENTS)
     sums = accumulate_shards(share_basis(mine), [own])
-    found = gather_candidates([rows_of(own, slice(0, 3))])
     kept = {f"sum.{i}": part.clone() for i, part in enumerate(sums.tensors)}
-    kept |= {f"candidates.{i}": block.features[1]["qd"].clone() for i, block in enumerate(found)}
     save_file(kept, Path(folder) / f"{rank}.safetensors")
     dist.destroy_process_group()

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.gp.kernels import Kernel, Linear, Matern32, SquaredExponential, sub
-from forcegp.gp.structured_covariance import Block
+from forcegp.gp.basis import latent_basis
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import Kernel, Linear, Matern32, Parameters, SquaredExponential, sub
+from forcegp.gp.sparse import SparsePosterior
+from forcegp.gp.structured_covariance import Block, Process, components_of
+from forcegp.gp.sums import accumulate
 
 WIDTHS = {"q": 2, "qd": 2}
 COMPONENTS = (2, 1)
@@ -55,6 +60,14 @@ def rows(n: int, r: int = 3, seed: int = 0) -> Block:
 def first(block: Block, count: int) -> list[dict[str, Tensor]]:
     """The inputs of the first samples of a block as inducing points of each process."""
     return [{name: x[:count] for name, x in f.items()} for f in block.features]
+
+
+def condition_sparse(
+    processes: Sequence[Process], params: Parameters, blocks: Sequence[Block], inducing: Sequence[Features]
+) -> SparsePosterior:
+    """Processes conditioned on whitened rows through given inducing points."""
+    basis = latent_basis(processes, params, inducing, components_of(blocks[0]))
+    return SparsePosterior.of(basis, accumulate(basis, blocks))
 
 
 class DenseSparse:

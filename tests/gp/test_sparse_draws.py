@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from forcegp.gp.sparse import condition_sparse
-from gp.sparse_cases import PROCESSES, first, parameters, rows
+from gp.sparse_cases import PROCESSES, condition_sparse, first, parameters, rows
 
 COUNT, FEATURES = 4000, 2000
 STANDARD_ERRORS = 5.0

@@ -9,9 +9,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from forcegp.errors import ModelError
-from forcegp.gp.sparse import condition_sparse
 from forcegp.gp.sparse_tensors import posterior_of_tensors, tensors_of_posterior
-from gp.sparse_cases import PROCESSES, first, parameters, rows
+from gp.sparse_cases import PROCESSES, condition_sparse, first, parameters, rows
 
 
 def test_what_is_loaded_predicts_the_same_and_can_be_updated(tmp_path: Path) -> None:

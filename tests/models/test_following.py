@@ -16,6 +16,8 @@ from forcegp.models.structured_fit import StructuredFit
 RATE, STEP, JUMP = 100, 5, 200
 """Samples per second and per update [Hz, 1], and the sample at which the payload is picked up."""
 NOISE = 0.1
+MASS = 0.05
+"""Error of the estimated mass [kg]; to first order alone it is 0.2 kg too small."""
 AS_GOOD = 1.5
 """Ratio of the error to that of a fit which has only seen the loaded arm, for twice as long."""
 FIRST_ORDER = 0.25
@@ -63,6 +65,9 @@ def test_a_payload_is_followed_within_a_second() -> None:
     now = _error(model.fitted, after)
     assert now < AS_GOOD * _error(reference.fitted, after) + 0.02
     assert now < FIRST_ORDER * stale
+    one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
+    mass = model.posterior.latent.latent_mean(1, one)[0, 0]
+    assert float(mass) == pytest.approx(1.0, abs=MASS)
 
 
 def test_nothing_changes_where_nothing_does() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
 
@@ -16,8 +17,13 @@ if TYPE_CHECKING:
     from forcegp.scene import ModelTable, Scene
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+SCENES = sorted(
+    entry.name.removesuffix(".toml") for entry in (files("forcegp") / "scene" / "bundled").iterdir()
+)
+"""Names of the bundled scenes, read without loading the library."""
 SceneName = Annotated[
-    str, typer.Option("--scene", "-s", help="Scene file, or the name of a bundled one: [b]kuka_plane[/b].")
+    str,
+    typer.Option("--scene", "-s", help=f"Scene file, or the name of a bundled one: {', '.join(SCENES)}."),
 ]
 ModelFolder = Annotated[Path, typer.Option("--model", "-m", help="Folder of a fitted model.")]
 DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -63,6 +64,7 @@ def rollout(
     check_destination(out, folder=True, own_files=["rollout*", "*.svg", "*.png"])
     regression = load_model(model)
     log = _stretch(data_of_robot(read_data(data), regression.system.robot), start, duration)
+    _say_contact(log, unilateral)
     dt = sampling_period(log)
     options = RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
     path = _roll(regression, log, options, samples, seed)
@@ -116,11 +118,27 @@ def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:
         "joint_error_at_the_end": float(error[-1].max()),
         "diverged": path.diverged[0].reason if path.diverged else "no",
     }
+    if path.samples is not None and path.samples.diverged:
+        figures["samples_diverged"] = f"{len(path.samples.diverged)} of {path.samples.rows}"
     if path.c.shape[-1]:
         figures["largest_constraint_error_m"] = float(path.drift[: len(rolled)].abs().max())
     for event in path.events:
         figures[f"{event.contact}_{'closes' if event.closed else 'opens'}_s"] = event.t
     return figures
+
+
+def _say_contact(log: Dataset, unilateral: bool) -> None:
+    """Warn where the log opens or closes a contact that the rollout holds as it is at the start."""
+    for name, closed in log.contact.items():
+        changed = (closed != closed[0]).nonzero()
+        if not unilateral and len(changed):
+            row = int(changed[0])
+            state = "closed" if closed[0] else "open"
+            warnings.warn(
+                f"the rollout holds {name!r} {state}, as at the start; the log changes it after "
+                f"{float(log.t[row] - log.t[0]):.4g} s: pass --unilateral",
+                stacklevel=2,
+            )
 
 
 def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
@@ -145,12 +163,28 @@ def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
     return own
 
 
+def _spread(q: Tensor) -> Tensor:
+    """Standard deviation `(T, nq)` over samples `(S, T, nq)` that have not diverged, while two are left."""
+    import torch
+
+    left = q.isfinite().all(-1)
+    length = int((left.sum(0) >= 2).to(torch.int64).cumprod(0).sum())
+    q, left = q[:, :length], left[:, :length, None]
+    count = left.sum(0)
+    mean = torch.where(left, q, 0.0).sum(0) / count
+    square = torch.where(left, (q - mean).square(), 0.0).sum(0)
+    return (square / (count - 1)).sqrt()
+
+
 def _as_data(path: Rollout, log: Dataset, dt: float) -> Dataset:
     """The rolled-out motion as a data set beside the log that it started from, up to where it diverged."""
     length = len(path.t) if not path.diverged else round(path.diverged[0].t / dt) + 1
+    spread = _spread(path.samples.q) if path.samples is not None and path.samples.rows > 1 else None
+    if spread is not None:
+        length = min(length, len(spread))
     extras = {"q_logged": log.q[:length], "qd_logged": log.qd[:length]}
-    if path.samples is not None:
-        extras["q_std"] = path.samples.q[:, :length].std(dim=0)
+    if spread is not None:
+        extras["q_std"] = spread[:length]
     rows = slice(0, length)
     names = path.system.contact_names
     return log[:length].replace(

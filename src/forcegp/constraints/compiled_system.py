@@ -58,7 +58,7 @@ class CompiledSystem(ConstrainedSystem):
         points = {}
         for anchor, i in zip(self._anchors, range(0, len(blocks), POINT), strict=True):
             _, position, jacobian, bias = blocks[i : i + POINT]
-            points[anchor] = MovingPoint.of(position, jacobian, bias[..., 3:], qd)
+            points[anchor] = MovingPoint.of(position, jacobian, bias, qd)
         terms = [c.terms_of([points[_key(a)] for a in c.anchors]) for c in self.contacts]
 
         def links() -> tuple[kinematics.LinkPoses, kinematics.LinkMotion]:

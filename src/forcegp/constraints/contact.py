@@ -16,7 +16,6 @@ from torch import Tensor
 from forcegp import kinematics
 from forcegp.constraints.surface import Surface, check_point
 from forcegp.errors import ParameterError
-from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
 
 Anchor = tuple[str, Sequence[float]]
@@ -43,9 +42,11 @@ class MovingPoint(NamedTuple):
 
     @classmethod
     def of(cls, position: Tensor, jacobian: Tensor, bias: Tensor, qd: Tensor) -> MovingPoint:
-        """From the position, the Jacobian `(*batch, 6, nq)` (angular rows first), the bias and q̇."""
+        """From what `kinematics.point_motion` gives, and q̇."""
         rate = (jacobian @ qd[..., None])[..., 0]
-        return cls(position, rate[..., 3:], bias, jacobian[..., 3:, :], rate[..., :3], jacobian[..., :3, :])
+        return cls(
+            position, rate[..., 3:], bias[..., 3:], jacobian[..., 3:, :], rate[..., :3], jacobian[..., :3, :]
+        )
 
 
 class ContactPoint(NamedTuple):
@@ -94,10 +95,6 @@ class Constraint(ABC):
     def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
         """c, A and b from the motion of the anchors."""
 
-    def terms(self, robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor) -> ConstraintTerms:
-        """c, A and b at a state whose link motion is known."""
-        return self.terms_of([_moving_point(robot, poses, motion, qd, *anchor) for anchor in self.anchors])
-
     @abstractmethod
     def check(self, robot: RobotModel) -> None:
         """Check that the constraint fits a robot.
@@ -106,17 +103,6 @@ class Constraint(ABC):
             UnknownNameError: the robot has no such frame.
             ParameterError: a point does not have three finite coordinates.
         """
-
-
-def _moving_point(
-    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: Tensor, frame: str, point: Sequence[float]
-) -> MovingPoint:
-    """The motion of a point fixed in a frame, from the motion of the links."""
-    index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
-    J = kinematics.jacobian_of_poses(robot, poses, index, x)
-    bias = kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x)[..., 3:]
-    position = kinematics.point_of_poses(robot, poses, index, x) + robot.base_position
-    return MovingPoint.of(position, J, bias, qd)
 
 
 @dataclass(frozen=True)

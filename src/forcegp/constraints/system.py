@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from forcegp import dynamics, kinematics
-from forcegp.constraints.contact import Constraint, ConstraintTerms
+from forcegp.constraints.contact import Constraint, ConstraintTerms, MovingPoint
 from forcegp.constraints.gauss import Equations
 from forcegp.constraints.linearization import Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
@@ -213,10 +214,8 @@ class ConstrainedSystem:
         robot.check_state(q=q, qd=qd)
         if q.shape != qd.shape:
             raise ShapeError("q and qd are not one batch", expected=tuple(q.shape), got=tuple(qd.shape))
-        poses = kinematics.link_poses(robot, q)
-        motion = kinematics.link_motion(robot, poses, qd)
+        poses, motion, terms = self._terms(q, qd)
         known = dynamics.known_terms(robot, poses, motion, qd)
-        terms = [contact.terms(robot, poses, motion, qd) for contact in self.contacts]
         return self._assembled(q, qd, active, known, terms, lambda: (poses, motion))
 
     def _assembled(
@@ -268,13 +267,29 @@ class ConstrainedSystem:
             eom = self.equations(q, qd, active)
 
         def rows(q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-            poses = kinematics.link_poses(self.robot, q)
-            motion = kinematics.link_motion(self.robot, poses, qd)
-            terms = [contact.terms(self.robot, poses, motion, qd) for contact in self.contacts]
-            _, _, A, b = self._rows(q, qd, terms, active)
-            return A, b
+            return self._rows(q, qd, self._terms(q, qd)[2], active)[2:]
 
         return linearize(self.robot, eom, rows, q, qd, force)
+
+    @cached_property
+    def _places(self) -> list[list[tuple[int, Tensor]]]:
+        """Frame and point of the anchors of each constraint."""
+        at = kinematics.as_point
+        return [
+            [(self.robot.frame_index(frame), at(self.robot, point)) for frame, point in contact.anchors]
+            for contact in self.contacts
+        ]
+
+    def _terms(self, q: Tensor, qd: Tensor) -> tuple[LinkPoses, LinkMotion, list[ConstraintTerms]]:
+        """Where the links are and how they move, and what the constraints say there."""
+        poses = kinematics.link_poses(self.robot, q)
+        motion = kinematics.link_motion(self.robot, poses, qd)
+        moving = [
+            [MovingPoint.of(*kinematics.point_motion(self.robot, poses, motion, *at), qd) for at in places]
+            for places in self._places
+        ]
+        terms = [contact.terms_of(points) for contact, points in zip(self.contacts, moving, strict=True)]
+        return poses, motion, terms
 
     def _rows(
         self, q: Tensor, qd: Tensor, terms: Sequence[ConstraintTerms], active: Tensor | None

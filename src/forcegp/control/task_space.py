@@ -123,14 +123,9 @@ def tool_motion(
         UnknownNameError: no such frame.
     """
     index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
-    J = kinematics.jacobian_of_poses(robot, poses, index, x)
-    return ToolMotion(
-        rotation=kinematics.rotation_of_poses(robot, poses, index),
-        position=kinematics.point_of_poses(robot, poses, index, x) + robot.base_position,
-        twist=(J @ qd[..., None])[..., 0],
-        jacobian=J,
-        bias=kinematics.bias_acceleration_of_motion(robot, poses, motion, index, x),
-    )
+    position, J, bias = kinematics.point_motion(robot, poses, motion, index, x)
+    rotation = kinematics.rotation_of_poses(robot, poses, index)
+    return ToolMotion(rotation, position, (J @ qd[..., None])[..., 0], J, bias)
 
 
 def orientation_error(rotation: Array, target: Array) -> Array:

@@ -36,6 +36,9 @@ CHUNK_STATES = 2000
 """States whose residuals are computed at a time, which bounds the memory."""
 NEGLIGIBLE = 0.05
 """Autocorrelation below which the rest is noise of the estimate."""
+WINDOW, WINDOWS = 10.0, 20
+"""Length of the windows of `correlation_times` in units of the autocorrelation time, and how many there are
+at least."""
 
 
 def autocorrelation_time(residual: Tensor, segment: Tensor) -> Tensor:
@@ -62,6 +65,26 @@ def autocorrelation_time(residual: Tensor, segment: Tensor) -> Tensor:
     return total
 
 
+def correlation_times(residual: Tensor, segment: Tensor, length: int) -> Tensor:
+    """Spectral density of each column at low frequencies over its variance, in samples `(d,)`.
+
+    L · mean(r̄²) / mean(r²) over windows of L samples with means r̄ (batch means, Flegal and Jones 2010). In
+    contrast to `autocorrelation_time` it contains the negative lobes of a residual that oscillates, such as
+    noise of differentiated positions or the ringing of a gear, which hardly move a robot.
+
+    Args:
+        residual: `(n, d)` in the order of time.
+        segment: `(n,)`.
+        length: L, several times the autocorrelation time.
+    """
+    squares = []
+    for s in segment.unique():
+        part = residual[segment == s]
+        windows = len(part) // length
+        squares.append(part[: windows * length].unflatten(0, (windows, length)).mean(1).square())
+    return length * torch.cat(squares).mean(0) / residual.square().mean(0).clamp(min=1e-300)
+
+
 def _free(m: Measurement) -> Tensor:
     """Rows of samples without a closed contact."""
     return (~m.active.any(-1)).nonzero()[:, 0]
@@ -72,24 +95,33 @@ def _motions(training: Training) -> list[int]:
     return [i for i, quantity in enumerate(training.quantities) if quantity == "qdd"]
 
 
-def likelihood_power(
-    problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training | None = None
-) -> float:
+def likelihood_power(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> float:
     """κ = 1/τ̄, τ̄ the geometric mean over the joints of the autocorrelation time of torque residuals.
 
     The n samples of a log hold as much evidence as n/τ̄ independent ones.
 
     Args:
-        problem: what is conditioned on.
+        problem: what is conditioned on, at its own rate.
         hyperparameters: learned tensors.
-        training: samples whose residuals are looked at, at their own rate; by default those of the problem.
 
     Returns:
         κ, at most 1.
     """
+    return residual_times(problem, hyperparameters, problem.training)[0]
+
+
+def residual_times(
+    problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
+) -> tuple[float, Tensor | None]:
+    """κ as in `likelihood_power`, and `correlation_times` of joints `(nq,)` [s], `None` for too few samples.
+
+    Args:
+        problem: what is conditioned on.
+        hyperparameters: learned tensors.
+        training: samples whose residuals are looked at, at their own rate.
+    """
     posterior = force_posterior(problem, hyperparameters)
-    logs = []
-    training = training or problem.training
+    logs, times = [], []
     for i in _motions(training):
         m = training.measurements[i]
         m = m[_some(_free(m))]
@@ -97,7 +129,13 @@ def likelihood_power(
             continue
         residual = torch.cat([_residual(posterior, problem, hyperparameters, part) for part in _chunks(m)])
         logs.append(autocorrelation_time(residual, m.segment).log())
-    return min(1.0, math.exp(-float(torch.stack(logs).mean()))) if logs else 1.0
+        own = math.exp(float(logs[-1].mean()))
+        longest_part = int(m.segment.unique(return_counts=True)[1].max())
+        length = max(1, min(round(WINDOW * own), len(residual) // WINDOWS, longest_part))
+        times.append(training.period * correlation_times(residual, m.segment, length))
+    if not logs:
+        return 1.0, None
+    return min(1.0, math.exp(-float(torch.stack(logs).mean()))), torch.stack(times).mean(0)
 
 
 def _some(rows: Tensor) -> Tensor:
@@ -169,8 +207,9 @@ def _held_out(
     at = m.at(system)
     z = affine_map(system, at, "qdd")
     M, P = at.eom.M, at.eom.P
-    residual = (M @ (m.values - posterior.read_mean(system, at, z))[..., None])[..., 0]
-    spread = (M @ posterior.read_covariance(system, at, z) @ M.mT).diagonal(dim1=-2, dim2=-1)
+    mean, covariance = posterior.read(system, at, z)
+    residual = (M @ (m.values - mean)[..., None])[..., 0]
+    spread = (M @ covariance @ M.mT).diagonal(dim1=-2, dim2=-1)
     std = noise_std if noise_std.ndim == 1 else noise_std.square().mean(0).sqrt()
     stick = (P**2 @ stick_variance(hyperparameters, at)[..., None])[..., 0]
     return residual, spread + (M**2 @ std**2) + stick, P

@@ -78,10 +78,10 @@ def doubts_of(posterior: ForcePosterior, system: ConstrainedSystem, training: Tr
     means, variances, correlations = [], [], []
     for m in (m for m in closed if len(m.q)):
         at = m.at(system)
-        read = posterior.rows(system, at, affine_map(system, at, "multiplier"))
+        mean, covariance = posterior.read(system, at, affine_map(system, at, "multiplier"))
         own = system.active_rows(m.active, m.active.shape[:-1])
-        means.append(posterior.mean_of(read)[own])
-        variances.append(posterior.latent.covariance(read).diagonal(dim1=-2, dim2=-1).clamp(min=0.0)[own])
+        means.append(mean[own])
+        variances.append(covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)[own])
         if {JOINT, CONTACT} <= targets:
             correlations.append(force_correlation(posterior, system, at))
     correlation = float(torch.cat(correlations).mean()) if correlations else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -105,8 +106,8 @@ def forces_and_constant(
     if problem.pinned:
         known = problem.silenced(problem.of_means().rows(hyperparameters).blocks)
         central = ExactPosterior.of(problem.priors, params, known)
-    coulomb, offsets = problem.coulomb(hyperparameters), problem.offsets
-    posterior = ForcePosterior(problem.priors, scales, problem.mean, latent, offsets, central, coulomb)
+    coulomb = problem.coulomb(hyperparameters)
+    posterior = ForcePosterior(problem.priors, scales, problem.mean, latent, central, coulomb)
     return posterior, rows.constant
 
 
@@ -117,3 +118,26 @@ def log_likelihood(posterior: ForcePosterior) -> float:
         return float(latent.log_likelihood())
     assert isinstance(latent, SparsePosterior)
     return -float(bound_of(latent.sums, latent))
+
+
+def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Which inference a posterior has, and what a sparse one loses by its inducing points.
+
+    Returns:
+        The fields of `FitResult`, and a warning where the points miss much of what the data could tell.
+    """
+    if not isinstance(posterior.latent, SparsePosterior):
+        return {"inference": "exact"}, ()
+    found = posterior.latent.diagnostics
+    warnings = (
+        f"more inducing points would help: {found.size} basis functions miss a variance of "
+        f"{found.missed:.3g} in units of the noise, where noise leaves {found.learned:.3g}; raise "
+        "inducing_points",
+    )
+    return {
+        "inference": "sparse",
+        "basis_functions": found.size,
+        "determined": found.learned,
+        "missed": found.missed,
+        "more_points_would_help": found.more_points_would_help,
+    }, warnings if found.more_points_would_help else ()

@@ -54,7 +54,8 @@ class Problem:
         parameters: module whose `forward()` gives the robot at θ_A, or `None`.
         torque_std: standard deviation of the white noise of the motor torque, `(nq,)`, unless it is learned.
         power: κ, which the likelihood is raised to; below 1 where samples are correlated.
-        correlation_time: how long the noise of the torque is correlated [s]; 0 where that is not known.
+        correlation: how long the noise of each torque is correlated, `(nq,)` [s]; `None` where that is not
+            known.
         offsets: prior means of latent forces, by prior.
         pinned: priors whose force has mean zero from here on, since the robot contains it; the others are
             conditioned on that, and only the uncertainty of the pinned ones remains.
@@ -69,7 +70,7 @@ class Problem:
     parameters: nn.Module | None = None
     torque_std: Tensor | None = None
     power: float = 1.0
-    correlation_time: float = 0.0
+    correlation: Tensor | None = None
     offsets: Mapping[str, Tensor] = field(default_factory=dict)
     inducing: tuple[Features, ...] | None = None
     pinned: tuple[str, ...] = ()

@@ -103,18 +103,37 @@ class Measurement:
         return Measurement(self.quantity, *(part[rows] for part in (*self.tensors, self.segment)))
 
 
-def is_simulated(data: Dataset | Sequence[Observation]) -> bool:
+def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observation]:
+    """A data set as measurements of accelerations, or the measurements as given.
+
+    Raises:
+        ModelError: there are none, or this is something else.
+    """
+    observations = [Observation(data)] if isinstance(data, Dataset) else data
+    if not isinstance(observations, Sequence) or not all(isinstance(o, Observation) for o in observations):
+        raise ModelError(
+            "cannot learn from this type of data",
+            expected="a Dataset, or a list of Observation",
+            got=type(data).__name__,
+        )
+    if not observations:
+        raise ModelError(
+            "there are no samples to learn from", expected="at least one observation", got="none"
+        )
+    return observations
+
+
+def is_simulated(observations: Sequence[Observation]) -> bool:
     """Whether a simulator made the data: only simulators state a seed or know noise-free accelerations."""
-    logs = [data] if isinstance(data, Dataset) else [observation.data for observation in data]
+    logs = [observation.data for observation in observations]
     return any(log.header.seed is not None or "qdd_clean" in log.extras for log in logs)
 
 
-def states_noise(data: Dataset | Sequence[Observation]) -> bool:
+def states_noise(observations: Sequence[Observation]) -> bool:
     """Whether the data state the noise of their accelerations."""
-    pairs = [(data, None)] if isinstance(data, Dataset) else [(o.data, o.noise_std) for o in data]
     return all(
-        noise is not None or log.header.noise_std is not None or "qdd_std" in log.extras
-        for log, noise in pairs
+        o.noise_std is not None or o.data.header.noise_std is not None or "qdd_std" in o.data.extras
+        for o in observations
     )
 
 
@@ -301,17 +320,7 @@ def training_of(
     Raises:
         ModelError, DataError: there are no data, or they do not fit the system.
     """
-    observations = [Observation(data)] if isinstance(data, Dataset) else data
-    if not isinstance(observations, Sequence) or not all(isinstance(o, Observation) for o in observations):
-        raise ModelError(
-            "cannot learn from this type of data",
-            expected="a Dataset, or a list of Observation",
-            got=type(data).__name__,
-        )
-    if not observations:
-        raise ModelError(
-            "there are no samples to learn from", expected="at least one observation", got="none"
-        )
+    observations = observations_of(data)
     pairs = [measurement_of(o, system, noise_std) for o in observations]
     at = [m.at(system) for m, _ in pairs] if any(prior.name not in kept for prior in priors) else []
     scales = []

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,7 +28,6 @@ from forcegp.forces.quantities import AffineMap, States, affine_map
 from forcegp.forces.state_noise import state_jacobian
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.structured_covariance import Block
-from forcegp.linalg import null_space_basis
 
 ForceNoise = Callable[[States], Tensor]
 """Variance of the white noise on the joint force at states, `(n, nq)`."""
@@ -57,6 +57,41 @@ class WhitenedRows:
             Block(b.features, tuple(root * W for W in b.operators), root * b.target) for b in self.blocks
         ]
         return WhitenedRows(blocks, power * self.constant)
+
+
+class _NullSpaceBasis(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, A: Tensor, rank: int) -> Tensor:
+        left, values, Vh = torch.linalg.svd(A, full_matrices=True)
+        U = Vh.mT[..., :, rank:].contiguous()
+        # The rank is given, so the pseudo-inverse needs no tolerance of its own.
+        pinv = (Vh.mT[..., :, :rank] / values[..., None, :rank]) @ left[..., :, :rank].mT
+        ctx.save_for_backward(pinv, U)
+        return U
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None]:
+        pinv, U = ctx.saved_tensors
+        return -(pinv.mT @ grad[0]) @ U.mT, None
+
+
+def null_space_basis(A: Tensor, rank: int) -> Tensor:
+    """Orthonormal basis U of the null space of matrices that share a rank, A U = 0, UᵀU = I.
+
+    The basis is defined up to a rotation U R, so only functions that do not depend on R have a
+    derivative; for these dU = −A⁺ dA U.
+
+    Args:
+        A: `(*batch, m, n)`.
+        rank: the rank of every matrix of the batch.
+
+    Returns:
+        `(*batch, n, n − rank)`.
+    """
+    if A.shape[-2] == 0 or rank == 0:
+        eye = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
+        return eye.expand(*A.shape[:-2], *eye.shape)
+    return _NullSpaceBasis.apply(A, rank)  # pyright: ignore[reportReturnType]
 
 
 def _split(A: Tensor, rank: int) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from forcegp.forces.coulomb import with_coulomb
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import CONTACT
 from forcegp.forces.quantities import States
-from forcegp.gp.pathwise import FEATURES, FunctionSamples
+from forcegp.gp.pathwise import FunctionSamples
 
 CHUNK_STATES = 256
 """States at which samples are evaluated at once, so that intermediate arrays stay in the cache."""
@@ -91,7 +91,7 @@ class ForceSamples:
 
 
 def draw_samples(
-    posterior: ForcePosterior, count: int, generator: torch.Generator, features: int = FEATURES
+    posterior: ForcePosterior, count: int, generator: torch.Generator, features: int | None = None
 ) -> ForceSamples:
     """Draw force functions from the posterior.
 
@@ -99,6 +99,7 @@ def draw_samples(
         posterior: what to draw from.
         count: number of functions.
         generator: source of randomness, on the CPU.
-        features: random features per component.
+        features: random features per component; by default as many as the kind of posterior needs.
     """
-    return ForceSamples(posterior, posterior.latent.draw(count, generator, features))
+    given = () if features is None else (features,)
+    return ForceSamples(posterior, posterior.latent.draw(count, generator, *given))

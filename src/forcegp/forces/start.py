@@ -44,6 +44,8 @@ WIDTH = {
 """Standard deviations of the log-normal priors below and above the start, in e-folds; 3 where not named."""
 START_SAMPLES = 5000
 """Evenly spaced samples that the start of learning is computed from, where there are more."""
+PARALLEL = 1e-9
+"""One minus the mean cosine below which two directions are the same."""
 
 
 def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
@@ -78,12 +80,34 @@ def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block
 
 
 def _force_scale(p: int, blocks: Sequence[Block]) -> Tensor:
-    """Root mean square of the least-squares force of prior p, `(components,)`."""
-    total, count = torch.zeros_like(blocks[0].operators[p][0, 0]), 0
+    """Root mean square of the least-squares force of prior p, `(components,)`.
+
+    Rows tell only the sum of components that act along one direction, such as viscous and dry friction, and
+    the least norm would divide it by their units. Each of these starts as if it were alone.
+    """
+    first = _first_parallel([block.operators[p] for block in blocks])
+    own, alone = first.unique(), (first[:, None] == first).sum(0) == 1
+    total = torch.zeros_like(blocks[0].operators[p][0, 0])
+    weight = torch.zeros_like(total)
     for block in blocks:
-        force = (torch.linalg.pinv(block.operators[p], rtol=1e-6) @ block.target[..., None])[..., 0]
-        total, count = total + (force**2).sum(0), count + len(force)
-    return (total / max(count, 1)).sqrt().clamp(1e-3, 1e4)
+        W = block.operators[p]
+        force = torch.zeros_like(W[:, 0])
+        force[:, own] = (torch.linalg.pinv(W[..., own], rtol=1e-6) @ block.target[..., None])[..., 0]
+        size = torch.where(alone, 1.0, W.square().sum(1))
+        total, weight = total + (force**2 * size)[:, first].sum(0), weight + size.sum(0)
+    return (total / weight.clamp(min=1e-300)).sqrt().clamp(1e-3, 1e4)
+
+
+def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
+    """For each component, the first one that has its direction at every sample, `(components,)`."""
+    along = most = torch.zeros_like(operators[0][0].mT @ operators[0][0])
+    for W in operators:
+        size = W.square().sum(1).sqrt()
+        along = along + (W.mT @ W).abs().sum(0)
+        most = most + (size[:, :, None] * size[:, None, :]).sum(0)
+    # |w_k·w_l| ≤ |w_k||w_l|, with equality at every sample where the sums are equal.
+    parallel = ((along >= (1.0 - PARALLEL) * most) & (most > 0.0)).fill_diagonal_(True)
+    return parallel.to(torch.uint8).argmax(0)
 
 
 def bounds_of(params: Parameters) -> dict[str, tuple[float, float]]:

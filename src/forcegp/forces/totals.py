@@ -114,4 +114,4 @@ def posterior_of(
     latent = SparsePosterior.of(basis, total.sums)
     central = None if total.central is None else SparsePosterior.of(basis, total.central)
     scales, coulomb = problem.training.scales, problem.coulomb(hyperparameters)
-    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central, coulomb)
+    return ForcePosterior(problem.priors, scales, problem.mean, latent, central, coulomb)

@@ -8,7 +8,7 @@ Each process holds its own samples; the inducing points and hyperparameters must
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import torch
 import torch.distributed as dist
@@ -111,35 +111,6 @@ def share_tensors(tensors: Parameters | Features, source: int = 0, group: Group 
     """Named tensors of one process in all of them, which must hold some of the same shapes."""
     _require_processes()
     return {key: _broadcast(tensors[key], source, group) for key in sorted(tensors)}
-
-
-def gather_candidates(blocks: Sequence[Block], group: Group = None) -> list[Block]:
-    """Candidates for inducing points of all processes, in the order of their ranks.
-
-    Every process must give the same number of blocks, of the same numbers of samples and rows.
-    """
-    _require_processes()
-    found: list[list[Block]] = [[] for _ in range(dist.get_world_size(group))]
-    for block in blocks:
-        features = [_gather_named(f, group) for f in block.features]
-        operators = [_gather(W, group) for W in block.operators]
-        targets = _gather(block.target, group)
-        for rank, own in enumerate(found):
-            x, W = tuple(f[rank] for f in features), tuple(W[rank] for W in operators)
-            own.append(Block(x, W, targets[rank]))
-    return [block for own in found for block in own]
-
-
-def _gather_named(features: Features, group: Group) -> list[dict[str, Tensor]]:
-    gathered = {name: _gather(features[name], group) for name in features}
-    return [{name: x[rank] for name, x in gathered.items()} for rank in range(dist.get_world_size(group))]
-
-
-def _gather(x: Tensor, group: Group) -> list[Tensor]:
-    own = x.contiguous()
-    found = [torch.empty_like(own) for _ in range(dist.get_world_size(group))]
-    dist.all_gather(found, own, group=group)
-    return found
 
 
 def _broadcast(x: Tensor, source: int, group: Group) -> Tensor:

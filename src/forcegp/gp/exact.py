@@ -15,7 +15,7 @@ from forcegp.gp.kernel_terms import kernel_terms
 from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.likelihood import Conditioned, condition, require_exact_fits, target_of
 from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors
-from forcegp.gp.structured_covariance import Block, Process, chunked, cross_gram, gram
+from forcegp.gp.structured_covariance import Block, Process, add_rows, chunked, cross_gram, gram, offsets
 
 CHUNK_COLUMNS = 700
 """Columns of the triangular solve that are held at a time."""
@@ -76,16 +76,20 @@ class ExactPosterior:
         result.__dict__["conditioned"] = Conditioned(L, alpha, max(old.jitter, jitter))
         return result
 
-    def is_measured(self, p: int) -> bool:
-        """Whether any row depends on process p; where none does, its posterior is its prior."""
-        return self.measured[p]
-
     @cached_property
     def measured(self) -> tuple[bool, ...]:
         """Whether any row depends on each process; the data change nothing about the others."""
-        return tuple(
-            any(bool(block.operators[p].any()) for block in self.blocks) for p in range(len(self.processes))
-        )
+        return tuple(map(any, self._heard))
+
+    @cached_property
+    def _heard(self) -> list[list[bool]]:
+        """By process and block, whether any row depends on the process."""
+        return [[bool(b.operators[p].any()) for b in self.blocks] for p in range(len(self.processes))]
+
+    @cached_property
+    def _own(self) -> list[dict[str, Tensor]]:
+        """Log-hyperparameters of each process."""
+        return [sub(self.params, process.prefix) for process in self.processes]
 
     @cached_property
     def _weights(self) -> list[list[Tensor]]:
@@ -108,10 +112,7 @@ class ExactPosterior:
     def kernels_to_data(self) -> list[list[Callable[[Features], Tensor]]]:
         """By process and block, x ↦ k(x, X)."""
         return [
-            [
-                process.kernel.towards(sub(self.params, process.prefix), block.features[p])
-                for block in self.blocks
-            ]
+            [process.kernel.towards(self._own[p], block.features[p]) for block in self.blocks]
             for p, process in enumerate(self.processes)
         ]
 
@@ -126,6 +127,13 @@ class ExactPosterior:
         ]
         return sum(parts[1:], start=parts[0]).mT
 
+    def mean(self, block: Block) -> Tensor:
+        """Posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
+        mean = torch.zeros_like(block.target)
+        for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
+            mean = mean + (W @ self.latent_mean(p, x)[..., None])[..., 0]
+        return mean
+
     def covariance(self, block: Block) -> Tensor:
         """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise."""
         n, d = block.target.shape
@@ -133,16 +141,28 @@ class ExactPosterior:
             return block.target.new_zeros(n, 0, 0)
         parts = [block.target.new_zeros(0, d, d)]
         for own in chunked([block], max(1, CHUNK_COLUMNS // d)):
-            cross = cross_gram(self.processes, self.params, self.blocks, [own])
-            V = torch.linalg.solve_triangular(self.conditioned.L, cross, upper=False)
+            V = torch.linalg.solve_triangular(self.conditioned.L, self._cross(own), upper=False)
             V = V.reshape(len(V), -1, d).transpose(0, 1)
             prior = V.new_zeros(())
-            for process, x, W in zip(self.processes, own.features, own.operators, strict=True):
-                variance = process.kernel.diagonal(sub(self.params, process.prefix), x)
+            for process, params, x, W in zip(
+                self.processes, self._own, own.features, own.operators, strict=True
+            ):
+                variance = process.kernel.diagonal(params, x)
                 prior = prior + torch.einsum("nak,kn,nbk->nab", W, variance, W)
             parts.append(prior - V.mT @ V)
         covariance = torch.cat(parts)
         return 0.5 * (covariance + covariance.mT)
+
+    def _cross(self, new: Block) -> Tensor:
+        """Covariance of the rows with those of another block, `(rows, new rows)`."""
+        starts = offsets(self.blocks)
+        cross = new.target.new_zeros(starts[-1], new.rows)
+        for p, W in enumerate(new.operators):
+            for g, heard in enumerate(self._heard[p]):
+                if heard and bool(W.any()):
+                    k = self.kernels_to_data[p][g](new.features[p]).mT
+                    add_rows(cross[starts[g] : starts[g + 1]], self.blocks[g].operators[p], k, W)
+        return cross
 
     def log_likelihood(self) -> Tensor:
         """log p(y) of the rows without their constant, −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π."""
@@ -166,9 +186,7 @@ class ExactPosterior:
         terms = [draw.terms(own) for draw, own in zip(draws.draws, draws.weights, strict=True)]
         for p, process in enumerate(self.processes):
             for block, w in zip(self.blocks, weights[p], strict=True) if self.measured[p] else ():
-                terms[p] += kernel_terms(
-                    process.kernel, sub(self.params, process.prefix), block.features[p], w
-                )
+                terms[p] += kernel_terms(process.kernel, self._own[p], block.features[p], w)
         return FunctionSamples(
             tuple(tuple(function for function, _ in own) for own in terms),
             tuple(tuple(w for _, w in own) for own in terms),

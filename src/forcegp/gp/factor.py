@@ -1,4 +1,4 @@
-"""Cholesky factors that follow added rows."""
+"""Cholesky factors: with counted jitter, and such that follow added rows."""
 
 from __future__ import annotations
 
@@ -8,11 +8,42 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
-from forcegp.linalg import cholesky
 from forcegp.threads import threads_of_pytorch
 
+JITTER_STEPS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)
+"""Fractions of the mean diagonal that are tried, in order, until the factorisation succeeds."""
 PANEL = 24
 """Columns that LAPACK's triangular-pentagonal QR takes at a time."""
+
+
+def cholesky(K: Tensor) -> tuple[Tensor, float]:
+    """Lower Cholesky factor of K + ε I, with the smallest ε of `JITTER_STEPS` that succeeds.
+
+    Args:
+        K: `(n, n)` symmetric; the lower triangle is read.
+
+    Returns:
+        The factor `(n, n)` and the ε that was added, 0.0 where none was needed.
+
+    Raises:
+        NumericalError: K is not finite, or not positive definite within the largest jitter.
+    """
+    scale = float(K.diagonal().mean()) if K.shape[-1] else 1.0
+    if not torch.isfinite(K.diagonal()).all():
+        raise NumericalError(
+            "the covariance matrix is not finite", hint="look for extreme inputs or hyperparameters"
+        )
+    for step in JITTER_STEPS:
+        jitter = step * scale
+        shifted = K if jitter == 0.0 else K + jitter * torch.eye(len(K), dtype=K.dtype, device=K.device)
+        L, info = torch.linalg.cholesky_ex(shifted)
+        if int(info) == 0 and bool(torch.isfinite(L.diagonal()).all()):
+            return L, jitter
+    raise NumericalError(
+        "the covariance matrix is not positive definite",
+        expected=f"a smallest eigenvalue above −{JITTER_STEPS[-1]:g} of the mean diagonal",
+        hint="drop duplicated rows, or raise the noise standard deviation",
+    )
 
 
 def extended(L: Tensor, rows: Tensor) -> Tensor:

@@ -10,14 +10,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import scipy.linalg.lapack
 import torch
 from torch import Tensor
 
-from forcegp.errors import ModelError
+from forcegp.errors import ModelError, NumericalError
+from forcegp.gp.factor import cholesky
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.structured_covariance import Block, Gradient, Place, Process, gram, gram_gradient
-from forcegp.linalg import cholesky, cholesky_inverse_
 from forcegp.memory import announce_memory, free_memory
+from forcegp.threads import threads_of_pytorch
 
 MATRICES_TO_LEARN = 3.0
 """Square matrices of all rows that learning holds at once: the covariance, its factor and a copy."""
@@ -89,6 +92,24 @@ def negative_log_likelihood(priors: Sequence[Process], params: Parameters, block
         return fit.negative_log_likelihood(target_of(blocks)), gradient
 
     return with_gradient(value, params, blocks)
+
+
+def cholesky_inverse_(L: Tensor) -> Tensor:
+    """Lower triangle of (L Lᵀ)⁻¹, written over the factor L (LAPACK potri); the upper one is undefined."""
+    if L.device.type != "cpu":
+        return torch.cholesky_inverse(L)
+    if L.shape[0] == 0:
+        return L
+    # A row-major lower triangle is the upper triangle in LAPACK's column-major order.
+    array = L.numpy().T
+    (potri,) = scipy.linalg.lapack.get_lapack_funcs(("potri",), (array,))
+    with threads_of_pytorch():
+        inverse, info = potri(array, lower=0, overwrite_c=1)
+    if info != 0:
+        raise NumericalError("a Cholesky factor is singular", got=f"zero pivot in row {info}")
+    if not np.shares_memory(inverse, array):
+        L.copy_(torch.from_numpy(inverse.T))
+    return L
 
 
 Valued = tuple[Tensor, Callable[[bool], Gradient]]

@@ -14,18 +14,15 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from forcegp.errors import ModelError
-from forcegp.gp.basis import LatentBasis, latent_basis
+from forcegp.gp.basis import LatentBasis
 from forcegp.gp.diagnostics import Diagnostics
 from forcegp.gp.drift import drifted
-from forcegp.gp.factor import extended
+from forcegp.gp.factor import cholesky, extended
 from forcegp.gp.features import Features
-from forcegp.gp.kernels import Parameters
-from forcegp.gp.pathwise import FEATURES, FunctionSamples
-from forcegp.gp.sparse_draws import draw_functions
-from forcegp.gp.structured_covariance import Block, Process, chunked, components_of
+from forcegp.gp.pathwise import FunctionSamples
+from forcegp.gp.sparse_draws import FEATURES, draw_functions
+from forcegp.gp.structured_covariance import Block, chunked
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
-from forcegp.linalg import cholesky
 
 CHUNK_PREDICTIONS = 256
 """Samples whose covariance is computed at a time."""
@@ -83,10 +80,6 @@ class SparsePosterior:
         own = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
         return tuple(bool((diagonal[columns] > 1.0).any()) for columns in own)
 
-    def is_measured(self, p: int) -> bool:
-        """Whether any row depends on process p; where none does, its posterior is its prior."""
-        return self.measured[p]
-
     @cached_property
     def folded(self) -> list[tuple[Tensor, Tensor]]:
         """Posterior mean of each process as weights of k(x, Z) and of the exact features."""
@@ -103,6 +96,13 @@ class SparsePosterior:
         if part.finite is not None:
             mean = mean + part.finite.basis(features) @ on_features
         return mean[..., 0].mT
+
+    def mean(self, block: Block) -> Tensor:
+        """Posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
+        mean = torch.zeros_like(block.target)
+        for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
+            mean = mean + (W @ self.latent_mean(p, x)[..., None])[..., 0]
+        return mean
 
     @cached_property
     def _inverse_factor(self) -> list[Tensor]:
@@ -212,29 +212,3 @@ class SparsePosterior:
             NumericalError: the samples were not among them.
         """
         return SparsePosterior.of(self.basis, self.sums - accumulate(self.basis, blocks))
-
-
-def condition_sparse(
-    processes: Sequence[Process],
-    params: Parameters,
-    blocks: Sequence[Block],
-    inducing: Sequence[Features],
-) -> SparsePosterior:
-    """Condition processes on whitened rows through given inducing points.
-
-    Args:
-        processes: the processes.
-        params: log-hyperparameters.
-        blocks: whitened rows, of one block at least.
-        inducing: kernel inputs of the inducing points of each process.
-
-    Raises:
-        ModelError: there is no block.
-        NumericalError: the sums are not finite.
-    """
-    if not blocks:
-        raise ModelError(
-            "there is nothing to condition on", expected="at least one block of rows", got="none"
-        )
-    basis = latent_basis(processes, params, inducing, components_of(blocks[0]))
-    return SparsePosterior.of(basis, accumulate(basis, blocks))

@@ -11,7 +11,11 @@ from torch import Tensor
 
 from forcegp.gp.basis import LatentBasis, ProcessBasis
 from forcegp.gp.kernel_terms import kernel_terms
-from forcegp.gp.pathwise import UNMEASURED, Basis, FunctionSamples
+from forcegp.gp.pathwise import Basis, FunctionSamples
+
+FEATURES = 256
+"""Random features per component. Only what the inducing points miss is drawn from them: its covariance errs
+by about 1/√FEATURES of its scale, and that of the rest not at all."""
 
 
 def draw_functions(
@@ -42,8 +46,7 @@ def _terms(
     terms: list[tuple[Basis, Tensor]] = []
     rest = part.split.rest
     if rest is not None:
-        own = features if part.to_inducing is not None else max(1, features // UNMEASURED)
-        draw = rest.kernel.draw(rest.parameters(part.params), own, generator)
+        draw = rest.kernel.draw(rest.parameters(part.params), features, generator)
         count = draw.basis(part.inducing).shape[-1]
         shape = (part.components, count, weights.shape[1])
         u = torch.randn(shape, dtype=torch.float64, generator=generator).to(weights)

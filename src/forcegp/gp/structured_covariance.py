@@ -103,7 +103,7 @@ def _chunks(n: int, size: int) -> Iterator[tuple[int, int]]:
         yield first, min(first + step, n)
 
 
-def _add_rows(out: Tensor, W1: Tensor, k: Tensor, W2: Tensor, lower: bool) -> None:
+def add_rows(out: Tensor, W1: Tensor, k: Tensor, W2: Tensor, lower: bool = False) -> None:
     """Add Σ_k W1 k W2ᵀ to `out`, chunk by chunk; only up to the diagonal where `lower`."""
     r = W1.shape[1]
     W2k = W2.permute(2, 0, 1)
@@ -148,7 +148,7 @@ def cross_gram(
         one, two = blocks1[g], blocks2[h]
         k = priors[p].kernel.covariance(own, one.features[p], two.features[p])
         part = K[starts1[g] : starts1[g + 1], starts2[h] : starts2[h + 1]]
-        _add_rows(part, one.operators[p], k, two.operators[p], lower=lower and g == h)
+        add_rows(part, one.operators[p], k, two.operators[p], lower=lower and g == h)
     return K
 
 

@@ -66,6 +66,11 @@ class Predictor(ABC):
             system: another system to predict on, for models of forces.
         """
 
+    @property
+    def _in_use(self) -> Predictor:
+        """What predicts: itself, or the most recent fit."""
+        return self
+
     def force_field(self) -> ForceField | None:
         """The mean impressed force Q̄ `(n, nq)` at states, or `None` for a model of accelerations alone."""
         return None
@@ -140,7 +145,7 @@ class Predictor(ABC):
             samples: number of function samples to integrate besides the mean.
             **settings: `options`, `seed`, `active`, `system` and `progress` of `rollout_model`.
         """
-        return rollout_model(self, q0, qd0, tau, duration, samples, **settings)
+        return rollout_model(self._in_use, q0, qd0, tau, duration, samples, **settings)
 
     def score(self, data: Dataset, quantity: str = "qdd") -> float:
         """Coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
@@ -356,6 +361,10 @@ class Model(Predictor, Generic[F]):
         return self.fitted.predict(
             q, qd, tau, quantity, active=active, covariance=covariance, system=system, **settings
         )
+
+    @property
+    def _in_use(self) -> Predictor:
+        return self.fitted
 
     def force_field(self) -> ForceField | None:
         return self.fitted.force_field()

@@ -43,6 +43,7 @@ KEYS: dict[str, tuple[str, ...]] = {
         "sensor_noise_std",
         "inference",
         "inducing_points",
+        "inertia",
         "analytical",
     ),
 }
@@ -119,7 +120,7 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
     given = {key: value for key, value in table.section.given().items() if key not in COMMON}
     for key in given:
         _check_key(table, ("model", key), (*COMMON, *KEYS[kind]), f"the model {name!r}")
-    plain = ("learn_noise", "state_noise", "inference", "inducing_points", "hidden")
+    plain = ("learn_noise", "state_noise", "inference", "inducing_points", "inertia", "hidden")
     arguments = {key: given[key] for key in plain if key in given}
     at = table.document.at
     if isinstance(mean := given.get("mean"), str):

@@ -6,10 +6,14 @@ to notice a new one. So what earlier samples say is forgotten on evidence: with 
     p(D | payload anew from its prior) · p(change) > p(D | payload as it was).
 
 Both are marginal likelihoods, read off the posterior before and after the update.
+
+The force of a payload is exact to first order in what it differs from the one that its prior knows. Once a
+change is found the prior knows the present estimate, as in an extended Kalman filter.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +22,7 @@ import torch
 
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
+from forcegp.forces.priors.payload import PayloadPrior
 from forcegp.gp.bound import bound_of
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.structured_fit import StructuredFit
@@ -69,7 +74,38 @@ def follow(
     gain = _evidence(anew) - _evidence(forgotten) - (_evidence(kept) - _evidence(before))
     log_odds = gain + math.log(change) - math.log1p(-change)
     changed = log_odds > 0.0
-    return Followed(model.adopt(anew if changed else kept), changed, log_odds)
+    if changed:
+        # The first estimate is that of accelerations without the new payload, so it is made once more.
+        model.adopt(_knowing(forgotten, anew, priors))
+        anew = model.update(data)
+    found = anew if changed else kept
+    return Followed(model.adopt(_knowing(found, found, priors, begin=changed)), changed, log_odds)
+
+
+def _knowing(
+    fit: StructuredFit, estimate: StructuredFit, priors: Sequence[str], begin: bool = True
+) -> StructuredFit:
+    """The fit with payload priors that know the payload of an estimate.
+
+    Args:
+        fit: whose priors are replaced.
+        estimate: fit that shows the payloads.
+        priors: names of the priors that are followed.
+        begin: whether priors that know no payload are replaced too.
+    """
+    one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
+    known = tuple(
+        prior.around(estimate.posterior.latent.latent_mean(p, one)[0])
+        if isinstance(prior, PayloadPrior) and prior.name in priors and (begin or prior.known)
+        else prior
+        for p, prior in enumerate(fit.posterior.priors)
+    )
+    return dataclasses.replace(
+        fit,
+        specification=dataclasses.replace(fit.specification, priors=known),
+        problem=dataclasses.replace(fit.problem, priors=known),
+        posterior=dataclasses.replace(fit.posterior, priors=known),
+    )
 
 
 def _evidence(fit: StructuredFit) -> float:

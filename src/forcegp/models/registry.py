@@ -58,7 +58,7 @@ def _structured(mean: str, kernel: Kernel | None = None) -> Callable[..., Model]
 
 
 def _measured(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
-    options = {"mean": "analytical", "force_priors": measured_priors(system)} | options
+    options = {"mean": "analytical", "force_priors": measured_priors(system), "inertia": "auto"} | options
     return StructuredGP(system, noise_std=noise_std, **options)
 
 

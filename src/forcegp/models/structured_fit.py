@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +14,7 @@ from forcegp.constraints.compiled_system import compiled_system
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.coulomb import coupled
 from forcegp.forces.identifiability import doubts_of
-from forcegp.forces.inference import forces_and_constant, log_likelihood
+from forcegp.forces.inference import forces_and_constant, log_likelihood, lost_by_inducing
 from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
@@ -24,7 +23,6 @@ from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps
 from forcegp.forces.samples import draw_samples
 from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
 from forcegp.gp.optimise import Learned
-from forcegp.gp.pathwise import FEATURES
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
 from forcegp.models.structured_spec import Specification, pack
@@ -106,10 +104,11 @@ class StructuredFit(FittedModel):
         if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
             at = self._with_acceleration(system, at)
         z, parts = affine_maps(system, at, quantity)
-        rows = self.posterior.rows(system, at, z)
-        mean, spread = self.posterior.mean_of(rows), None
-        if covariance:
-            spread = self.posterior.latent.covariance(rows)
+        spread = None
+        if not covariance:
+            mean = self.posterior.read_mean(system, at, z)
+        else:
+            mean, spread = self.posterior.read(system, at, z)
             z = coupled(system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
             if STICK_NOISE in self.hyperparameters:
                 spread = spread + _carried(z, stick_variance(self.hyperparameters, at))
@@ -132,7 +131,7 @@ class StructuredFit(FittedModel):
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         """Force functions drawn from the posterior."""
-        return draw_samples(self.posterior, samples, generator, FEATURES).total_force
+        return draw_samples(self.posterior, samples, generator).total_force
 
     def updated(self, measurements: Training) -> StructuredFit:
         """The fit with more samples.
@@ -225,13 +224,13 @@ class StructuredFit(FittedModel):
 
     @property
     def torque_disturbance(self) -> Tensor | None:
-        """s √T of torque noise with standard deviation s that is correlated for a time T, [N m √s].
+        """s √T of torque noise with standard deviation s that is correlated for a time T, `(nq,)` [N m √s].
 
         Over times longer than T it acts like white noise with this root of a spectral density.
         """
-        if self.torque_std is None or self.problem.correlation_time == 0.0:
+        if self.torque_std is None or self.problem.correlation is None:
             return None
-        return self.torque_std * self.problem.correlation_time**0.5
+        return self.torque_std * self.problem.correlation.sqrt()
 
     def _noise_covariance(self, z: AffineMap, parts: Mapping[str, slice]) -> Tensor:
         """B Σ_τ Bᵀ + Σ_q̈ of a measurement of the quantities, `(n, d, d)`."""
@@ -310,13 +309,14 @@ def conditioned(
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
-    names = enumerate(problem.training.quantities)
-    noise = {quantity: typical(problem.noise_at(hyperparameters, i)) for i, quantity in names}
+    measured = enumerate(problem.training.measurements)
+    noise = {m.quantity: typical(problem.noise_at(hyperparameters, i)) for i, m in measured}
     posterior, constant = forces or forces_and_constant(problem, hyperparameters)
     likelihood, jitter = log_likelihood(posterior) - float(constant), posterior.latent.jitter
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     training, system = problem.training, problem.system_at(hyperparameters)
-    doubts, lost = doubts_of(posterior, system, training), _lost(posterior)
+    lost, more_points = lost_by_inducing(posterior)
+    doubts = doubts_of(posterior, system, training)
     result = FitResult.of(
         learned,
         log_marginal_likelihood=likelihood,
@@ -327,34 +327,9 @@ def conditioned(
             for name in scale.constant
         ),
         force_correlation=doubts.correlation,
-        warnings=(*warnings, *doubts.warnings, *_more_points(lost)),
+        warnings=(*warnings, *doubts.warnings, *more_points),
         samples=training.all_samples,
         learned_on=learned_on,
         **lost,
     )
     return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)
-
-
-def _lost(posterior: ForcePosterior) -> dict[str, Any]:
-    """Which inference a posterior has, and what a sparse one loses by its inducing points."""
-    if not isinstance(posterior.latent, SparsePosterior):
-        return {"inference": "exact"}
-    found = posterior.latent.diagnostics
-    return {
-        "inference": "sparse",
-        "basis_functions": found.size,
-        "determined": found.learned,
-        "missed": found.missed,
-        "more_points_would_help": found.more_points_would_help,
-    }
-
-
-def _more_points(lost: Mapping[str, Any]) -> tuple[str, ...]:
-    """A warning where inducing points miss much of what the data could tell."""
-    if not lost.get("more_points_would_help"):
-        return ()
-    return (
-        f"more inducing points would help: {lost['basis_functions']} basis functions miss a variance of "
-        f"{lost['missed']:.3g} in units of the noise, where noise leaves {lost['determined']:.3g}; raise "
-        "inducing_points",
-    )

@@ -36,7 +36,7 @@ from forcegp.gp.optimise import LearningOptions, Progress
 from forcegp.models.base import FitProgress, Model, require_double
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Lesson, in_motion, prepared, solve
-from forcegp.models.structured_spec import Specification, torque_noise_of
+from forcegp.models.structured_spec import Specification, check_inertia, torque_noise_of
 from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
@@ -70,6 +70,9 @@ class StructuredGP(Model[StructuredFit]):
             and the result of the fit says where more would help.
         state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
             or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
+        inertia: `"file"` keeps that of the robot; `"auto"` adds inertia of drives or an `InertialPrior`
+            where held-out stretches of the log ask for it (`forces/inertia.py`), as the defaults of a
+            measured robot do. It needs a `JointFrictionPrior` and a mean with the motor torque.
 
     Example:
         >>> import forcegp, torch
@@ -101,6 +104,7 @@ class StructuredGP(Model[StructuredFit]):
         inference: str = "auto",
         inducing_points: int = LIMIT,
         state_noise: tuple[NoiseStd, NoiseStd] | None = None,
+        inertia: str = "file",
     ) -> None:
         require_double(system)
         form = mean_of(mean)
@@ -120,6 +124,7 @@ class StructuredGP(Model[StructuredFit]):
             check_limit(inducing_points),
             force_priors is None and torque_noise == "auto" and "actuation" in form.terms,
             state_noise,
+            check_inertia(inertia),
         )
 
     @classmethod
@@ -155,6 +160,7 @@ class StructuredGP(Model[StructuredFit]):
             "analytical_parameters": spec.parameters,
             "torque_noise": "auto" if spec.automatic else spec.torque_noise,
             "inference": spec.inference,
+            "inertia": spec.inertia,
         }
 
     # -- learning ---------------------------------------------------------------------------------
@@ -207,6 +213,12 @@ class StructuredGP(Model[StructuredFit]):
         options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
         chosen = None if learn is None else self._chosen(learn)
         training, doubts = self._training(known, chosen)
+        if self._fitted is None and chosen is None:
+            self.specification, found = spec.with_inertia_of(training)
+            doubts = (*doubts, *found)
+            if self.specification.priors != spec.priors:
+                training, _ = self._training(known, chosen)
+            spec = self.specification
         spec.system.announce_states(training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
         log = None
         if sample is not None:
@@ -336,12 +348,12 @@ class StructuredGP(Model[StructuredFit]):
     ) -> tuple[Training, tuple[str, ...]]:
         """What is learned from, with doubts about it; priors that are not learned (`None`: all are) keep the
         scales of their inputs."""
-        spec, kept, measured = self.specification, {}, self.specification.learns_torque_noise
+        spec, kept = self.specification, {}
         if self._fitted is not None and learned is not None:
             scales = zip(spec.priors, self._fitted.training.scales, strict=True)
             kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
         training = training_of(data, spec.system, spec.priors, spec.noise_std, kept)
-        return in_motion(spec, training) if measured else (training, ())
+        return in_motion(spec.system, training) if spec.learns_torque_noise else (training, ())
 
     def adopt(self, fitted: StructuredFit) -> StructuredFit:
         """Predict with this fit from now on."""

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
-from forcegp.forces.calibration import held_out_torque_std, likelihood_power
+from forcegp.forces.calibration import held_out_torque_std, likelihood_power, residual_times
 from forcegp.forces.impacts import without_impacts
 from forcegp.forces.inference import (
     force_posterior,
@@ -73,16 +74,14 @@ class Lesson:
     warnings: tuple[str, ...] = ()
 
 
-def in_motion(spec: Specification, training: Training) -> tuple[Training, tuple[str, ...]]:
-    """The samples in motion, without impacts, for models that learn the torque noise of a measured robot."""
-    if not spec.learns_torque_noise:
-        return training, ()
+def in_motion(system: ConstrainedSystem, training: Training) -> tuple[Training, tuple[str, ...]]:
+    """The samples in motion, without impacts, and doubts about them."""
     moving = training.moving(REST_SPEED)
     if moving.samples < FEWEST_MOVING:
         return training, (
             f"only {moving.samples} samples are in motion: friction cannot be told from noise at rest",
         )
-    moving, impacts = without_impacts(moving, spec.system)
+    moving, impacts = without_impacts(moving, system)
     if not impacts:
         return moving, ()
     return moving, (
@@ -92,9 +91,10 @@ def in_motion(spec: Specification, training: Training) -> tuple[Training, tuple[
 
 def subset(spec: Specification, problem: Problem) -> Problem:
     """The problem on the samples that hyperparameters are learned on."""
-    training, finite = problem.training, is_finite(problem.priors)
+    training = problem.training
     if not is_sparse(spec.inference, problem.priors, training.all_samples):
         return problem
+    finite = is_finite(problem.priors)
     most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
     if training.samples > most:
         # Neighbours in time show how long residuals are correlated; elsewhere samples far apart say most.
@@ -146,9 +146,11 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
     Neighbours in the whole log are closer in time than in the part that was learned on. Of a log that is read
     piece by piece, a few contiguous stretches are looked at.
     """
-    power = part.power if part.training is training else likelihood_power(part, values, training)
+    power, correlation = residual_times(part, values, training)
+    if part.training is training:
+        power = part.power
     share = training.samples / training.all_samples
-    return dataclasses.replace(part, power=power * share, correlation_time=training.period / power)
+    return dataclasses.replace(part, power=power * share, correlation=correlation)
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:

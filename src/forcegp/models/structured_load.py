@@ -143,7 +143,7 @@ def _restored(
         spec.problem(training),
         system=spec.system if spec.parameters is not None else system,
         power=settings.power,
-        correlation_time=settings.correlation_time,
+        correlation=_correlation(tensors, settings, system),
         offsets=_below(tensors, "offset."),
         torque_std=tensors.get("torque_std"),
         pinned=settings.pinned,
@@ -159,6 +159,15 @@ def _restored(
     return StructuredFit(spec, problem, hyper, posterior, result, system, noise)
 
 
+def _correlation(
+    tensors: Mapping[str, Tensor], settings: StructuredSettings, system: ConstrainedSystem
+) -> Tensor | None:
+    """How long torque noise is correlated; older models have one time for all joints."""
+    if "torque_correlation" in tensors or settings.correlation_time == 0.0:
+        return tensors.get("torque_correlation")
+    return torch.full_like(system.robot.mass, settings.correlation_time)
+
+
 def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str, Tensor]) -> ForcePosterior:
     """The posterior with its weights or sums as they were."""
     scales, params, coulomb = problem.training.scales, kernel_parameters(hyper), problem.coulomb(hyper)
@@ -166,7 +175,7 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
         kept = {name: _below(tensors, name + ".") for name in ("sparse", "central")}
         latent = posterior_of_tensors(problem.priors, params, kept["sparse"])
         central = posterior_of_tensors(problem.priors, params, kept["central"]) if kept["central"] else None
-        return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, central, coulomb)
+        return ForcePosterior(problem.priors, scales, problem.mean, latent, central, coulomb)
     blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
     rows = sum(block.rows for block in blocks)
     if alpha.shape != (rows,):
@@ -174,4 +183,4 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
     if problem.pinned:
         return force_posterior(problem, hyper)
     latent = ExactPosterior(problem.priors, params, blocks, alpha)
-    return ForcePosterior(problem.priors, scales, problem.mean, latent, problem.offsets, coulomb=coulomb)
+    return ForcePosterior(problem.priors, scales, problem.mean, latent, coulomb=coulomb)

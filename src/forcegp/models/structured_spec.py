@@ -13,9 +13,18 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ModelError
+from forcegp.errors import ModelError, UnknownNameError
+from forcegp.forces.inertia import inertia_of
 from forcegp.forces.learn import Problem, analytical_parameters
-from forcegp.forces.measurements import NoiseStd, Observation, Training, is_simulated, plain, states_noise
+from forcegp.forces.measurements import (
+    NoiseStd,
+    Observation,
+    Training,
+    is_simulated,
+    observations_of,
+    plain,
+    states_noise,
+)
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
@@ -57,6 +66,8 @@ CLASSES: dict[str, type] = {
 """What can be saved, by the name in the file."""
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
 """A noise that may be zero, as one number or one per joint."""
+INERTIAS = ("file", "auto")
+"""Where the inertia of the robot is from."""
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """What is kept of each measurement."""
 
@@ -77,6 +88,7 @@ class Specification:
         inducing_points: maximum number of inducing points of one prior.
         automatic: whether the priors depend on whether the data are simulated or measured.
         state_noise: standard deviations of the noise of q and of q̇, or `None` for none.
+        inertia: `"file"`, or `"auto"` where the log may show another one.
     """
 
     system: ConstrainedSystem
@@ -90,6 +102,7 @@ class Specification:
     inducing_points: int = LIMIT
     automatic: bool = False
     state_noise: tuple[NoiseStd, NoiseStd] | None = None
+    inertia: str = "file"
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
         """The specification with what was left to the data filled in.
@@ -97,11 +110,11 @@ class Specification:
         Around the analytical forces of a measured robot the default priors are `measured_priors`. The noise
         of accelerations is learned with that of the torque where nobody states it.
         """
-        spec = self
-        if spec.automatic and not is_simulated(data):
-            spec = dataclasses.replace(spec, priors=measured_priors(spec.system), torque_noise="learn")
-        learns = isinstance(spec.torque_noise, str)
-        if learns and spec.noise_std is None and not states_noise(data):
+        spec, observations = self, observations_of(data)
+        if spec.automatic and not is_simulated(observations):
+            priors = measured_priors(spec.system)
+            spec = dataclasses.replace(spec, priors=priors, torque_noise="learn", inertia="auto")
+        if spec.learns_torque_noise and spec.noise_std is None and not states_noise(observations):
             spec = dataclasses.replace(spec, learn_noise=True)
         return dataclasses.replace(spec, automatic=False)
 
@@ -109,6 +122,17 @@ class Specification:
     def learns_torque_noise(self) -> bool:
         """Whether the noise of the motor torque is learned."""
         return isinstance(self.torque_noise, str)
+
+    def with_inertia_of(self, training: Training) -> tuple[Specification, tuple[str, ...]]:
+        """The specification with the inertia that the training samples ask for, and doubts about it."""
+        friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
+        asks = self.inertia == "auto" and "actuation" in self.mean.terms and self.parameters is None
+        if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
+            return self, ()
+        found = inertia_of(self.system, friction, self.mean, training)
+        priors = (*self.priors, InertialPrior()) if found.learned else self.priors
+        system = self.system.with_robot(found.robot)
+        return dataclasses.replace(self, system=system, priors=priors, inertia="file"), found.doubts
 
     def problem(self, training: Training) -> Problem:
         """The learning problem of training data."""
@@ -140,6 +164,17 @@ def torque_noise_of(given: NoiseStd | str | None, priors: Sequence[ForcePrior]) 
             got=given,
         )
     return given
+
+
+def check_inertia(inertia: str) -> str:
+    """Where the inertia of the robot is from.
+
+    Raises:
+        UnknownNameError: neither "file" nor "auto".
+    """
+    if inertia not in INERTIAS:
+        raise UnknownNameError("inertia", inertia, INERTIAS)
+    return inertia
 
 
 class ResultSettings(Settings):
@@ -214,7 +249,6 @@ def pack(
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
         inducing_points=spec.inducing_points,
         power=problem.power,
-        correlation_time=problem.correlation_time,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
         measured=training.quantities if exact else (),
@@ -226,6 +260,8 @@ def pack(
     tensors |= {f"offset.{name}": value for name, value in problem.offsets.items()}
     if problem.torque_std is not None:
         tensors["torque_std"] = problem.torque_std
+    if problem.correlation is not None:
+        tensors["torque_correlation"] = problem.correlation
     if isinstance(latent, ExactPosterior):
         tensors |= {"alpha": latent.alpha, **_tensors_of(training)}
     else:

@@ -12,7 +12,7 @@ from torch import Tensor
 from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.constraints.unilateral import any_row, can_open
-from forcegp.errors import ForceGPError, UnknownNameError
+from forcegp.errors import ForceGPError, ModelError, UnknownNameError
 from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
 from forcegp.rollout.law import ForceLaw, ForwardModel, Law, Problem, State, law_of
@@ -210,6 +210,11 @@ def _run(
     n, system = whole.numel(), options.stabilized(system)
     system.robot.check_state(q0=start[0], qd0=start[1])
     unilateral = options.unilateral and len(system.contacts) > 0
+    if unilateral and not law.has_multiplier:
+        raise ModelError(
+            "a model of accelerations alone has no multiplier that could tell when contact is lost",
+            hint="pass unilateral=False, or use a model with forces",
+        )
     inputs = inputs_of(tau, whole if batch is None else batch, n, options.dt, options.interpolation)
     dt = options.dt or inputs.period or STEP
     steps = max(1, round(duration / dt))

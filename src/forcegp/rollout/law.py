@@ -207,13 +207,6 @@ class Problem:
     inputs: Inputs
     unilateral: bool
 
-    def __post_init__(self) -> None:
-        if self.unilateral and not self.law.has_multiplier:
-            raise ModelError(
-                "a model of accelerations alone has no multiplier that could tell when contact is lost",
-                hint="pass unilateral=False, or use a model with forces",
-            )
-
     def evaluate(self, state: State, end: Tensor) -> Evaluation:
         """The motion at a state, within a step that ends at `end` `(n, 1)`."""
         eom = self.system.equations(state.q, state.qd, state.active)

@@ -63,6 +63,7 @@ class ModelSection(Section):
     state_noise: tuple[State, State] | None = None
     sensor_noise_std: PositiveFloat | None = None
     inference: Literal["auto", "exact", "sparse"] = "auto"
+    inertia: Literal["file", "auto"] = "file"
     inducing_points: PositiveInt = 100
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: tuple[dict[str, Any], ...] = ()

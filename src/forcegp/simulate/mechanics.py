@@ -101,7 +101,7 @@ class Mechanics:
         """The equations of motion at a state `(nq,)`; `active` `(n_contacts,)` defaults to all."""
         M, Q_C, Q_G, *points = self._blocks(q, qd)
         frames = [points[i : i + POINT] for i in range(0, len(points), POINT)]
-        moving = [_moving_point(p, J, bias[3:], qd) for _, p, J, bias in frames]
+        moving = [_moving_point(p, J, bias, qd) for _, p, J, bias in frames]
         found = [
             contact.terms_of([moving[k] for k in places])
             for contact, places in zip(self.contacts, self._places, strict=True)

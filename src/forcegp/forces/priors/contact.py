@@ -43,17 +43,6 @@ def tangent_frame(n: Tensor) -> Tensor:
     return torch.stack([first, second], dim=-1)
 
 
-def sliding(at: States, contact: str) -> tuple[Tensor, Tensor]:
-    """Jacobian `(n, 3, nq)` and velocity `(n, 3)` of the touching point along the surface.
-
-    J and v = J q̇ are those of the point, with the part along the normal left out.
-    """
-    point = at.eom.contact_points[contact]
-    normal = normalize(point.normal, dim=-1)[..., None]
-    J = point.jacobian - normal @ (normal.mT @ point.jacobian)
-    return J, (J @ at.qd[..., None])[..., 0]
-
-
 @dataclass(frozen=True)
 class SurfaceForcePrior(ForcePrior):
     """A force at a contact with a surface, where it is closed."""

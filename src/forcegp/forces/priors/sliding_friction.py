@@ -12,13 +12,14 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import check_inputs
-from forcegp.forces.priors.contact import SurfaceForcePrior, sliding
+from forcegp.forces.priors.contact import SurfaceForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
@@ -27,6 +28,17 @@ TERMS = ("viscous", "dry", "coulomb", "stribeck", "torsion")
 """Kinds of friction, in the order of the components of the latent function."""
 LOADED = ("coulomb", "stribeck", "torsion")
 """Kinds that are proportional to the multiplier."""
+
+
+def sliding(at: States, contact: str) -> tuple[Tensor, Tensor]:
+    """Jacobian `(n, 3, nq)` and velocity `(n, 3)` of the touching point along the surface.
+
+    J and v = J q̇ are those of the point, with the part along the normal left out.
+    """
+    point = at.eom.contact_points[contact]
+    normal = normalize(point.normal, dim=-1)[..., None]
+    J = point.jacobian - normal @ (normal.mT @ point.jacobian)
+    return J, (J @ at.qd[..., None])[..., 0]
 
 
 @dataclass(frozen=True)

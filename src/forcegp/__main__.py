@@ -1,0 +1,6 @@
+"""`python -m forcegp`: the command line, where the script `forcegp` is not on the path."""
+
+from forcegp.cli import main
+
+if __name__ == "__main__":
+    main()

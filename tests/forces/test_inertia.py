@@ -1,0 +1,143 @@
+"""Which inertia a measured log asks for, on logs whose robot is known."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+import forcegp
+from forcegp import dynamics
+from forcegp.errors import UnknownNameError
+from forcegp.forces.calibration import correlation_times
+from forcegp.forces.inertia import Inertia, Rows, difference, inertia_of, is_harmless, sums
+from forcegp.forces.measurements import training_of
+from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.robot.model import RobotModel
+
+NOISE = torch.tensor([0.2, 0.05], dtype=torch.float64)
+"""Standard deviation of the measured torque [N m]."""
+ROUNDING = 1e-8
+"""Of two formulas for the same solution, in double precision with a ridge of 1e-8."""
+
+
+def log(
+    robot: RobotModel, n: int = 1600, speed: float = 1.0, seed: int = 0, segments: int = 8
+) -> forcegp.Dataset:
+    """Torques that move a robot with joint friction along sums of sines, measured with noise."""
+    generator = torch.Generator().manual_seed(seed)
+    t = torch.arange(n, dtype=torch.float64) * 0.01
+    segment = torch.arange(n) * segments // n
+    w = speed * (1.0 + 5.0 * torch.rand(segments, 3, 2, generator=generator, dtype=torch.float64))
+    phase = 6.3 * torch.rand(segments, 3, 2, generator=generator, dtype=torch.float64)
+    angle = w[segment] * t[:, None, None] + phase[segment]
+    parts = torch.sin(angle), w[segment] * torch.cos(angle), -(w[segment] ** 2) * torch.sin(angle)
+    q, qd, qdd = (0.4 * part.sum(1) for part in parts)
+    noise = NOISE * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    friction = 0.3 * qd + 0.4 * torch.tanh(qd / 0.02)
+    tau = dynamics.inverse_dynamics(robot, q, qd, qdd) + friction + noise
+    return forcegp.Dataset(t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names, segment=segment)
+
+
+@pytest.fixture(scope="module")
+def file() -> RobotModel:
+    robot = forcegp.load_robot("double_pendulum")
+    zero = torch.zeros_like(robot.damping)
+    return robot.replace(damping=zero, friction=zero)
+
+
+def found(file: RobotModel, data: forcegp.Dataset) -> Inertia:
+    system, prior = forcegp.ConstrainedSystem(file), JointFrictionPrior()
+    return inertia_of(system, prior, AnalyticalMean(), training_of(data, system, (prior,), None, {}))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_right_file_is_kept(file: RobotModel, seed: int) -> None:
+    result = found(file, log(file, seed=seed))
+    assert result.robot is file and not result.learned and not result.doubts
+
+
+def test_inertia_of_drives_that_the_file_lacks_is_found(file: RobotModel) -> None:
+    """Not taken for inertia of the links, which would load the other joint too."""
+    armature = torch.tensor([0.3, 0.1], dtype=torch.float64)
+    result = found(file, log(file.replace(armature=armature)))
+    assert not result.learned and "drives" in result.doubts[0]
+    torch.testing.assert_close(result.robot.armature, armature, rtol=0.1, atol=0.0)
+
+
+def test_links_that_the_file_describes_wrongly_are_learned(file: RobotModel) -> None:
+    truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
+    result = found(file, log(truth))
+    assert result.learned and result.robot is file and "inertial parameters" in result.doubts[0]
+    system = forcegp.ConstrainedSystem(file)
+    model = forcegp.StructuredGP(system, "analytical")
+    model.fit(log(truth, 800))
+    assert any(isinstance(prior, InertialPrior) for prior in model.force_priors)
+
+
+def test_accelerations_below_the_noise_of_the_torque_damp_the_drives_without_harm_to_torques(
+    file: RobotModel,
+) -> None:
+    """A slow motion: the noise of the torque over the inertia is ten times what was measured."""
+    light = file.replace(mass=0.02 * file.mass, inertia=0.02 * file.inertia)
+    data, test = log(light, speed=0.15), log(light, speed=0.15, seed=1)
+    result = found(light, data)
+    assert not result.learned and float(result.robot.armature.min()) > 0.0 and "drives" in result.doubts[0]
+
+    def errors(robot: RobotModel) -> tuple[Tensor, Tensor]:
+        friction = 0.3 * test.qd + 0.4 * torch.tanh(test.qd / 0.02)
+        torque = test.tau - friction - dynamics.inverse_dynamics(robot, test.q, test.qd, test.qdd)
+        M = dynamics.mass_matrix(robot, test.q)
+        return torque.square().mean(0), torch.linalg.solve(M, torque[..., None])[..., 0].square().mean(0)
+
+    before, after = errors(light), errors(result.robot)
+    assert bool((after[1] < 0.5 * before[1]).all()) and bool((after[0] < 1.1 * before[0]).all())
+
+
+def test_sums_give_the_dense_least_squares() -> None:
+    """Unknowns and friction together, each joint weighted by its noise."""
+    random = torch.Generator().manual_seed(0)
+    n, nq, f, p = 60, 2, 3, 4
+    C = torch.randn(n, nq, p, generator=random, dtype=torch.float64)
+    Phi = torch.randn(n, nq, f, generator=random, dtype=torch.float64)
+    r = torch.randn(n, nq, generator=random, dtype=torch.float64)
+    group = torch.arange(n) * 3 // n
+    by_stretch = sums(Rows(r, r, r, r, Phi, group, group), C)
+    every, rest = by_stretch.total(), by_stretch.without(1)
+    for given, own in ((every, group >= 0), (rest, group != 1)):
+        H, h = given.quadratic(NOISE)
+        delta = torch.linalg.solve(H, h)
+        w = given.friction(delta)
+        rows = [torch.cat([C[own, j], *(Phi[own, j] if k == j else 0.0 * Phi[own, j] for k in range(nq))], -1)
+                / NOISE[j] for j in range(nq)]  # fmt: skip
+        dense = torch.linalg.lstsq(
+            torch.cat(rows), torch.cat([r[own, j] / NOISE[j] for j in range(nq)])
+        ).solution
+        torch.testing.assert_close(torch.cat([delta, w.flatten()]), dense, rtol=ROUNDING, atol=ROUNDING)
+        left = r[own] - (C[own] @ delta) - (Phi[own] * w).sum(-1)
+        torch.testing.assert_close(given.error(delta, w), left.square().mean(0), rtol=1e-9, atol=0.0)
+
+
+def test_harm_is_what_one_joint_suffers() -> None:
+    before = torch.ones(8, 2, dtype=torch.float64)
+    assert difference(before, before) == (0.0, 0.0)
+    assert is_harmless(1.03 * before, before), "one and a half percent of the root mean square"
+    assert not is_harmless(before * torch.tensor([1.06, 0.8]), before), "three percent on one joint"
+
+
+def test_correlation_times_of_known_processes() -> None:
+    """(1 + a)/(1 − a) of an AR(1) process, and (1 − b)²/(1 + b²) of noise that swings back by b."""
+    noise = torch.randn(60_000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x = noise.clone()
+    for k in range(1, len(x)):
+        x[k, 0] = 0.8 * x[k - 1, 0] + noise[k, 0]
+    x[1:, 1] = noise[1:, 1] - 0.5 * noise[:-1, 1]
+    time = correlation_times(x, torch.zeros(len(x), dtype=torch.int64), 100)
+    torch.testing.assert_close(time, torch.tensor([9.0, 0.2], dtype=torch.float64), rtol=0.15, atol=0.0)
+
+
+def test_an_unknown_source_of_inertia_is_named(file: RobotModel) -> None:
+    with pytest.raises(UnknownNameError, match="guess"):
+        forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical", inertia="guess")
