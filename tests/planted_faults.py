@@ -15,6 +15,7 @@ import forcegp
 from forcegp import dynamics
 from forcegp.checks import Finding, Log, Report
 from forcegp.checks.log import derive
+from forcegp.checks.statistics import intervals
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.data import DataHeader
 from forcegp.errors import RobotFileWarning
@@ -312,19 +313,14 @@ def _label(which: str, seconds: float) -> Callable:
     def plant(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, Rows]:
         name = next(iter(log.contact))
         label, k = log.contact[name].copy(), round(seconds / log.dt)
-        change = np.diff(label.astype(int))
-        if which == "early":
-            start = int(np.flatnonzero(change == 1)[0]) + 1
-            rows = slice(start - k, start)
-        elif which == "late":
-            stop = int(np.flatnonzero(change == -1)[0]) + 1
-            rows = slice(stop, stop + k)
-        elif which == "far":
-            start = int(np.flatnonzero(change == 1)[0]) + 1
-            rows = slice(start - 2 * k, start - k)
-        else:
-            start = int(np.flatnonzero(change == 1)[0]) + 1
-            rows = slice(start + k, start + 3 * k)
+        # A tip that bounces touches for a few rows at a time; the fault is planted at a lasting contact.
+        start, stop = next(span for span in intervals(label) if span[0] > 2 * k and span[1] - span[0] > 3 * k)
+        rows = {
+            "early": slice(start - k, start),
+            "late": slice(stop, stop + k),
+            "far": slice(start - 2 * k, start - k),
+            "missed": slice(start + k, start + 3 * k),
+        }[which]
         label[rows] = which != "missed"
         return system, log.replace(contact={**log.contact, name: label}), (rows.start, rows.stop)
 
