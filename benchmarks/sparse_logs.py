@@ -51,7 +51,7 @@ def accuracy(folder: Path, name: str, seed: int) -> dict:
     train, test = parts(folder, seed)
     model = create(name, load_scene("kuka_plane").system(), noise_std=NOISE)
     began, used = time.perf_counter(), time.process_time()
-    result = model.fit(train)
+    fit = model.fit(train)
     seconds, processor = time.perf_counter() - began, time.process_time() - used
     found = evaluate(model, test, compare=False)
     return {
@@ -63,7 +63,7 @@ def accuracy(folder: Path, name: str, seed: int) -> dict:
         "coverage_noisy": found.coverage_noisy,
         "fit_seconds": seconds,
         "fit_processor_seconds": processor,
-        "basis_functions": getattr(result, "basis_functions", None),
+        "basis_functions": fit.result.basis_functions,
     }
 
 

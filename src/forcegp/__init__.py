@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from forcegp.forces.measurements import Observation
     from forcegp.forces.priors.base import AnalyticalMean
     from forcegp.forces.priors.contact import ContactForcePrior
+    from forcegp.forces.priors.coregional import CoregionalPrior
+    from forcegp.forces.priors.disturbance import DisturbancePrior
     from forcegp.forces.priors.inertial import InertialPrior
     from forcegp.forces.priors.joint import JointForcePrior
     from forcegp.forces.priors.joint_friction import JointFrictionPrior
@@ -58,6 +60,8 @@ _HOME = {
     "InertialPrior": "forces.priors.inertial",
     "JointForcePrior": "forces.priors.joint",
     "JointFrictionPrior": "forces.priors.joint_friction",
+    "CoregionalPrior": "forces.priors.coregional",
+    "DisturbancePrior": "forces.priors.disturbance",
     "LearningOptions": "gp.optimise",
     "NeuralNetwork": "models.neural",
     "NormalForcePrior": "forces.priors.normal_force",
@@ -99,8 +103,10 @@ __all__ = [
     "Baumgarte",
     "ConstrainedSystem",
     "ContactForcePrior",
+    "CoregionalPrior",
     "Cylinder",
     "Dataset",
+    "DisturbancePrior",
     "Evaluation",
     "ImplicitSurface",
     "IndependentGP",

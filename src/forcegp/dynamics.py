@@ -176,12 +176,17 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
     return batch_first(force, poses.batch)
 
 
-def damping_force(robot: RobotModel, qd: JointVector) -> JointVector:
+def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None = None) -> JointVector:
     """Joint friction of the robot: viscous, Coulomb (smoothed at zero speed) and the Stribeck effect.
 
     Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]; see Armstrong-Hélouvry,
     Dupont, Canudas de Wit, *A survey of models, analysis tools and compensation methods for the control of
     machines with friction* (Automatica 30, 1994). It is smooth, so it can be integrated and differentiated.
+
+    Args:
+        robot: the robot.
+        qd: `(*batch, nq)` joint velocities.
+        slip: `(*batch, nq)` direction of sliding, in place of tanh(q̇/v_0).
 
     Example:
         >>> import torch, forcegp
@@ -195,7 +200,7 @@ def damping_force(robot: RobotModel, qd: JointVector) -> JointVector:
     """
     robot.check_state(qd=qd)
     dry = robot.friction + robot.stribeck * torch.exp(-((qd / robot.stribeck_velocity) ** 2))
-    return -robot.damping * qd - dry * torch.tanh(qd / robot.friction_velocity)
+    return -robot.damping * qd - dry * (torch.tanh(qd / robot.friction_velocity) if slip is None else slip)
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:

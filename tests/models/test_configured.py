@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from forcegp import LearningOptions
+from forcegp import CoregionalPrior, DisturbancePrior, LearningOptions
 from forcegp.errors import SceneError, UnknownNameError
 from forcegp.forces import priors
 from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
@@ -20,6 +20,7 @@ from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.gp import kernels
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
+from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.configured import COMMON, KEYS, Configured, configured
 from forcegp.models.independent_gp import IndependentGP
@@ -91,6 +92,25 @@ learning = { optimizer = "adam", restarts = 3, warm_start = false }
     assert spec.torque_noise is None
     expected = LearningOptions("adam", tolerance=WITH_PARAMETERS.tolerance, restarts=3, warm_start=None)
     assert found.options == expected
+
+
+def test_noise_with_tails_disturbances_and_causes(made) -> None:
+    found = made("""
+degrees_of_freedom = 4.0
+standardize = false
+[[model.priors]]
+type = "disturbance"
+kernel = { type = "ornstein_uhlenbeck", time = 2.0 }
+[[model.priors]]
+type = "coregional"
+causes = 2
+[model.learning]
+hyperpriors = false
+""")
+    spec = found.model.specification
+    assert (spec.degrees_of_freedom, spec.standardize) == (4.0, False)
+    assert spec.priors == (DisturbancePrior(OrnsteinUhlenbeck(2.0)), CoregionalPrior(causes=2))
+    assert found.options == LearningOptions(hyperpriors=False)
 
 
 def test_the_other_models(made) -> None:

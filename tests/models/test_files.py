@@ -194,3 +194,19 @@ def test_a_tensor_that_is_missing_or_of_another_shape_is_named(
 def test_no_model_is_there(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"holds no saved model(.|\n)*model\.safetensors"):
         forcegp.load_model(tmp_path)
+
+
+def test_inputs_of_a_sparse_model_keep_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file does not keep the order of its tensors; kernels that read all inputs depend on theirs."""
+    priors = [forcegp.JointForcePrior()]
+    model = forcegp.StructuredGP(system, "analytical", priors, 0.1, inference="sparse")
+    model.fit(data, options=SHORT)
+    model.save(tmp_path / "model")
+    expected = model.predict(test.q, test.qd, test.tau).mean
+    read = safetensors.torch.load
+    for reverse in (False, True):
+        monkeypatch.setattr(
+            safetensors.torch, "load", lambda b, r=reverse: dict(sorted(read(b).items(), reverse=r))
+        )
+        found = forcegp.load_model(tmp_path / "model").predict(test.q, test.qd, test.tau).mean
+        assert torch.equal(found, expected)

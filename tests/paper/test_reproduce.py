@@ -10,6 +10,8 @@ import torch
 
 from forcegp.data import Dataset
 from forcegp.errors import DataError, UnknownNameError
+from forcegp.models.load import load_model
+from forcegp.models.structured_gp import StructuredGP
 from forcegp.paper.covariance import CovarianceData
 from forcegp.paper.multiplier import MultiplierData
 from forcegp.paper.profiles import Profile, profile_of
@@ -84,6 +86,18 @@ def test_a_second_run_does_nothing_again(made: Reproduction) -> None:
     again = run(TEN_SECONDS, made.page.parent, seed=3)
     assert again.reused == again.stages == made.stages
     assert again.results == made.results
+
+
+def test_the_paper_s_own_models_make_a_page(tmp_path: Path) -> None:
+    sizes = dataclasses.replace(TEN_SECONDS, sizes=(20,), main=20, identification_evaluations=5, exact=True)
+    made = run(sizes, tmp_path, seed=3)
+    assert {s.model for s in made.results.scores} == {"analytical", "nn", "gp", "sgp-zero", "sgp-mean"}
+    assert made.results.exact
+    text = made.page.read_text(encoding="utf-8")
+    assert "its kernel alone on inputs in their units" in text and "state where learning starts" in text
+    model = load_model(next(tmp_path.glob("stages/fit/**/sgp-zero-20/model")))
+    assert isinstance(model, StructuredGP)
+    assert model.hyperparameters["joint.log_lengthscale"].numel() == 147
 
 
 def test_two_processes_make_the_same_page(tmp_path: Path) -> None:

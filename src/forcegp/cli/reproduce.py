@@ -12,9 +12,10 @@ from forcegp.cli.common import AsJson, progress_bar, show
 
 def reproduce(
     profile: Annotated[
-        Literal["quick", "paper", "large", "real-contact"],
+        Literal["quick", "paper", "paper-exact", "large", "real-contact"],
         typer.Option(
-            help="A few minutes; the paper's sizes; all samples of a ten-minute log; or from a log in CSV to "
+            help="A few minutes; the paper's sizes; the paper's models too, in all that it states; all "
+            "samples of a ten-minute log; or from a log in CSV to "
             "the contact force, on scenes whose contact MuJoCo's solver makes."
         ),
     ] = "quick",
@@ -33,6 +34,8 @@ def reproduce(
     forcegp reproduce
 
     forcegp reproduce --profile paper --out out/paper --seed 1
+
+    forcegp reproduce --profile paper-exact --out out/paper-exact
 
     forcegp reproduce --profile large --out out/large
 

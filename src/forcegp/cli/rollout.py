@@ -11,6 +11,8 @@ import typer
 from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, progress_bar, read_data, show
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from forcegp.data import Dataset
     from forcegp.models.base import Model
     from forcegp.rollout import Rollout, RolloutOptions

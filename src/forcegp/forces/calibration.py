@@ -183,7 +183,10 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
         for g in group.unique().tolist():
             own = (group == g).nonzero()[:, 0]
             rest = dataclasses.replace(problem, training=training.without(i, own))
-            parts.append(_held_out(rest, hyperparameters, m[own], problem.noise_at(hyperparameters, i)))
+            found = _held_out(rest, hyperparameters, m[own], problem.noise_at(hyperparameters, i))
+            if training.weights is not None:
+                found = (training.weights[i][own].sqrt()[:, None] * found[0], *found[1:])
+            parts.append(found)
     if sum(len(residual) for residual, _, _ in parts) < FEWEST:
         return least
     residual, variance, P = (torch.cat(part) for part in zip(*parts, strict=True))

@@ -114,6 +114,16 @@ def with_coulomb(
     return Q_bar + (gain @ at.eom.multiplier(Q_bar)[..., None])[..., 0]
 
 
+def coulomb_response(
+    system: ConstrainedSystem, at: States, friction: Sequence[CoulombFriction]
+) -> Tensor | None:
+    """∂Q̄/∂Q = I − G Lᵀ `(n, nq, nq)`: a joint force changes the contact's load; `None` for identity."""
+    gain = _gain(system, at, friction)
+    if gain is None:
+        return None
+    return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device) - gain @ at.eom.L.mT
+
+
 @torch.no_grad()
 def below_jamming(
     system: ConstrainedSystem,

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from forcegp.errors import UnknownNameError
+from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
@@ -43,7 +43,20 @@ def is_finite(priors: Sequence[ForcePrior]) -> bool:
 
 
 def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> bool:
-    """Whether inference is sparse: on request, for finite priors, and beyond `EXACT_SAMPLES`."""
+    """Whether inference is sparse: on request, for finite priors, and beyond `EXACT_SAMPLES`.
+
+    Raises:
+        ModelError: sparse inference is asked for, and a force is a function of time.
+    """
+    if any(prior.in_time for prior in priors):
+        if inference == "sparse":
+            raise ModelError(
+                "sparse inference takes samples to be independent, which a function of time couples",
+                expected="exact inference",
+                got=", ".join(prior.name for prior in priors if prior.in_time),
+                hint='use inference="exact" on evenly spaced rows (`forcegp select --method even`)',
+            )
+        return False
     return inference == "sparse" or (inference == "auto" and (is_finite(priors) or samples > EXACT_SAMPLES))
 
 
@@ -106,8 +119,8 @@ def forces_and_constant(
     if problem.pinned:
         known = problem.silenced(problem.of_means().rows(hyperparameters).blocks)
         central = ExactPosterior.of(problem.priors, params, known)
-    coulomb = problem.coulomb(hyperparameters)
-    posterior = ForcePosterior(problem.priors, scales, problem.mean, latent, central, coulomb)
+    coulomb, priors = problem.coulomb(hyperparameters), problem.priors_at(hyperparameters)
+    posterior = ForcePosterior(priors, scales, problem.mean, latent, central, coulomb)
     return posterior, rows.constant
 
 

@@ -13,22 +13,25 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombFriction, coulomb_of
 from forcegp.forces.measurements import Training
-from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForcePrior
+from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForcePrior
 from forcegp.forces.projection import ForceMean, ForceNoise, WhitenedRows, combine, whiten
 from forcegp.forces.torque_noise import TORQUE_NOISE, stick_variance
 from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features
+from forcegp.gp.kernels import sub
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.structured_covariance import Block
 
 Tensors = dict[str, Tensor]
 OWN = tuple(name + "." for name in RESERVED)
 """Prefixes of what is learned besides the hyperparameters of the priors."""
+MIXED = "." + MIXING
+"""End of the names of what operators learn."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
     """The hyperparameters of the priors among learned tensors."""
-    return {key: value for key, value in tensors.items() if not key.startswith(OWN)}
+    return {key: x for key, x in tensors.items() if not key.startswith(OWN) and not key.endswith(MIXED)}
 
 
 def analytical_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -83,6 +86,10 @@ class Problem:
             return self.system
         return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
 
+    def priors_at(self, tensors: Mapping[str, Tensor]) -> tuple[ForcePrior, ...]:
+        """The priors with what their operators have learned."""
+        return tuple(prior.with_parameters(sub(tensors, prior.name)) for prior in self.priors)
+
     def noise_at(self, tensors: Mapping[str, Tensor], measurement: int) -> Tensor:
         """Noise of a measurement, `(d,)` or `(n, d)`; a learned one scales what varies by sample."""
         std = self.training.noise_std[measurement]
@@ -109,12 +116,12 @@ class Problem:
     def rows(self, tensors: Mapping[str, Tensor]) -> WhitenedRows:
         """Whitened rows at the noise and analytical parameters among the tensors."""
         system, force_noise = self.system_at(tensors), self.force_noise(tensors)
-        friction = self.coulomb(tensors)
+        friction, priors = self.coulomb(tensors), self.priors_at(tensors)
         return combine(
             [
                 whiten(
                     system,
-                    self.priors,
+                    priors,
                     self.training.scales,
                     self.mean,
                     m,
@@ -123,6 +130,7 @@ class Problem:
                     self.offsets,
                     friction,
                     self.state_std,
+                    None if self.training.weights is None else self.training.weights[i],
                 )
                 for i, m in enumerate(self.training.measurements)
             ]
@@ -169,7 +177,8 @@ class Problem:
 
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
         """The rows at learned and held tensors; computed once where they are those as given."""
-        own = any(key.startswith(OWN) for part in (tensors, held) for key in part)
+        keys = [*tensors, *held]
+        own = any(key.startswith(OWN) or key.endswith(MIXED) for key in keys)
         return self.rows({**held, **tensors}) if own else self.fixed_rows
 
 

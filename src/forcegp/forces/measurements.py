@@ -69,6 +69,7 @@ class Measurement:
         active: `(n, n_contacts)` bool.
         values: `(n, d)`.
         segment: `(n,)` trajectory of each sample; one trajectory by default.
+        t: `(n,)` time of each sample [s]; zero by default.
     """
 
     quantity: str
@@ -78,11 +79,14 @@ class Measurement:
     active: Tensor
     values: Tensor
     segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
+    t: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
 
     def __post_init__(self) -> None:
         if self.segment is None:
             zero = torch.zeros(self.q.shape[:1], dtype=torch.int64, device=self.q.device)
             object.__setattr__(self, "segment", zero)
+        if self.t is None:
+            object.__setattr__(self, "t", torch.zeros_like(self.q[:, 0]))
 
     @property
     def states(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -96,11 +100,12 @@ class Measurement:
 
     def at(self, system: ConstrainedSystem) -> States:
         """The equations of motion at the states, with the acceleration where it was measured."""
-        return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None)
+        time = torch.stack([self.t, self.segment.to(self.t)], dim=-1)
+        return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
 
     def __getitem__(self, rows: Tensor) -> Measurement:
         """The values at some of the states."""
-        return Measurement(self.quantity, *(part[rows] for part in (*self.tensors, self.segment)))
+        return Measurement(self.quantity, *(part[rows] for part in (*self.tensors, self.segment, self.t)))
 
 
 def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observation]:
@@ -181,7 +186,7 @@ def measurement_of(
         raise ModelError("there are no samples to learn from", expected="at least one sample", got="none")
     values = COLUMNS[quantity](data, system)
     std = _checked_noise(_noise_of(observation, default_noise), quantity, values)
-    return Measurement(quantity, data.q, data.qd, data.tau, active, values, data.segment), std
+    return Measurement(quantity, data.q, data.qd, data.tau, active, values, data.segment, data.t), std
 
 
 def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
@@ -225,6 +230,8 @@ class Training:
         scales: standardization of the inputs of each prior.
         part_of: number of samples that are conditioned on, of which these are a part; 0 where these are all.
         period: sampling period of the log that these are from [s]; 0 where its rows are not in order.
+        weights: of the samples of each measurement `(n,)`, which their noise variance is divided by; `None`
+            for one.
     """
 
     measurements: tuple[Measurement, ...]
@@ -232,6 +239,7 @@ class Training:
     scales: tuple[Standardization, ...]
     part_of: int = 0
     period: float = 0.0
+    weights: tuple[Tensor, ...] | None = None
 
     @property
     def samples(self) -> int:
@@ -279,14 +287,21 @@ class Training:
             noise_std=tuple(
                 std[own] if std.ndim == 2 else std for std, own in zip(self.noise_std, rows, strict=True)
             ),
+            weights=None
+            if self.weights is None
+            else tuple(w[own] for w, own in zip(self.weights, rows, strict=True)),
         )
 
     def joined(self, measurements: Sequence[Measurement], noise_std: Sequence[Tensor]) -> Training:
         """These and further measurements, with the noise of the latter."""
+        weights = self.weights
+        if weights is not None:
+            weights = (*weights, *(torch.ones_like(m.t) for m in measurements))
         return dataclasses.replace(
             self,
             measurements=(*self.measurements, *measurements),
             noise_std=(*self.noise_std, *noise_std),
+            weights=weights,
         )
 
     def moving(self, speed: float) -> Training:
@@ -307,6 +322,7 @@ def training_of(
     priors: Sequence[ForcePrior],
     noise_std: NoiseStd | None,
     kept: Mapping[str, Standardization],
+    standardize: bool = True,
 ) -> Training:
     """Measurements with their noise and input scales.
 
@@ -316,6 +332,7 @@ def training_of(
         priors: the force priors.
         noise_std: of accelerations whose noise is not stated.
         kept: scales of priors, by name, that keep earlier ones.
+        standardize: whether inputs of kernels are standardized, or enter in their units.
 
     Raises:
         ModelError, DataError: there are no data, or they do not fit the system.
@@ -330,7 +347,8 @@ def training_of(
             continue
         features = [prior.features(system, a) for a in at]
         together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
-        scales.append(Standardization.of(together, prior.vectors, prior.centred))
+        own = Standardization.of(together, prior.vectors, prior.centred)
+        scales.append(own if standardize and prior.scaled else Standardization.none(together))
     period = _period(observations[0].data)
     return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales), period=period)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -51,12 +52,18 @@ class ForcePosterior:
 
     def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Posterior mean of Q̄ = m + Σ E f, `(n, nq)`: the force field of a rollout."""
-        force, means = self.mean(system, at), self.central or self.latent
-        pairs = [(p, prior) for p, prior in enumerate(self.priors) if means.measured[p]]
+        force = self.mean(system, at) + self.unknown_force(system, at, range(len(self.priors)))
+        return with_coulomb(system, at, force, self.coulomb) if self.coulomb else force
+
+    def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
+        """Posterior mean of Σ E f over some priors, `(n, nq)`, without Coulomb friction of contacts."""
+        means = self.central or self.latent
+        pairs = [(p, self.priors[p]) for p in priors if means.measured[p]]
         parts = [(p, prior.features(system, at), prior.operator(system, at)) for p, prior in pairs]
+        force: Tensor | float = 0.0
         for p, x, E in parts:
             force = force + (E @ means.latent_mean(p, self.scales[p].apply(x))[..., None])[..., 0]
-        return with_coulomb(system, at, force, self.coulomb) if self.coulomb else force
+        return force
 
     def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
         """A quantity at n states as rows of the processes, with its prior mean as target.

@@ -152,6 +152,7 @@ def whiten(
     offsets: Mapping[str, Tensor] | None = None,
     coulomb: Sequence[CoulombFriction] = (),
     state_std: Tensor | None = None,
+    weight: Tensor | None = None,
 ) -> WhitenedRows:
     """Rows of one measurement with unit white noise, without noise-free directions.
 
@@ -165,6 +166,7 @@ def whiten(
         offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
         coulomb: friction of contacts that is proportional to the multiplier.
         state_std: `(2 nq,)` standard deviation of the noise of q and q̇.
+        weight: `(n,)` of each sample, which the variance of all its noise is divided by.
     """
     at = measurement.at(system)
     z = affine_map(system, at, measurement.quantity)
@@ -186,9 +188,11 @@ def whiten(
         _noise_factor(system, at, measurement, z, force_noise, state_std, std),
     )
     constant = std.log().sum()
+    if weight is not None:
+        constant = constant - 0.5 * std.shape[-1] * weight.log().sum()
     if rank is None:
         block, log_det = everything.whitened()
-        return WhitenedRows([block], constant + log_det)
+        return WhitenedRows([_weighted(block, weight)], constant + log_det)
     A = at.eom.A * std[:, None, :]
     violated = (at.eom.A @ measurement.values[..., None])[..., 0] - at.eom.b
     blocks = []
@@ -196,10 +200,20 @@ def whiten(
         own = (rank == value).nonzero()[:, 0]
         U, pinv = _split(A[own], value)
         block, log_det = everything.of(own, U).whitened()
-        fixed = 0.5 * ((pinv @ violated[own][..., None]) ** 2).sum()
+        squares = ((pinv @ violated[own][..., None]) ** 2)[..., 0].sum(-1)
+        fixed = 0.5 * (squares if weight is None else weight[own] * squares).sum()
         constant = constant + fixed + log_det + 0.5 * value * len(own) * math.log(2 * math.pi)
-        blocks.append(block)
+        blocks.append(_weighted(block, None if weight is None else weight[own]))
     return WhitenedRows(blocks, constant)
+
+
+def _weighted(block: Block, weight: Tensor | None) -> Block:
+    """The rows of samples with noise of less or more than unit variance, in units of it."""
+    if weight is None:
+        return block
+    root = weight.sqrt()
+    operators = tuple(root[:, None, None] * W for W in block.operators)
+    return Block(block.features, operators, root[:, None] * block.target)
 
 
 def _noise_factor(

@@ -26,6 +26,9 @@ class States:
         active: `(n, n_contacts)` bool.
         eom: the equations of motion at these states.
         qdd: `(n, nq)` measured acceleration, where one is known.
+        slip: `(n, nq)` direction in which each joint slides, in place of the smooth tanh(q̇/v₀) of dry
+            friction.
+        time: `(n, 2)` time [s] and number of the trajectory, for states of a log that is conditioned on.
     """
 
     q: Tensor
@@ -34,6 +37,8 @@ class States:
     active: Tensor
     eom: Equations
     qdd: Tensor | None = None
+    slip: Tensor | None = None
+    time: Tensor | None = None
 
 
 def states(
@@ -43,9 +48,10 @@ def states(
     tau: Tensor,
     active: Tensor,
     qdd: Tensor | None = None,
+    time: Tensor | None = None,
 ) -> States:
     """Evaluate the equations of motion at a batch of states."""
-    return States(q, qd, tau, active, system.equations(q, qd, active), qdd)
+    return States(q, qd, tau, active, system.equations(q, qd, active), qdd, time=time)
 
 
 class FlatStates(NamedTuple):

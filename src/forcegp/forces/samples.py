@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -68,12 +69,18 @@ class ForceSamples:
         Returns:
             `(samples · k, nq)` [N m, N].
         """
-        Q_bar = self.posterior.mean(system, at)
+        priors = range(len(self.posterior.priors))
+        Q_bar = self.posterior.mean(system, at) + self.unknown_force(system, at, priors)
+        return with_coulomb(system, at, Q_bar, self.posterior.coulomb)
+
+    def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
+        """Σ E f over some priors, as in `total_force`, without Coulomb friction of contacts."""
+        unknown: Tensor | float = 0.0
         runs = len(at.q) // self.count
         step = max(1, CHUNK_STATES // max(runs, 1))
         chunks = [range(i, min(i + step, self.count)) for i in range(0, self.count, step)]
-        for p, prior in enumerate(self.posterior.priors):
-            features = self.posterior.features_of(p, system, at)
+        for p in priors:
+            prior, features = self.posterior.priors[p], self.posterior.features_of(p, system, at)
             force = torch.cat(
                 [
                     self.functions.by_runs(
@@ -86,8 +93,8 @@ class ForceSamples:
                 ]
             )
             force = force + self.posterior.shift(p, features)
-            Q_bar = Q_bar + (prior.operator(system, at) @ force[..., None])[..., 0]
-        return with_coulomb(system, at, Q_bar, self.posterior.coulomb)
+            unknown = unknown + (prior.operator(system, at) @ force[..., None])[..., 0]
+        return unknown
 
 
 def draw_samples(

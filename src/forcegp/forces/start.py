@@ -20,7 +20,7 @@ from torch import Tensor
 from forcegp.errors import ModelError
 from forcegp.forces.coulomb import below_jamming, initial_coulomb
 from forcegp.forces.learn import OWN, Problem, Tensors, kernel_parameters, noise_key, typical
-from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
+from forcegp.forces.priors.base import ANALYTICAL, MIXING, ForcePrior
 from forcegp.forces.torque_noise import initial_torque_noise
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
@@ -31,6 +31,7 @@ LOG_STD_BOUNDS = (math.log(1e-6), math.log(1e6))
 LOG_NOISE_BOUNDS = (math.log(1e-6), math.log(1e4))
 LOG_COEFFICIENT_BOUNDS = (math.log(1e-3), math.log(2.0))
 LOG_SPEED_BOUNDS = (math.log(1e-3), math.log(1.0))
+LOG_TIME_BOUNDS = (math.log(1e-3), math.log(1e4))
 LOG_SMOOTHING_BOUNDS = (math.log(1e-4), math.log(0.1))
 WIDTH = {
     "log_coefficient": (2.0, 1.0),
@@ -40,6 +41,7 @@ WIDTH = {
     "log_noise_std": (5.0, 5.0),
     "log_scale": (1.0, 1.0),
     "log_offset": (1.0, 1.0),
+    "log_time": (1.0, 1.0),
 }
 """Standard deviations of the log-normal priors below and above the start, in e-folds; 3 where not named."""
 START_SAMPLES = 5000
@@ -54,6 +56,9 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     if problem.training.samples > START_SAMPLES:
         few = dataclasses.replace(problem, training=problem.training.evenly(START_SAMPLES))
     start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks)
+    for prior in problem.priors:
+        own = prior.initial_parameters(problem.system.robot)
+        start |= {f"{prior.name}.{name}": value for name, value in own.items()}
     if problem.has_coulomb:
         start |= initial_coulomb(problem.priors, problem.system.robot.mass)
     if learn_torque_noise:
@@ -118,6 +123,8 @@ def bounds_of(params: Parameters) -> dict[str, tuple[float, float]]:
         "log_coefficient": LOG_COEFFICIENT_BOUNDS,
         "log_smoothing": LOG_SMOOTHING_BOUNDS,
         "log_speed": LOG_SPEED_BOUNDS,
+        "log_time": LOG_TIME_BOUNDS,
+        MIXING: (-10.0, 10.0),
     }
     return {key: kinds.get(key.rsplit(".", 1)[-1], LOG_STD_BOUNDS) for key in params}
 
@@ -215,9 +222,9 @@ class Search:
         return min(found, key=lambda learned: learned.value)
 
     def objective(self, problem: Problem, tensors: Tensors) -> Tensor:
-        """Negative log posterior: the likelihood of the rows, and weak priors around the start."""
+        """Negative log posterior: the likelihood of the rows, and weak priors around the start if any."""
         hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL + ".")}
-        weak = negative_log_prior(hyper, self.start)
+        weak = negative_log_prior(hyper, self.start) if self.options.hyperpriors else 0.0
         rows = problem.rows_for(tensors, self.held)
         return problem.negative_log_likelihood(kernel_parameters({**self.held, **tensors}), rows) + weak
 

@@ -114,4 +114,5 @@ def posterior_of(
     latent = SparsePosterior.of(basis, total.sums)
     central = None if total.central is None else SparsePosterior.of(basis, total.central)
     scales, coulomb = problem.training.scales, problem.coulomb(hyperparameters)
-    return ForcePosterior(problem.priors, scales, problem.mean, latent, central, coulomb)
+    priors = problem.priors_at(hyperparameters)
+    return ForcePosterior(priors, scales, problem.mean, latent, central, coulomb)

@@ -77,6 +77,12 @@ class Standardization:
                 std[name] = torch.where(fixed, 1.0, spread.clamp(min=FLOOR * whole))
         return cls(mean, std, tuple(constant))
 
+    @classmethod
+    def none(cls, features: Mapping[str, Tensor]) -> Standardization:
+        """Inputs as they are, in their units."""
+        zero = {name: torch.zeros_like(x[0]) for name, x in features.items()}
+        return cls(zero, {name: torch.ones_like(x) for name, x in zero.items()})
+
     def apply(self, features: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The standardized features."""
         return {name: (x - self.mean[name]) / self.std[name] for name, x in features.items()}

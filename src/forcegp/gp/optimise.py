@@ -37,6 +37,8 @@ class LearningOptions:
             twice as many and so on, and at last on all; `None` learns on all from the start.
         restarts: further random starts, of which the best end is kept.
         seed: of the random starts.
+        hyperpriors: whether hyperparameters have weak log-normal priors around their start (maximum a
+            posteriori), or none, as in the paper (maximum likelihood).
 
     Example:
         >>> LearningOptions(max_evaluations=50).optimizer
@@ -52,6 +54,7 @@ class LearningOptions:
     warm_start: int | None = 200
     restarts: int = 0
     seed: int = 0
+    hyperpriors: bool = True
 
     def __post_init__(self) -> None:
         if self.optimizer not in OPTIMIZERS:

@@ -33,7 +33,7 @@ COMMON = ("name", "noise_std", "seed", "learning")
 KEYS: dict[str, tuple[str, ...]] = {
     AnalyticalModel.kind: ("analytical", "window"),
     NeuralNetwork.kind: ("hidden",),
-    IndependentGP.kind: (),
+    IndependentGP.kind: ("standardize",),
     StructuredGP.kind: (
         "mean",
         "priors",
@@ -44,10 +44,23 @@ KEYS: dict[str, tuple[str, ...]] = {
         "inference",
         "inducing_points",
         "inertia",
+        "standardize",
+        "degrees_of_freedom",
         "analytical",
     ),
 }
 """Further keys by the kind of model."""
+PLAIN = (
+    "learn_noise",
+    "state_noise",
+    "inference",
+    "inducing_points",
+    "inertia",
+    "standardize",
+    "degrees_of_freedom",
+    "hidden",
+)
+"""Keys that are arguments of the model's class as they are."""
 Options = LearningOptions | BatchOptions
 
 
@@ -120,8 +133,7 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
     given = {key: value for key, value in table.section.given().items() if key not in COMMON}
     for key in given:
         _check_key(table, ("model", key), (*COMMON, *KEYS[kind]), f"the model {name!r}")
-    plain = ("learn_noise", "state_noise", "inference", "inducing_points", "inertia", "hidden")
-    arguments = {key: given[key] for key in plain if key in given}
+    arguments = {key: given[key] for key in PLAIN if key in given}
     at = table.document.at
     if isinstance(mean := given.get("mean"), str):
         arguments["mean"] = mean

@@ -78,6 +78,7 @@ class IndependentSettings(Settings):
     """What is kept of independent Gaussian processes besides their tensors."""
 
     noise_std: PositiveFloat | tuple[PositiveFloat, ...] | None
+    standardize: bool = True
 
 
 class IndependentGP(Model["IndependentFit"]):
@@ -89,6 +90,7 @@ class IndependentGP(Model["IndependentFit"]):
         system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
         noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states, else 0.1.
+        standardize: whether inputs are standardized; otherwise they enter in their units, as in the paper.
 
     Raises:
         ModelError: the robot is not float64.
@@ -107,13 +109,16 @@ class IndependentGP(Model["IndependentFit"]):
 
     kind = KIND
 
-    def __init__(self, system: ConstrainedSystem, noise_std: NoiseStd | None = None) -> None:
+    def __init__(
+        self, system: ConstrainedSystem, noise_std: NoiseStd | None = None, standardize: bool = True
+    ) -> None:
         require_double(system)
         self.specified = system
         self.noise_std = noise_std
+        self.standardize = standardize
 
     def get_params(self) -> dict[str, Any]:
-        return {"system": self.specified, "noise_std": self.noise_std}
+        return {"system": self.specified, "noise_std": self.noise_std, "standardize": self.standardize}
 
     def fit(
         self,
@@ -141,7 +146,8 @@ class IndependentGP(Model["IndependentFit"]):
         options = options or LearningOptions()
         measured, noise_std = measurement_of(Observation(data), self.specified, self.noise_std)
         features = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
-        training = IndependentTraining(features, measured.values, noise_std, Standardization.of(features))
+        scale = _scale(features, self.standardize)
+        training = IndependentTraining(features, measured.values, noise_std, scale)
         priors = joint_processes(self.specified.robot.nq)
         _announce(training, LEARNING)
         saved = None if checkpoint is None else _record(Path(checkpoint), training, priors, options)
@@ -157,7 +163,9 @@ class IndependentGP(Model["IndependentFit"]):
         if saved is not None:
             saved.write()
         hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
-        self._fitted = fitted(self.specified, self.noise_std, training, hyperparameters, parts)
+        self._fitted = fitted(
+            self.specified, self.noise_std, training, hyperparameters, parts, self.standardize
+        )
         if saved is not None and not keep_checkpoint:
             saved.remove()
         return self._fitted
@@ -171,6 +179,10 @@ class IndependentGP(Model["IndependentFit"]):
         value = self.fitted.log_marginal_likelihood
         assert value is not None
         return value
+
+
+def _scale(features: Mapping[str, Tensor], standardize: bool) -> Standardization:
+    return Standardization.of(features) if standardize else Standardization.none(features)
 
 
 def joint_processes(nq: int) -> tuple[JointForcePrior, ...]:
@@ -193,7 +205,7 @@ def _learn(
 
     def objective(tensors: dict[str, Tensor]) -> Tensor:
         value = negative_log_likelihood([prior], tensors, blocks)
-        return value + constant + negative_log_prior(tensors, start)
+        return value + constant + (negative_log_prior(tensors, start) if options.hyperpriors else 0.0)
 
     recorded = objective if saved is None else saved.recorded(objective)
     return minimise(recorded, start, options, bounds=bounds_of(start), progress=report)
@@ -221,6 +233,7 @@ def fitted(
     training: IndependentTraining,
     hyperparameters: dict[str, Tensor],
     parts: Sequence[Learned] = (),
+    standardize: bool = True,
 ) -> IndependentFit:
     """Condition on training data at given hyperparameters.
 
@@ -244,7 +257,7 @@ def fitted(
         message="; ".join(f"{joint}: {part.message}" for joint, part in ended),
         history=tuple(value for part in parts for value in part.history),
     )
-    return IndependentFit(system, noise_std, training, hyperparameters, posteriors, result)
+    return IndependentFit(system, noise_std, training, hyperparameters, posteriors, result, standardize)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -258,6 +271,7 @@ class IndependentFit(FittedModel):
         hyperparameters: by process.
         posteriors: of each joint.
         result: how the fit went.
+        standardize: as given to the model.
     """
 
     system: ConstrainedSystem
@@ -266,6 +280,7 @@ class IndependentFit(FittedModel):
     hyperparameters: dict[str, Tensor]
     posteriors: tuple[ExactPosterior, ...]
     result: FitResult
+    standardize: bool = True
 
     kind = KIND
 
@@ -313,7 +328,7 @@ class IndependentFit(FittedModel):
         return Prediction(mean, torch.diag_embed(torch.cat(variances).reshape(mean.shape)), parts)
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
-        settings = IndependentSettings(noise_std=plain(self.noise_std))
+        settings = IndependentSettings(noise_std=plain(self.noise_std), standardize=self.standardize)
         tensors = {f"training.{name}": value for name, value in self.training.features.items()}
         tensors |= {"training.qdd": self.training.qdd, "training.noise_std": self.training.noise_std}
         tensors |= {f"hyperparameters.{name}": value for name, value in self.hyperparameters.items()}
@@ -333,7 +348,7 @@ def load_independent(
     """The model that `IndependentFit.save` wrote."""
     settings = settings_of(header, IndependentSettings, source)
     nq, dtype = system.robot.nq, system.robot.dtype
-    model = IndependentGP(system, settings.noise_std)
+    model = IndependentGP(system, settings.noise_std, settings.standardize)
     n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
     features = {
         name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
@@ -342,7 +357,7 @@ def load_independent(
     if noise.shape not in ((nq,), (n, nq)) or not bool((noise > 0.0).all()):
         raise ModelError(f"{source}: tensor 'training.noise_std' is not valid", expected="positive numbers")
     qdd = take(tensors, "training.qdd", (n, nq), dtype, source)
-    training = IndependentTraining(features, qdd, noise, Standardization.of(features))
+    training = IndependentTraining(features, qdd, noise, _scale(features, settings.standardize))
     hyperparameters = {
         f"{prior.name}.{name}": take(
             tensors, f"hyperparameters.{prior.name}.{name}", tuple(value.shape), torch.float64, source
@@ -352,7 +367,9 @@ def load_independent(
     }
     _announce(training, 0)
     try:
-        model._fitted = fitted(system, settings.noise_std, training, hyperparameters)
+        model._fitted = fitted(
+            system, settings.noise_std, training, hyperparameters, standardize=settings.standardize
+        )
     except ForceGPError as cause:
         raise ModelError.at(f"{source}: the training data", cause) from cause
     return model

@@ -31,6 +31,7 @@ from forcegp.forces.priors.base import (
 from forcegp.forces.priors.default import default_priors
 from forcegp.forces.start import Search, initial
 from forcegp.forces.state_noise import state_std_of
+from forcegp.forces.student_t import check_degrees
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions, Progress
 from forcegp.models.base import FitProgress, Model, require_double
@@ -73,6 +74,10 @@ class StructuredGP(Model[StructuredFit]):
         inertia: `"file"` keeps that of the robot; `"auto"` adds inertia of drives or an `InertialPrior`
             where held-out stretches of the log ask for it (`forces/inertia.py`), as the defaults of a
             measured robot do. It needs a `JointFrictionPrior` and a mean with the motor torque.
+        standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
+            in the paper.
+        degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
+            impacts and other outliers; `None` for Gaussian noise (`forces/student_t.py`).
 
     Example:
         >>> import forcegp, torch
@@ -105,6 +110,8 @@ class StructuredGP(Model[StructuredFit]):
         inducing_points: int = LIMIT,
         state_noise: tuple[NoiseStd, NoiseStd] | None = None,
         inertia: str = "file",
+        standardize: bool = True,
+        degrees_of_freedom: float | None = None,
     ) -> None:
         require_double(system)
         form = mean_of(mean)
@@ -125,6 +132,8 @@ class StructuredGP(Model[StructuredFit]):
             force_priors is None and torque_noise == "auto" and "actuation" in form.terms,
             state_noise,
             check_inertia(inertia),
+            standardize,
+            check_degrees(degrees_of_freedom),
         )
 
     @classmethod
@@ -161,6 +170,8 @@ class StructuredGP(Model[StructuredFit]):
             "torque_noise": "auto" if spec.automatic else spec.torque_noise,
             "inference": spec.inference,
             "inertia": spec.inertia,
+            "standardize": spec.standardize,
+            "degrees_of_freedom": spec.degrees_of_freedom,
         }
 
     # -- learning ---------------------------------------------------------------------------------
@@ -352,7 +363,7 @@ class StructuredGP(Model[StructuredFit]):
         if self._fitted is not None and learned is not None:
             scales = zip(spec.priors, self._fitted.training.scales, strict=True)
             kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
-        training = training_of(data, spec.system, spec.priors, spec.noise_std, kept)
+        training = training_of(data, spec.system, spec.priors, spec.noise_std, kept, spec.standardize)
         return in_motion(spec.system, training) if spec.learns_torque_noise else (training, ())
 
     def adopt(self, fitted: StructuredFit) -> StructuredFit:

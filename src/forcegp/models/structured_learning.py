@@ -3,7 +3,8 @@
 1. Samples at rest say nothing but that friction is below a limit, and impacts break the equations of motion;
    robots that are measured learn from motion without impacts.
 2. Hyperparameters are learned on a part of a long log, or on all of a short one.
-3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more.
+3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more;
+   unless a `DisturbancePrior` explains them.
 4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
 5. The noise of the torque is enlarged to what held-out stretches of the training log ask for.
 6. The posterior is conditioned on all samples.
@@ -34,6 +35,7 @@ from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.start import Search
+from forcegp.forces.student_t import left_out, weighted
 from forcegp.forces.torque_noise import TORQUE_NOISE
 from forcegp.gp.likelihood import require_exact_fits
 from forcegp.gp.optimise import Learned, Progress
@@ -51,6 +53,8 @@ FEWEST_MOVING = 20
 """With fewer samples in motion, samples at rest are kept."""
 VOLUME_STATES = 100
 """States that the volume of the noise is averaged over."""
+ROUNDS = 3
+"""Rounds of the weights of samples under heavy-tailed noise and of the hyperparameters with them."""
 FIRST_POWER = 0.25
 """Power of the likelihood before the correlation of its residuals is known."""
 
@@ -124,20 +128,33 @@ def solve(
     part = subset(spec, problem)
     if part.inducing is None:
         require_exact_fits(part.fixed_rows.blocks)
-    correlated = spec.learns_torque_noise and TORQUE_NOISE in search.start
+    calibrated = spec.learns_torque_noise and TORQUE_NOISE in search.start
+    correlated = calibrated and not any(prior.in_time for prior in part.priors)
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)
     learned, learned_on = search.solve(part, progress, begin), part.training.samples
     values = {**search.held, **learned.tensors}
+    if spec.degrees_of_freedom is not None:
+        for _ in range(ROUNDS):
+            part = weighted(part, values, spec.degrees_of_freedom)
+            learned = search.solve(part, progress, learned.tensors)
+            values = {**search.held, **learned.tensors}
     if correlated:
         part = dataclasses.replace(part, power=likelihood_power(part, values))
         learned = search.solve(part, progress, learned.tensors)
         values = {**search.held, **learned.tensors}
+    if calibrated:
         part = with_updated_robot(part, values)
         values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
+    if correlated:
         part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
     whole = dataclasses.replace(part, training=problem.training, inducing=None)
-    return Lesson(prepared(spec, whole, values), values, learned, learned_on)
+    whole = prepared(spec, whole, values)
+    warnings = ()
+    if count := left_out(whole):
+        samples = whole.training.samples
+        warnings = (f"{count} of {samples} samples lie far outside the noise and hardly count",)
+    return Lesson(whole, values, learned, learned_on, warnings)
 
 
 def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:
@@ -154,12 +171,15 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """The problem with the inference that its samples ask for."""
-    if not is_sparse(spec.inference, problem.priors, problem.training.all_samples):
+    """The problem with the inference that its samples ask for, and their weights under heavy-tailed noise."""
+    if is_sparse(spec.inference, problem.priors, problem.training.all_samples):
+        if is_finite(problem.priors):
+            problem = without_inducing(problem)
+        else:
+            problem = with_inducing(problem, values, spec.inducing_points)
+    if spec.degrees_of_freedom is None:
         return problem
-    if is_finite(problem.priors):
-        return without_inducing(problem)
-    return with_inducing(problem, values, spec.inducing_points)
+    return weighted(problem, values, spec.degrees_of_freedom)
 
 
 @torch.no_grad()

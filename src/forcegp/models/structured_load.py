@@ -15,13 +15,14 @@ from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.forces.quantities import states
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.sparse_tensors import posterior_of_tensors
 from forcegp.models.base import FitResult
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.models.structured_spec import CLASSES, COLUMNS, Specification, StructuredSettings
+from forcegp.models.structured_spec import CLASSES, COLUMNS, IN_TIME, Specification, StructuredSettings
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode
 from forcegp.storage.folder import ModelHeader, settings_of
@@ -79,6 +80,8 @@ def _specification(
         settings.inference,
         settings.inducing_points,
         state_noise=settings.state_noise,
+        standardize=settings.standardize,
+        degrees_of_freedom=settings.degrees_of_freedom,
     )
 
 
@@ -87,6 +90,7 @@ def _check_types(tensors: Mapping[str, Tensor]) -> None:
     for name, value in tensors.items():
         is_flag = name.startswith("data.") and name.endswith(".active")
         is_count = name.startswith(("sparse.", "central.")) and name.endswith((".components", ".dropped"))
+        is_count |= name.startswith("data.") and name.endswith(".segment")
         fits = value.is_floating_point()
         if is_flag or is_count:
             fits = value.dtype == (torch.bool if is_flag else torch.int64)
@@ -97,9 +101,11 @@ def _check_types(tensors: Mapping[str, Tensor]) -> None:
 def _training(settings: StructuredSettings, spec: Specification, tensors: Mapping[str, Tensor]) -> Training:
     measurements, noise = [], []
     for i, quantity in enumerate(settings.measured):
-        m = Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in COLUMNS})
+        names = COLUMNS + (IN_TIME if any(prior.in_time for prior in spec.priors) else ())
+        m = Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in names})
         n, nq = len(m.values) if m.values.ndim == 2 else -1, spec.system.robot.nq
         shapes = {"q": (n, nq), "qd": (n, nq), "tau": (n, nq), "active": (n, len(spec.system.contacts))}
+        shapes |= {"segment": (n,), "t": (n,)}
         for name, shape in shapes.items():
             if getattr(m, name).shape != shape:
                 raise ValueError(f"tensor 'data.{i}.{name}' has shape {tuple(getattr(m, name).shape)}")
@@ -116,14 +122,21 @@ def _training(settings: StructuredSettings, spec: Specification, tensors: Mappin
         )
         for prior, constant in zip(spec.priors, settings.constant, strict=True)
     )
-    return Training(tuple(measurements), tuple(noise), scales)
+    weights = None
+    if measurements and "data.0.weight" in tensors:
+        weights = tuple(tensors[f"data.{i}.weight"] for i in range(len(measurements)))
+        for i, (m, w) in enumerate(zip(measurements, weights, strict=True)):
+            if w.shape != m.t.shape or not bool((w > 0.0).all()):
+                raise ValueError(f"tensor 'data.{i}.weight' has shape {tuple(w.shape)}, or is not positive")
+    return Training(tuple(measurements), tuple(noise), scales, weights=weights)
 
 
 def _check_hyperparameters(spec: Specification, training: Training, hyper: Mapping[str, Tensor]) -> None:
     """Raise `ValueError` or `KeyError` where hyperparameters are not those of the kernels."""
     for prior, scale in zip(spec.priors, training.scales, strict=True):
         widths = {name: x.shape[-1] for name, x in scale.mean.items()}
-        for key, value in prior.kernel.initial(prior.outputs(spec.system.robot), widths).items():
+        expected = prior.kernel.initial(prior.outputs(spec.system.robot), widths)
+        for key, value in {**expected, **prior.initial_parameters(spec.system.robot)}.items():
             found = hyper[f"{prior.prefix}.{key}"]
             if found.shape != value.shape:
                 raise ValueError(f"hyperparameter '{prior.prefix}.{key}' has shape {tuple(found.shape)}")
@@ -168,14 +181,32 @@ def _correlation(
     return torch.full_like(system.robot.mass, settings.correlation_time)
 
 
+def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors with the inputs of each kernel in the order in which its prior names them.
+
+    A kernel that reads all inputs takes them in their order, which a file does not keep.
+    """
+    system = problem.system
+    rest = torch.zeros(1, system.robot.nq, dtype=system.robot.dtype, device=system.robot.device)
+    closed = torch.ones(1, len(system.contacts), dtype=torch.bool, device=rest.device)
+    at = states(system, rest, rest, rest, closed)
+    named = [
+        f"{p}.inducing.{name}"
+        for p, prior in enumerate(problem.priors)
+        for name in prior.features(system, at)
+    ]
+    return {name: tensors[name] for name in (*named, *tensors) if name in tensors}
+
+
 def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str, Tensor]) -> ForcePosterior:
     """The posterior with its weights or sums as they were."""
     scales, params, coulomb = problem.training.scales, kernel_parameters(hyper), problem.coulomb(hyper)
+    priors = problem.priors_at(hyper)
     if "alpha" not in tensors:
-        kept = {name: _below(tensors, name + ".") for name in ("sparse", "central")}
+        kept = {name: _in_order(problem, _below(tensors, name + ".")) for name in ("sparse", "central")}
         latent = posterior_of_tensors(problem.priors, params, kept["sparse"])
         central = posterior_of_tensors(problem.priors, params, kept["central"]) if kept["central"] else None
-        return ForcePosterior(problem.priors, scales, problem.mean, latent, central, coulomb)
+        return ForcePosterior(priors, scales, problem.mean, latent, central, coulomb)
     blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
     rows = sum(block.rows for block in blocks)
     if alpha.shape != (rows,):
@@ -183,4 +214,4 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
     if problem.pinned:
         return force_posterior(problem, hyper)
     latent = ExactPosterior(problem.priors, params, blocks, alpha)
-    return ForcePosterior(problem.priors, scales, problem.mean, latent, coulomb=coulomb)
+    return ForcePosterior(priors, scales, problem.mean, latent, coulomb=coulomb)

@@ -28,7 +28,9 @@ from forcegp.forces.measurements import (
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.coregional import CoregionalPrior
 from forcegp.forces.priors.default import measured_priors
+from forcegp.forces.priors.disturbance import DisturbancePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
@@ -39,6 +41,7 @@ from forcegp.forces.state_noise import state_std_of
 from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.inducing import LIMIT
+from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sparse_tensors import tensors_of_posterior
 from forcegp.models.base import FitResult
@@ -55,8 +58,11 @@ CLASSES: dict[str, type] = {
     "sum": kernels.Sum,
     "product": kernels.Product,
     "constant": kernels.Constant,
+    "ornstein_uhlenbeck": OrnsteinUhlenbeck,
     "joint": JointForcePrior,
     "joint_friction": JointFrictionPrior,
+    "disturbance": DisturbancePrior,
+    "coregional": CoregionalPrior,
     "inertial": InertialPrior,
     "normal": NormalForcePrior,
     "payload": PayloadPrior,
@@ -70,6 +76,8 @@ INERTIAS = ("file", "auto")
 """Where the inertia of the robot is from."""
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """What is kept of each measurement."""
+IN_TIME = ("segment", "t")
+"""What is kept beside it where a prior is a function of time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +97,8 @@ class Specification:
         automatic: whether the priors depend on whether the data are simulated or measured.
         state_noise: standard deviations of the noise of q and of q̇, or `None` for none.
         inertia: `"file"`, or `"auto"` where the log may show another one.
+        standardize: whether the inputs of kernels are standardized.
+        degrees_of_freedom: ν of noise with heavy tails, or `None` for Gaussian noise.
     """
 
     system: ConstrainedSystem
@@ -103,6 +113,8 @@ class Specification:
     automatic: bool = False
     state_noise: tuple[NoiseStd, NoiseStd] | None = None
     inertia: str = "file"
+    standardize: bool = True
+    degrees_of_freedom: float | None = None
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
         """The specification with what was left to the data filled in.
@@ -208,6 +220,8 @@ class StructuredSettings(Settings):
     state_noise: tuple[Stated, Stated] | None
     inference: Literal["auto", "exact", "sparse"]
     inducing_points: PositiveInt = LIMIT
+    standardize: bool = True
+    degrees_of_freedom: float | None = Field(default=None, gt=2.0)
     power: float = Field(gt=0.0, le=1.0)
     correlation_time: float = Field(default=0.0, ge=0.0)
     priors: tuple[dict[str, Any], ...]
@@ -248,6 +262,8 @@ def pack(
         state_noise=None if spec.state_noise is None else tuple(map(plain, spec.state_noise)),  # pyright: ignore[reportArgumentType]
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
         inducing_points=spec.inducing_points,
+        standardize=spec.standardize,
+        degrees_of_freedom=spec.degrees_of_freedom,
         power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
@@ -263,7 +279,7 @@ def pack(
     if problem.correlation is not None:
         tensors["torque_correlation"] = problem.correlation
     if isinstance(latent, ExactPosterior):
-        tensors |= {"alpha": latent.alpha, **_tensors_of(training)}
+        tensors |= {"alpha": latent.alpha, **_tensors_of(training, any(p.in_time for p in spec.priors))}
     else:
         assert isinstance(latent, SparsePosterior)
         tensors |= {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
@@ -278,12 +294,14 @@ def pack(
     return settings, tensors
 
 
-def _tensors_of(training: Training) -> dict[str, Tensor]:
-    """The data of an exact posterior."""
+def _tensors_of(training: Training, in_time: bool) -> dict[str, Tensor]:
+    """The data of an exact posterior, with their times where a prior reads them."""
     tensors = {}
     for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
-        tensors |= {f"data.{i}.{name}": getattr(m, name) for name in COLUMNS}
+        tensors |= {f"data.{i}.{name}": getattr(m, name) for name in COLUMNS + (IN_TIME if in_time else ())}
         tensors[f"data.{i}.noise_std"] = std
+        if training.weights is not None:
+            tensors[f"data.{i}.weight"] = training.weights[i]
     return tensors
 
 

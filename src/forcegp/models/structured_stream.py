@@ -70,15 +70,29 @@ def sample_of(spec: Specification, stream: StreamedDataset) -> Sample:
     if first is not None and spec.for_data(first).learns_torque_noise:
         data, count = spaced_sample(stream.pieces(), SAMPLE_ROWS, moving_rows)
         if count >= FEWEST_MOVING:
+            _check_inference(spec, count, len(data))
             return Sample(stream, data, count, moving=True)
     data, count = spaced_sample(stream.pieces(), SAMPLE_ROWS)
-    if spec.inference == "exact" and count > len(data):
+    _check_inference(spec, count, len(data))
+    return Sample(stream, data, count, moving=False)
+
+
+def _check_inference(spec: Specification, count: int, held: int) -> None:
+    """Raise `ModelError` where exact inference is needed on more samples than are held at once."""
+    if spec.degrees_of_freedom is not None and count > held:
+        raise ModelError(
+            "noise with heavy tails weighs every sample, also of a log that is read piece by piece",
+            expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",
+            got=f"{count:,}",
+            hint="select rows, or leave degrees_of_freedom out",
+        )
+    coupled = any(prior.in_time for prior in spec.priors)
+    if (spec.inference == "exact" or coupled) and count > held:
         raise ModelError(
             f"exact inference on a log of {count:,} samples that is read piece by piece",
             expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",
-            hint='use inference="sparse"',
+            hint="select rows" if coupled else 'use inference="sparse"',
         )
-    return Sample(stream, data, count, moving=False)
 
 
 def neighbours_of(spec: Specification, sample: Sample, training: Training) -> Training | None:
@@ -225,6 +239,7 @@ def _restored(
     expected = _tensors(basis, Totals.zero(problem, basis))
     if {k: x.shape for k, x in tensors.items()} != {k: x.shape for k, x in expected.items()}:
         raise ModelError("the checkpoint's sums do not fit the model", hint="remove it to start anew")
+    tensors = {name: tensors[name] for name in expected}  # kernel inputs in their order
     own = basis_of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
     found = {
         name: Sums(*(tensors[f"{name}.{i}"] for i in range(len(fields(Sums)))))

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from forcegp.paper import figures
-from forcegp.paper.fits import Fit, fit_model, score_fit
+from forcegp.paper.fits import EXACT_MODELS, Fit, fit_model, score_fit
 from forcegp.paper.parallel import Job, run_jobs
 from forcegp.paper.profiles import Profile
 from forcegp.paper.results import GP_MODELS, PAPER_KERNELS, SPLITS
@@ -32,7 +32,8 @@ def models_of(sizes: Profile, split: str) -> list[tuple[str, int]]:
     found = [(name, sizes.baseline_points) for name in ("analytical", *sizes.networks) if baselines]
     for points in sizes.sizes:
         papers = PAPER_KERNELS.values() if points <= sizes.paper_kernels_up_to else ()
-        found += [(name, points) for name in (*GP_MODELS, *papers)]
+        names = EXACT_MODELS if sizes.exact else (*GP_MODELS, *papers)
+        found += [(name, points) for name in names]
     if split == "stretches":
         structured = [name for name in GP_MODELS if name != "gp"]
         found += [(name, points) for points in sizes.sparse_sizes for name in structured]
@@ -48,7 +49,7 @@ def fits_of(
         if most is not None and points > most:
             break
         before = fits[-1] if fits and fits[-1].points >= LARGE else None
-        fits.append(fit_model(stages, task, name, split, points, before))
+        fits.append(fit_model(stages, task, name, split, points, before, exact=sizes.exact))
     return fits
 
 

@@ -36,18 +36,34 @@ TASK = (
 """What `UNKNOWN` means, said once on every page."""
 
 
+EXACT = (
+    "The Gaussian processes of this profile are the paper's: its kernel alone on inputs in their units, the "
+    "marginal likelihood without priors on hyperparameters, ADAM with the learning rate 0.2. The paper does "
+    "not state where learning starts or when it counts as converged; here length-scales start at the square "
+    "root of the number of inputs, and learning stops after 50 evaluations without improvement, or 500."
+)
+"""What the profile `paper-exact` takes from the paper, and what it had to choose."""
+
+
+def about_task(results: Results) -> str:
+    """What is not known of the paper's task, and of its models where these are compared."""
+    return f"{TASK} {EXACT}" if results.exact else TASK
+
+
 def learning_block(results: Results, paper: PaperNumbers) -> Block:
     """The learning curves under their caption."""
     pictures = [
         draw_learning_curve(results, paper, split, kind) for kind in ("noisy", "clean") for split in SPLITS
     ]
+    ours = "Solid: our default kernels. Long dashes: the paper's kernel alone."
+    if results.exact:
+        ours = "Solid: the paper's models, learned here."
     seeds = len(results.seeds)
     spread = f" Lines are means over {seeds} seeds, bands their range." if seeds > 1 else ""
     return Block(
         "Learning curves (main paper, error over N)",
-        "Mean absolute error over the number of training points, and the mean constraint residual. Solid: "
-        "our "
-        "default kernels. Long dashes: the paper's kernel alone. Short dashes: the paper's curves, read off "
+        "Mean absolute error over the number of training points, and the mean constraint residual. "
+        f"{ours} Short dashes: the paper's curves, read off "
         "its plots, where they are comparable: noisy accelerations on its own split, and the residual. "
         f"Dotted: the mean magnitude of the noise.{spread}",
         (*pictures, draw_residual(results, paper, "stretches")),

@@ -8,7 +8,7 @@ from forcegp.paper.covariance import covariance_block
 from forcegp.paper.figures import FigureData
 from forcegp.paper.identification import identification_block, identification_finding
 from forcegp.paper.learning import (
-    TASK,
+    about_task,
     against_paper,
     curve_table,
     draw_learning_curve,
@@ -61,7 +61,7 @@ def render_page(results: Results, figures: FigureData, view: str | None = None) 
         results=results,
         paper=paper,
         view=view,
-        task=TASK,
+        task=about_task(results),
         opening=_opening(results, paper, figures),
         tables=_tables(results, paper),
         findings=findings(results, paper, figures),
@@ -129,7 +129,8 @@ def render_markdown(results: Results, figures: FigureData) -> str:
     said = findings(results, paper, figures)
     parts = [
         "# Results",
-        f"Written by `forcegp reproduce --profile {results.profile}`; do not edit. {paper.source} {TASK}",
+        f"Written by `forcegp reproduce --profile {results.profile}`; do not edit. {paper.source} "
+        f"{about_task(results)}",
         tables["overview"],
         "## Findings",
         "\n".join(f"- **{f.topic}**{VERDICT[f.agrees]}. {f.text}" for f in said),

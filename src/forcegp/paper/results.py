@@ -81,6 +81,11 @@ class Results(Header):
     scores: list[Score]
 
     @property
+    def exact(self) -> bool:
+        """Whether the Gaussian processes are the paper's in every respect that it states."""
+        return self.settings.get("exact") == "True"
+
+    @property
     def models(self) -> list[str]:
         """The models that were scored, in order."""
         return list(dict.fromkeys(s.model for s in self.scores))

@@ -52,6 +52,9 @@ class RolloutOptions:
         speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
         torque_noise: whether function samples are driven by torques with noise drawn anew for each of them,
             where the model has learned the noise of logged torques and its correlation in time.
+        sticking: whether dry friction of joints (of the robot file, or of a prior such as
+            `JointFrictionPrior`) holds a joint at rest while the net force is within its limit; otherwise it
+            is the smooth function of the velocity that models learn, which lets joints creep.
         on_divergence: `raise` a `DivergedError` that holds the trajectories, or `keep` them.
 
     Example:
@@ -70,6 +73,7 @@ class RolloutOptions:
     interpolation: str = "hold"
     speed_limit: float = 100.0
     torque_noise: bool = True
+    sticking: bool = True
     on_divergence: str = "raise"
 
     def __post_init__(self) -> None:
@@ -221,7 +225,7 @@ def _run(
     if noise is not None:
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
     mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
-    problem = Problem(mechanics, law, inputs, unilateral)
+    problem = Problem(mechanics, law, inputs, unilateral, options.sticking)
     system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
     closed = torch.ones(n, len(system.contacts), dtype=torch.bool, device=q.device)

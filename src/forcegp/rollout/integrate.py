@@ -108,7 +108,7 @@ class _Record:
         """Keep a state; NaN in the rows `(n,)` that were dropped."""
         if not bool(alive.all()):
             rows = alive[:, None]
-            now = Evaluation(*(torch.where(rows, x, torch.nan) for x in now))
+            now = Evaluation(*(torch.where(rows, x, torch.nan) for x in now[:-1]))  # pyright: ignore[reportArgumentType]
             state = state._replace(
                 q=torch.where(rows, state.q, torch.nan), qd=torch.where(rows, state.qd, torch.nan)
             )
@@ -146,7 +146,7 @@ def integrate(
     Returns:
         The trajectories, batch `(n,)`; shorter than asked for if all diverged.
     """
-    record, state = _Record(), start
+    record, state, step = _Record(), start, _stopping(step)
     alive = torch.ones(len(start.q), dtype=torch.bool, device=start.q.device)
     h = torch.full_like(start.t, dt)
     for k in range(steps + 1):
@@ -185,6 +185,19 @@ def _stepped(
     after, events = advance(problem, step, state, now, h)
     record.note(events, alive)
     return after
+
+
+def _stopping(step: Step) -> Step:
+    """The method, with joints at rest that dry friction stops within the step, up to its error."""
+
+    def stopped(problem: Problem, state: State, first: Evaluation, h: Tensor) -> State:
+        reached = step(problem, state, first, h)
+        if first.held is None:
+            return reached
+        slowed = (reached.qd.abs() <= 0.5 * state.qd.abs()) | (state.qd == 0.0)
+        return reached._replace(qd=torch.where(first.held & slowed & (h > 0.0), 0.0, reached.qd))
+
+    return stopped
 
 
 def _survivors(

@@ -14,10 +14,12 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.errors import ModelError
+from forcegp.forces.dry_friction import DryFriction, TotalForce, split
 from forcegp.forces.quantities import States
 from forcegp.rollout.inputs import Inputs, Reached
+from forcegp.rollout.sticking import at_the_end, dry_friction_force, overshooting
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]
 """The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""
@@ -105,6 +107,18 @@ class Law(ABC):
     def motion(self, system: ConstrainedSystem, at: States) -> Motion:
         """Acceleration and multiplier at states."""
 
+    def dry_friction(self, system: ConstrainedSystem, at: States) -> DryFriction | None:
+        """Forces with the dry friction of joints apart; `None` where there is none."""
+        return None
+
+
+def under(eom: Equations, Q_bar: Tensor) -> Motion:
+    """The constrained motion under an impressed force `(n, nq)`."""
+    free = eom.free_acceleration(Q_bar)
+    missing = eom.b - (eom.A @ free[..., None])[..., 0]
+    multiplier = (eom.constraint_inertia @ missing[..., None])[..., 0]
+    return Motion(free + (eom.M_inv_At @ multiplier[..., None])[..., 0], multiplier)
+
 
 @dataclass(frozen=True)
 class ForceLaw(Law):
@@ -114,11 +128,12 @@ class ForceLaw(Law):
     has_multiplier: bool = True
 
     def motion(self, system: ConstrainedSystem, at: States) -> Motion:
-        eom = at.eom
-        free = eom.free_acceleration(self.force(system, at))
-        missing = eom.b - (eom.A @ free[..., None])[..., 0]
-        multiplier = (eom.constraint_inertia @ missing[..., None])[..., 0]
-        return Motion(free + (eom.M_inv_At @ multiplier[..., None])[..., 0], multiplier)
+        return under(at.eom, self.force(system, at))
+
+    def dry_friction(self, system: ConstrainedSystem, at: States) -> DryFriction | None:
+        if isinstance(self.force, TotalForce):
+            return self.force.split(system, at)
+        return split(system, at, self.force)
 
 
 @dataclass(frozen=True)
@@ -182,6 +197,8 @@ class Evaluation(NamedTuple):
     Attributes:
         tau, qdd: `(n, nq)` motor torque and acceleration.
         multiplier, c, cd: `(n, m)` λ, constraint error and its rate.
+        held: `(n, nq)` joints that stick, or come to rest by the end of the step; `None` without dry
+            friction.
     """
 
     tau: Tensor
@@ -189,6 +206,7 @@ class Evaluation(NamedTuple):
     multiplier: Tensor
     c: Tensor
     cd: Tensor
+    held: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -200,20 +218,36 @@ class Problem:
         law: gives the acceleration.
         inputs: give the torque.
         unilateral: whether contacts with a surface can open and close.
+        sticking: whether dry friction holds joints at rest, rather than being smooth.
     """
 
     system: ConstrainedSystem
     law: Law
     inputs: Inputs
     unilateral: bool
+    sticking: bool = False
 
     def evaluate(self, state: State, end: Tensor) -> Evaluation:
         """The motion at a state, within a step that ends at `end` `(n, 1)`."""
         eom = self.system.equations(state.q, state.qd, state.active)
         tau = self.inputs.torque(state.t, end, Reached(self.system, eom, state.q, state.qd))
         at = States(state.q, state.qd, tau, state.active, eom)
-        qdd, multiplier = self.law.motion(self.system, at)
-        return Evaluation(tau, qdd, multiplier, eom.c, eom.cd)
+        dry = self.law.dry_friction(self.system, at) if self.sticking else None
+        if dry is None:
+            qdd, multiplier = self.law.motion(self.system, at)
+            return Evaluation(tau, qdd, multiplier, eom.c, eom.cd)
+        free, h = under(eom, dry.Q_bar).qdd, end - state.t
+        G = eom.H if dry.response is None else eom.H @ dry.response
+        damping = overshooting(G, dry.damping, h)
+        if damping is not None:
+            free, G = at_the_end(free, G, damping, h)
+        force, held, stopping = dry_friction_force(free, G, dry.limit, state.qd, h)
+        if damping is not None:
+            force = force - h * damping * (free + (G @ force[..., None])[..., 0])
+        impressed = force if dry.response is None else (dry.response @ force[..., None])[..., 0]
+        qdd, multiplier = under(eom, dry.Q_bar + impressed)
+        qdd = torch.where(held, stopping, qdd)  # the same but for rounding
+        return Evaluation(tau, qdd, multiplier, eom.c, eom.cd, held)
 
 
 Step = Callable[[Problem, State, Evaluation, Tensor], State]

@@ -40,6 +40,7 @@ class LearningSection(Section):
     warm_start: Literal[False] | PositiveInt = False
     restarts: NonNegativeInt = 0
     seed: NonNegativeInt = 0
+    hyperpriors: bool = True
     epochs: PositiveInt = 1
     batch: PositiveInt = 1
     held_out: PositiveFloat = 0.1
@@ -65,6 +66,8 @@ class ModelSection(Section):
     inference: Literal["auto", "exact", "sparse"] = "auto"
     inertia: Literal["file", "auto"] = "file"
     inducing_points: PositiveInt = 100
+    standardize: bool = True
+    degrees_of_freedom: PositiveFloat | None = None
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: tuple[dict[str, Any], ...] = ()
     analytical: dict[str, Literal["all"] | tuple[str, ...]] = {}

@@ -6,13 +6,14 @@ A prior says where a force acts, on what it depends and how it varies.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.dynamics import damping_force
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.quantities import AffineMap, States
 from forcegp.gp.features import Standardization
@@ -26,6 +27,9 @@ against the constraint (the range of Aᵀ), which no acceleration in contact sho
 NOISE, ANALYTICAL, COULOMB = "noise", "analytical", "coulomb"
 RESERVED = (NOISE, ANALYTICAL, COULOMB)
 """Prefixes of what is learned beside the hyperparameters of the priors."""
+
+MIXING = "mixing"
+"""Last part of the names of what an operator learns."""
 
 ForceMean = Callable[[ConstrainedSystem, States], Tensor]
 """Prior mean of the joint force Q at states, `(n, nq)`."""
@@ -60,7 +64,8 @@ class AnalyticalMean:
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """The mean of Q at states, `(n, nq)` [N m, N]."""
-        known = {"bias": at.eom.Q_C, "gravity": at.eom.Q_G, "friction": at.eom.Q_D, "actuation": at.tau}
+        Q_D = at.eom.Q_D if at.slip is None else damping_force(system.robot, at.qd, at.slip)
+        known = {"bias": at.eom.Q_C, "gravity": at.eom.Q_G, "friction": Q_D, "actuation": at.tau}
         return sum((known[term] for term in self.terms), start=torch.zeros_like(at.q))
 
 
@@ -92,6 +97,12 @@ class ForcePrior(ABC):
     """Whether Coulomb friction that is proportional to the multiplier goes with the prior."""
     vectors: tuple[str, ...] = ()
     """Inputs whose components are standardized by one scale, as turning the axes must change nothing."""
+    sticks: bool = False
+    """Whether the force has dry friction of joints in it, which `States.slip` tells apart."""
+    in_time: bool = False
+    """Whether the force is a function of time, which couples the samples of a trajectory."""
+    scaled: bool = True
+    """Whether the inputs are standardized."""
     centred: bool = True
     """Whether the mean of the training data is subtracted from the inputs before they are scaled."""
 
@@ -111,6 +122,14 @@ class ForcePrior(ABC):
     @abstractmethod
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         """E(x) `(n, nq, outputs)`."""
+
+    def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
+        """Where learning what the operator E contains begins, by name; nothing for most priors."""
+        return {}
+
+    def with_parameters(self, params: Mapping[str, Tensor]) -> ForcePrior:
+        """The prior with learned parameters of its operator, of those in `initial_parameters`."""
+        return self
 
     def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
         """Raise a typed error where the prior does not fit the system."""

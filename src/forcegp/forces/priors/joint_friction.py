@@ -65,6 +65,7 @@ class JointFrictionPrior(ForcePrior):
     target: str = JOINT
 
     centred = False
+    sticks = True
 
     def __post_init__(self) -> None:
         if not self.speeds or not all(0.0 < v < float("inf") for v in self.speeds):
@@ -74,6 +75,11 @@ class JointFrictionPrior(ForcePrior):
                 got=self.speeds,
             )
 
+    @property
+    def sharpest(self) -> int:
+        """Which Coulomb feature is the dry friction of a joint that may stick."""
+        return self.speeds.index(min(self.speeds))
+
     def outputs(self, robot: RobotModel) -> int:
         return robot.nq
 
@@ -81,6 +87,8 @@ class JointFrictionPrior(ForcePrior):
         v = at.qd[..., None]
         columns = {"velocity": v}
         columns |= {f"coulomb_{i}": torch.tanh(v / speed) for i, speed in enumerate(self.speeds)}
+        if at.slip is not None:
+            columns[f"coulomb_{self.sharpest}"] = at.slip[..., None]
         if self.load:
             columns["load"] = at.eom.Q_G.abs()[..., None] * columns["coulomb_0"]
         return columns

@@ -1,0 +1,103 @@
+"""Noise with heavy tails: a sample's noise is that of a Student t distribution, as a scale mixture.
+
+Impacts, dropped packets and shocks of a gear break the equations of motion for a few samples, and under a
+Gaussian likelihood these decide what is learned. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and w_i ~ Γ(ν/2, ν/2) the
+noise of sample i, d numbers that share one w_i, has a t distribution with ν degrees of freedom. Given the
+weights all is Gaussian, so inference stays exact. Expectation maximisation alternates learning with
+
+    w_i = (ν + d) / (ν + E[r_iᵀ Σ_i⁻¹ r_i]),
+
+r_i the residual under the posterior: samples far outside the noise count for next to nothing (Lange, Little
+and Taylor, *Robust statistical modeling using the t distribution*, 1989).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import ModelError
+from forcegp.forces.coulomb import coupled
+from forcegp.forces.inference import force_posterior
+from forcegp.forces.learn import Problem
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.quantities import affine_map
+from forcegp.forces.state_noise import state_jacobian
+
+STEPS = 5
+"""Steps of the weights at given hyperparameters; each needs one posterior."""
+CHUNK_STATES = 1024
+"""Samples whose residuals are computed at a time."""
+IGNORED = 0.1
+"""A sample of less weight is counted as left out."""
+
+
+def check_degrees(degrees: float | None) -> float | None:
+    """Degrees of freedom ν, or `None` for Gaussian noise.
+
+    Raises:
+        ModelError: ν is not above 2, where the noise has no variance.
+    """
+    if degrees is not None and not 2.0 < degrees < float("inf"):
+        raise ModelError(
+            "the degrees of freedom of the noise are not valid",
+            expected="a finite number above 2, or None for Gaussian noise",
+            got=degrees,
+        )
+    return degrees
+
+
+@torch.no_grad()
+def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> Problem:
+    """The problem with the weights of its samples after `STEPS` steps, from those that it has.
+
+    Args:
+        problem: samples, robot and noise.
+        values: hyperparameters.
+        degrees: ν.
+    """
+    for _ in range(STEPS):
+        posterior = force_posterior(problem, values)
+        weights = tuple(
+            _weights(problem, posterior, values, i, degrees)
+            for i in range(len(problem.training.measurements))
+        )
+        problem = dataclasses.replace(
+            problem, training=dataclasses.replace(problem.training, weights=weights)
+        )
+    return problem
+
+
+def left_out(problem: Problem) -> int:
+    """Number of samples that count for next to nothing."""
+    return sum(int((w < IGNORED).sum()) for w in problem.training.weights or ())
+
+
+def _weights(
+    problem: Problem, posterior: ForcePosterior, values: Mapping[str, Tensor], i: int, degrees: float
+) -> Tensor:
+    """Weights of the samples of a measurement `(n,)`."""
+    m, std = problem.training.measurements[i], problem.noise_at(values, i)
+    system, force_noise, coulomb = problem.system_at(values), problem.force_noise(values), posterior.coulomb
+    found = []
+    for first in range(0, len(m.q), CHUNK_STATES):
+        rows = torch.arange(first, min(first + CHUNK_STATES, len(m.q)), device=m.q.device)
+        part = m[rows]
+        at = part.at(system)
+        z = affine_map(system, at, m.quantity)
+        mean, spread = posterior.read(system, at, z)
+        z = coupled(system, at, z, coulomb) if coulomb else z
+        noise = torch.diag_embed((std if std.ndim == 1 else std[rows]).square().expand_as(part.values))
+        if force_noise is not None:
+            noise = noise + (z.B_Q * force_noise(at)[:, None, :]) @ z.B_Q.mT
+        if problem.state_std is not None and (G := state_jacobian(system, part)) is not None:
+            noise = noise + (G * problem.state_std.square()) @ G.mT
+        residual = part.values - mean
+        square = residual[..., None] * residual[:, None, :] + spread
+        L = torch.linalg.cholesky(noise)
+        distance = torch.cholesky_solve(square, L).diagonal(dim1=-2, dim2=-1).sum(-1)
+        found.append((degrees + part.values.shape[-1]) / (degrees + distance))
+    return torch.cat(found)

@@ -1,0 +1,71 @@
+"""A process along time that is independent from one trajectory to the next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import ModelError
+from forcegp.gp.draws import FourierDraw, FunctionDraw
+from forcegp.gp.features import Features
+from forcegp.gp.kernels import LARGEST_EXPONENT, Initial, Kernel, Parameters
+from forcegp.gp.structured_covariance import points
+
+TIME, SEGMENT = "time", "segment"
+"""Names of its inputs: time [s], and the number of the trajectory, each `(n, 1)`."""
+
+
+@dataclass(frozen=True)
+class OrnsteinUhlenbeck(Kernel):
+    """k = σ² exp(−|t − t′|/T) within a trajectory, and 0 between two (Rasmussen and Williams, eq. B.28).
+
+    Args:
+        time: T at which learning begins [s].
+
+    Example:
+        >>> import torch
+        >>> kernel = OrnsteinUhlenbeck(time=2.0)
+        >>> x = {"time": torch.tensor([[0.0], [2.0], [2.0]]), "segment": torch.tensor([[0.0], [0.0], [1.0]])}
+        >>> kernel.covariance(kernel.initial(1, {}), x, x)[0, 0].tolist()
+        [1.0, 0.36787944117144233, 0.0]
+
+    Raises:
+        ModelError: the time is not positive.
+    """
+
+    time: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.time < float("inf"):
+            raise ModelError(
+                "a correlation time must be positive", expected="a positive finite time [s]", got=self.time
+            )
+
+    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
+        return {
+            "log_time": torch.full((outputs,), math.log(self.time), dtype=torch.float64),
+            "log_std": torch.zeros(outputs, dtype=torch.float64) + log_std,
+        }
+
+    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        apart = (x1[TIME] - x2[TIME].mT).abs()
+        together = x1[SEGMENT] == x2[SEGMENT].mT
+        rate = torch.exp(-params["log_time"])[:, None, None]
+        decay = torch.exp(-(apart * rate).clamp(max=LARGEST_EXPONENT))
+        return torch.exp(2.0 * params["log_std"])[:, None, None] * torch.where(together, decay, 0.0)
+
+    def diagonal(self, params: Parameters, x: Features) -> Tensor:
+        return torch.exp(2.0 * params["log_std"])[:, None].expand(-1, points(x))
+
+    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+        # The spectral density is a Cauchy density. Over uniform frequencies u, the mean of cos(u(s − s′)) is
+        # zero for whole numbers s ≠ s′, so that trajectories are independent.
+        rate = torch.exp(-params["log_time"])
+        uniform = torch.rand(len(rate), features, 3, dtype=torch.float64, generator=generator).to(rate)
+        in_time = torch.tan(math.pi * (uniform[..., 0] - 0.5)) * rate[:, None]
+        omega = torch.stack([in_time, 2.0 * math.pi * uniform[..., 1]], dim=-1)
+        return FourierDraw((TIME, SEGMENT), omega, 2.0 * math.pi * uniform[..., 2], params["log_std"].exp())

@@ -1,0 +1,206 @@
+"""Joints that stick: against MuJoCo's friction loss, closed forms, and the conditions of the problem."""
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+import forcegp
+from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.rollout import DivergedError, ForceLaw, RolloutOptions, rollout
+from forcegp.rollout.sticking import dry_friction_force
+
+LIMITS = (2.0, 0.7)
+DT = 2e-3
+DOUBLE = f"""
+<mujoco><compiler angle="radian"/><option timestep="{DT}" integrator="Euler" iterations="200"
+    tolerance="1e-12">
+  <flag eulerdamp="disable"/></option>
+  <default><joint type="hinge" axis="0 1 0" solimpfriction="0.99999 0.99999 0.001"
+    solreffriction="{2 * DT} 1"/></default>
+  <worldbody><body><joint name="shoulder" frictionloss="{LIMITS[0]}"/>
+    <inertial pos="0 0 -0.5" mass="1" diaginertia="0.0834 0.0834 0.0002"/>
+    <body pos="0 0 -1"><joint name="elbow" frictionloss="{LIMITS[1]}"/>
+      <inertial pos="0 0 -0.5" mass="1" diaginertia="0.0834 0.0834 0.0002"/>
+    </body></body></worldbody></mujoco>
+"""
+TOLERANCE = {"semi_implicit_euler": 1e-4, "rk4": 2.0 * DT}
+"""The same step as MuJoCo's, up to its compliance; another method up to that step's order [rad, rad/s]."""
+ANALYTICAL = ForceLaw(AnalyticalMean())
+
+
+@pytest.fixture
+def pendulum(tmp_path: Path) -> forcegp.ConstrainedSystem:
+    """Two links with dry friction in both joints, hanging along −z."""
+    path = tmp_path / "double.xml"
+    path.write_text(DOUBLE)
+    return forcegp.ConstrainedSystem(forcegp.load_robot(path))
+
+
+def in_mujoco(q0: Tensor, qd0: Tensor, tau: Tensor, xml: str = DOUBLE) -> tuple[Tensor, Tensor]:
+    """Position and velocity before each step under torques `(steps, 2)`."""
+    model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    data.qpos[:], data.qvel[:] = q0, qd0
+    states = []
+    for torque in tau.numpy():
+        states.append((data.qpos.copy(), data.qvel.copy()))
+        data.qfrc_applied[:] = torque
+        mujoco.mj_step(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+    q, qd = (torch.from_numpy(np.stack(part)) for part in zip(*states, strict=True))
+    return q, qd
+
+
+def rolled(system: forcegp.ConstrainedSystem, q0: Tensor, qd0: Tensor, tau: Tensor, **options):
+    settings = RolloutOptions(dt=DT, **options)
+    return rollout(ANALYTICAL, system, q0, qd0, tau, DT * (len(tau) - 1), options=settings)
+
+
+def pair(first: float, second: float) -> Tensor:
+    return torch.tensor([first, second], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("method", ["semi_implicit_euler", "rk4"])
+def test_a_ramp_breaks_a_joint_away_where_it_does_in_mujoco(pendulum, method: str) -> None:
+    """The torque of the shoulder rises through its limit; the elbow sticks on for a while."""
+    tau = torch.zeros(300, 2, dtype=torch.float64)
+    tau[:, 0] = torch.linspace(0.0, 3.0, 300, dtype=torch.float64)
+    q, qd = in_mujoco(pair(0, 0), pair(0, 0), tau)
+    found = rolled(pendulum, pair(0, 0), pair(0, 0), tau, method=method)
+    first = int((found.qd[:, 0] != 0.0).double().argmax())
+    assert first == pytest.approx(2.0 / 3.0 * 299, abs=2), "where the ramp reaches 2 N m, and not before"
+    assert float(qd[-1].abs().max()) > 0.03
+    assert float((found.q - q).abs().max()) < TOLERANCE[method]
+    assert float((found.qd - qd).abs().max()) < TOLERANCE[method]
+
+
+@pytest.mark.parametrize("method", ["semi_implicit_euler", pytest.param("rk4", marks=pytest.mark.slow)])
+def test_both_joints_come_to_rest_where_they_do_in_mujoco(pendulum, method: str) -> None:
+    tau = torch.zeros(450, 2, dtype=torch.float64)
+    tau[:100, 0], tau[50:120, 1] = 4.0, -1.5
+    q, qd = in_mujoco(pair(0.0, 0.05), pair(0.4, -1.0), tau)
+    found = rolled(pendulum, pair(0.0, 0.05), pair(0.4, -1.0), tau, method=method)
+    assert float(qd[-1].abs().max()) < 1e-4 and float(qd[1:].abs().amax()) > 0.3
+    assert not bool(found.qd[-1].any()), "at rest, exactly"
+    assert float((found.q - q).abs().max()) < TOLERANCE[method]
+
+
+def test_smooth_friction_lets_a_joint_creep_that_dry_friction_holds(pendulum) -> None:
+    tau = torch.zeros(50, 2, dtype=torch.float64)
+    q0 = pair(0.1, 0.0)  # the weight of the two links at 0.1 rad is 1.96 N m, of the second 0.49 N m
+    held = rolled(pendulum, q0, pair(0, 0), tau)
+    assert torch.equal(held.q, q0.expand_as(held.q))
+    assert not bool(held.qdd.any())
+    creeping = rolled(pendulum, q0, pair(0, 0), tau, sticking=False)
+    assert float((creeping.q[-1] - q0).abs().max()) > 1e-3
+
+
+def test_stiff_viscous_friction_is_that_of_mujocos_implicit_step(pendulum) -> None:
+    """A damper that an explicit step would turn round: h D/I = 4.8; MuJoCo takes it at the step's end."""
+    damping = (1.0, 200.0)
+    xml = DOUBLE.replace('<flag eulerdamp="disable"/>', "")
+    for limit, own in zip(LIMITS, damping, strict=True):
+        xml = xml.replace(f'frictionloss="{limit}"', f'damping="{own}"')
+    tau = torch.zeros(300, 2, dtype=torch.float64)
+    tau[:, 0] = 2.0 * torch.sin(torch.arange(300.0) / 30.0)
+    q0, qd0 = pair(0.3, -0.5), pair(0.2, 1.0)
+    q, qd = in_mujoco(q0, qd0, tau, xml)
+    robot = pendulum.robot.replace(damping=pair(*damping), friction=pair(1e-9, 1e-9))
+    found = rolled(dataclasses.replace(pendulum, robot=robot), q0, qd0, tau)
+    assert float((found.q - q).abs().max()) < 1e-7
+    assert float((found.qd - qd).abs().max()) < 1e-7
+    with pytest.raises(DivergedError):
+        rolled(dataclasses.replace(pendulum, robot=robot), q0, qd0, tau, sticking=False)
+
+
+def test_a_block_in_contact_slides_to_rest_in_closed_form(tmp_path: Path) -> None:
+    """A guide with dry friction F: the block stops after m v²/2F, and holds against less than F."""
+    from rollout_cases import slider
+
+    system = slider(tmp_path)
+    robot = system.robot.replace(friction=pair(6.0, 0.0))
+    system = dataclasses.replace(system, robot=robot)
+    push = torch.zeros(200, 2, dtype=torch.float64)
+    push[120:160, 0], push[160:, 0] = 5.9, 6.6
+    options = RolloutOptions(dt=DT, unilateral=True)
+    found = rollout(ANALYTICAL, system, pair(0, 0), pair(0.4, 0), push, 0.398, options=options)
+    mass = 3.0  # at rest after m v/F = 0.2 s
+    assert float(found.q[150, 0]) == pytest.approx(mass * 0.4**2 / 12.0, abs=0.4 * DT)
+    assert not bool(found.qd[101:160].any())
+    assert float(found.qd[-1, 0]) == pytest.approx(0.6 / mass * 0.078, rel=1e-6)
+    assert not found.events and float(found.multiplier.min()) > 0.0
+
+
+def test_an_arm_pressed_on_a_table_holds_still() -> None:
+    """Seven joints stick in contact, where only six can move: the arm rests, and the table carries it."""
+    from forcegp.constraints.projection import project_state
+    from rollout_cases import arm, simulated
+
+    system = arm()
+    robot = system.robot.replace(friction=torch.full_like(system.robot.mass, 5.0))
+    system = dataclasses.replace(system, robot=robot)
+    q, _ = project_state(system, simulated().data.q[50], torch.zeros(7, dtype=torch.float64))
+    eom = system.equations(q, 0 * q)
+    hold = -eom.Q_G + (eom.A.mT @ torch.tensor([[-20.0]], dtype=torch.float64))[:, 0]
+    still = rollout(ANALYTICAL, system, q, 0 * q, lambda t, q, qd: hold, 0.1)
+    assert float(still.qd.abs().max()) < 1e-9
+    gone = rollout(ANALYTICAL, system, q, 0 * q, lambda t, q, qd: hold + 6.0, 0.05)
+    assert float(gone.qd[-1].abs().max()) > 1e-3
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31 - 1), st.sampled_from([0.0, 1e-4, 1e-2]))
+def test_friction_opposes_as_much_as_it_can(seed: int, h: float) -> None:
+    """|p| ≤ F; p = −F sign(q̇⁺) where a joint slides; q̇⁺ = 0 where |p| < F; with singular G as in contact."""
+    generator = torch.Generator().manual_seed(seed)
+    W = torch.randn(40, 7, 7, dtype=torch.float64, generator=generator)
+    W[20:, :, 0] = 0.0
+    scale = torch.logspace(-1, 1.5, 7, dtype=torch.float64)
+    G = (scale * (W @ W.mT)).mT * scale
+    range_of = G @ torch.randn(40, 7, 1, dtype=torch.float64, generator=generator)
+    qdd, limit = range_of[..., 0], torch.rand(40, 7, dtype=torch.float64, generator=generator)
+    qd = 1e-3 * (G @ torch.randn(40, 7, 1, dtype=torch.float64, generator=generator))[..., 0]
+    qd[::3] = 0.0
+    force, held, _ = dry_friction_force(qdd, G, limit, qd, torch.full((40, 1), h, dtype=torch.float64))
+    after = qdd + (G @ force[..., None])[..., 0] + qd / max(h, 1e-12)
+    size = after.abs() + qdd.abs() + qd.abs() / max(h, 1e-12) + (G.abs() @ limit[..., None])[..., 0]
+    moving = after.abs() > 1e-6 * size
+    assert bool((force.abs() <= limit * (1.0 + 1e-6) + 1e-6).all())
+    assert bool((after[held].abs() <= 1e-6 * size[held]).all())
+    assert torch.allclose(force[moving], (-limit * after.sign())[moving])
+
+
+@pytest.mark.slow
+def test_a_learned_friction_sticks_as_the_true_one_does(pendulum) -> None:
+    """A robot file without friction, a log of MuJoCo's motion with it: where the fit breaks away."""
+    generator = torch.Generator().manual_seed(1)
+    n = 6000
+    t, torque = DT * torch.arange(n, dtype=torch.float64), torch.zeros(n, 2, dtype=torch.float64)
+    for joint, size in enumerate((9.0, 3.0)):
+        rate, phase = torch.rand(2, 6, dtype=torch.float64, generator=generator)
+        tones = torch.sin(2.0 * torch.pi * ((0.2 + 1.3 * rate) * t[:, None] + phase))
+        torque[:, joint] = size * tones.sum(-1) / 6.0**0.5
+    q, qd = in_mujoco(pair(0, 0), pair(0, 0), torque)
+    qdd = qd.diff(dim=0) / DT + 0.05 * torch.randn(n - 1, 2, dtype=torch.float64, generator=generator)
+    rows = torch.arange(0, n - 1, 8)
+    robot = pendulum.robot.replace(friction=pair(0, 0))
+    log = forcegp.Dataset(
+        t=t[rows], q=q[rows], qd=qd[rows], qdd=qdd[rows], tau=torque[rows], joint_names=robot.joint_names
+    )
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical").fit(log)
+    ramp = torch.zeros(300, 2, dtype=torch.float64)
+    ramp[:, 0] = torch.linspace(0.0, 3.0, 300, dtype=torch.float64)
+    truth, _ = in_mujoco(pair(0, 0), pair(0, 0), ramp)
+    options = RolloutOptions(dt=DT, torque_noise=False)
+    path = fit.rollout(pair(0, 0), pair(0, 0), ramp, DT * 299, samples=10, options=options)
+    assert path.samples is not None
+    assert int((path.qd[:, 0] != 0.0).double().argmax()) == pytest.approx(200, abs=5)
+    assert float((path.q - truth).abs().max()) < 1e-3
+    breaks = (path.samples.qd[..., 0] != 0.0).double().argmax(-1).double()
+    assert float((breaks - 200.0).abs().max()) < 20.0
