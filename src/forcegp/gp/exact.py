@@ -141,7 +141,7 @@ class ExactPosterior:
             return block.target.new_zeros(n, 0, 0)
         parts = [block.target.new_zeros(0, d, d)]
         for own in chunked([block], max(1, CHUNK_COLUMNS // d)):
-            V = torch.linalg.solve_triangular(self.conditioned.L, self._cross(own), upper=False)
+            V = torch.linalg.solve_triangular(self.conditioned.L, self._cross(own).mT, upper=False)
             V = V.reshape(len(V), -1, d).transpose(0, 1)
             prior = V.new_zeros(())
             for process, params, x, W in zip(
@@ -154,14 +154,14 @@ class ExactPosterior:
         return 0.5 * (covariance + covariance.mT)
 
     def _cross(self, new: Block) -> Tensor:
-        """Covariance of the rows with those of another block, `(rows, new rows)`."""
+        """Covariance of the rows of another block with those of the data, `(new rows, rows)`."""
         starts = offsets(self.blocks)
-        cross = new.target.new_zeros(starts[-1], new.rows)
+        cross = new.target.new_zeros(new.rows, starts[-1])
         for p, W in enumerate(new.operators):
             for g, heard in enumerate(self._heard[p]):
                 if heard and bool(W.any()):
-                    k = self.kernels_to_data[p][g](new.features[p]).mT
-                    add_rows(cross[starts[g] : starts[g + 1]], self.blocks[g].operators[p], k, W)
+                    k = self.kernels_to_data[p][g](new.features[p])
+                    add_rows(cross[:, starts[g] : starts[g + 1]], W, k, self.blocks[g].operators[p])
         return cross
 
     def log_likelihood(self) -> Tensor:

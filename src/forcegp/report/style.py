@@ -34,7 +34,6 @@ KINDS = {
 OTHER = "#0072b2"
 """Colour of a model without one of its own; not black, as measurements are."""
 INK = "#222222"
-FAINT = "#b8b8b8"
 AXES = ("#0072b2", "#d55e00", "#007a5e")
 """Colours of the Cartesian axes x, y, z."""
 LABELS = {
