@@ -15,6 +15,7 @@ import forcegp
 from forcegp import dynamics
 from forcegp.checks import Finding, Log, Report
 from forcegp.checks.log import derive
+from forcegp.checks.statistics import intervals
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.data import DataHeader
 from forcegp.errors import RobotFileWarning
@@ -110,6 +111,7 @@ class Fault:
         contact: whether it needs a contact, cannot be planted in one, or neither.
         joint: joint that the finding must list, by index.
         white: whether it needs a log whose header states its white noise.
+        amount: its size as the evidence of `faults-hidden` counts it: rad, degrees, s, or a share.
     """
 
     name: str
@@ -118,6 +120,7 @@ class Fault:
     contact: bool | None = None
     joint: int | None = None
     white: bool = False
+    amount: float = 0.0
 
 
 def _change(
@@ -297,8 +300,10 @@ def _surface(change: Callable[[Plane], Plane]) -> Callable:
 
 
 def _tilt_surface(plane: Plane) -> Plane:
-    a, center = np.radians(1.0), np.array([0.5, 0.0, plane.offset])
-    normal = np.array([np.sin(a), 0.0, np.cos(a)])
+    """The plane turned by 1° about the world's y axis through its point below x = 0.5 m."""
+    a, n = np.radians(1.0), np.array(plane.normal)
+    center = np.array([0.5, 0.0, (plane.offset - 0.5 * n[0]) / n[2]])
+    normal = np.array([np.cos(a) * n[0] + np.sin(a) * n[2], n[1], np.cos(a) * n[2] - np.sin(a) * n[0]])
     return Plane(tuple(normal), float(normal @ center))
 
 
@@ -308,19 +313,14 @@ def _label(which: str, seconds: float) -> Callable:
     def plant(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, Rows]:
         name = next(iter(log.contact))
         label, k = log.contact[name].copy(), round(seconds / log.dt)
-        change = np.diff(label.astype(int))
-        if which == "early":
-            start = int(np.flatnonzero(change == 1)[0]) + 1
-            rows = slice(start - k, start)
-        elif which == "late":
-            stop = int(np.flatnonzero(change == -1)[0]) + 1
-            rows = slice(stop, stop + k)
-        elif which == "far":
-            start = int(np.flatnonzero(change == 1)[0]) + 1
-            rows = slice(start - 2 * k, start - k)
-        else:
-            start = int(np.flatnonzero(change == 1)[0]) + 1
-            rows = slice(start + k, start + 3 * k)
+        # A tip that bounces touches for a few rows at a time; the fault is planted at a lasting contact.
+        start, stop = next(span for span in intervals(label) if span[0] > 2 * k and span[1] - span[0] > 3 * k)
+        rows = {
+            "early": slice(start - k, start),
+            "late": slice(stop, stop + k),
+            "far": slice(start - 2 * k, start - k),
+            "missed": slice(start + k, start + 3 * k),
+        }[which]
         label[rows] = which != "missed"
         return system, log.replace(contact={**log.contact, name: label}), (rows.start, rows.stop)
 
@@ -375,17 +375,22 @@ DEG = 180.0 / np.pi
 FAULTS = (
     Fault("a step back in time", "time-backward", _backward),
     Fault("a repeated time stamp", "time-repeated", _repeated),
-    Fault("twelve samples missing", "time-gap", _gap),
-    Fault("a jittering clock", "time-jitter", _jitter),
+    Fault("12 samples missing", "time-gap", _gap),
+    Fault("a clock that jitters by 15 % of its period", "time-jitter", _jitter),
     Fault("milliseconds", "time-unit", _change(t=lambda log: 1e3 * log.t)),
     Fault("a clock 20 % too fast", "time-scale", _change(t=lambda log: 1.2 * log.t)),
-    Fault("NaN in a velocity", "not-finite", _in_rows("qd", 2, 5, lambda x: np.nan * x)),
-    Fault("rows held", "rows-held", _held),
-    Fault("an encoder that stands still", "channel-stuck", _in_rows("q", 3, 60, lambda x: x[0]), joint=3),
-    Fault("a torque that clips", "torque-saturated", _saturated, joint=1),
-    Fault("a spike of the encoder", "spike", _in_rows("q", 3, 1, lambda x: x + 0.3)),
-    Fault("a spike of the torque", "spike", _in_rows("tau", 1, 1, lambda x: x + 60.0)),
-    Fault("rows lost that the clock hides", "position-jump", _missing_rows),
+    Fault("NaN in a velocity for 5 rows", "not-finite", _in_rows("qd", 2, 5, lambda x: np.nan * x)),
+    Fault("8 rows held", "rows-held", _held),
+    Fault(
+        "an encoder that stands still for 60 rows",
+        "channel-stuck",
+        _in_rows("q", 3, 60, lambda x: x[0]),
+        joint=3,
+    ),
+    Fault("a torque that clips at its 97th percentile", "torque-saturated", _saturated, joint=1),
+    Fault("a spike of the encoder by 0.3 rad", "spike", _in_rows("q", 3, 1, lambda x: x + 0.3)),
+    Fault("a spike of the torque by 60 N m", "spike", _in_rows("tau", 1, 1, lambda x: x + 60.0)),
+    Fault("40 rows lost that the clock hides", "position-jump", _missing_rows),
     Fault(
         "degrees",
         "degrees",
@@ -404,13 +409,21 @@ FAULTS = (
         "torque-gain",
         _change(tau=lambda g: g.tau * _joint(g, 3, 1.6, 1.0)),
         joint=3,
+        amount=0.6,
     ),
-    Fault("current", "torque-current", _change(tau=lambda g: g.tau / np.linspace(14.0, 6.0, g.nq))),
-    Fault("a torque offset", "torque-offset", _change(tau=lambda g: g.tau + _joint(g, 3, 3.0)), joint=3),
+    Fault(
+        "current, at 14 to 6 N m/A",
+        "torque-current",
+        _change(tau=lambda g: g.tau / np.linspace(14.0, 6.0, g.nq)),
+    ),
+    Fault(
+        "a torque offset of 3 N m", "torque-offset", _change(tau=lambda g: g.tau + _joint(g, 3, 3.0)), joint=3
+    ),
     Fault(
         "a torque 40 ms late",
         "torque-delay",
         _change(tau=lambda g: np.roll(g.tau, round(0.04 / g.dt), axis=0)),
+        amount=0.04,
     ),
     Fault("torque less gravity", "torque-without-gravity", _without_gravity),
     Fault("torques exchanged", "torque-order", _change(tau=lambda g: g.tau[:, _swap(g, 1, 3)]), joint=1),
@@ -428,40 +441,44 @@ FAULTS = (
         joint=3,
     ),
     Fault(
-        "an encoder off by 0.1 rad", "encoder-offset", _change(q=lambda g: g.q + _joint(g, 3, 0.1)), joint=3
+        "an encoder off by 0.1 rad",
+        "encoder-offset",
+        _change(q=lambda g: g.q + _joint(g, 3, 0.1)),
+        joint=3,
+        amount=0.1,
     ),
     Fault("gravity the wrong way round", "gravity-direction", _gravity(0.0, 0.0, 9.81)),
     Fault("gravity along x", "gravity-direction", _gravity(9.81, 0.0, 0.0)),
-    Fault("a base tilted by 6°", "base-tilted", _robot(_tilted)),
+    Fault("a base tilted by 6°", "base-tilted", _robot(_tilted), amount=6.0),
     Fault(
-        "undeclared friction",
+        "undeclared friction of 3 N m",
         "friction-undeclared",
         _change(tau=lambda g: g.tau + _joint(g, 3, 3.0) * np.tanh(g.qd / 0.01)),
         joint=3,
     ),
-    Fault("masses that do not fit", "masses-mismatch", _robot(_wrong_masses)),
+    Fault("masses × 0.6 and × 1.5", "masses-mismatch", _robot(_wrong_masses), amount=0.45),
     Fault("a tool of 1.5 kg missing", "payload-missing", _lighter(1.5)),
     Fault(
-        "a push of 0.5 s",
+        "a push of 120 rows, 20 to 0.3 N m",
         "disturbance",
         _in_rows("tau", None, 120, lambda x: x + np.linspace(20.0, 0.3, x.shape[1])),
     ),
     Fault("a joint held", "joint-still", _still, contact=False, joint=1),
     Fault(
-        "noise stated too small",
+        "noise stated 5 times too small",
         "noise-understated",
         _change(header=lambda g: g.header.model_copy(update={"noise_std": 0.02})),
         white=True,
     ),
     Fault(
-        "noise stated too large",
+        "noise stated 5 times too large",
         "noise-overstated",
         _change(header=lambda g: g.header.model_copy(update={"noise_std": 0.5})),
         white=True,
     ),
-    Fault("filtered data with white noise stated", "noise-filtered", _filtered, white=True),
+    Fault("data filtered at 0.12 of Nyquist, stated as white", "noise-filtered", _filtered, white=True),
     Fault(
-        "a period that the header does not have",
+        "a header that states 10 ms",
         "period-header",
         _change(header=lambda g: g.header.model_copy(update={"dt": 0.01})),
     ),
@@ -487,8 +504,8 @@ FAULTS = (
     ),
     Fault("contact labelled 0.1 s too early", "contact-early", _label("early", 0.1), contact=True),
     Fault("contact labelled 0.1 s too long", "contact-late", _label("late", 0.1), contact=True),
-    Fault("contact labelled in the air", "contact-far", _label("far", 0.2), contact=True),
-    Fault("contact not labelled", "contact-missed", _label("missed", 0.2), contact=True),
+    Fault("contact labelled in the air for 0.2 s", "contact-far", _label("far", 0.2), contact=True),
+    Fault("contact not labelled for 0.4 s", "contact-missed", _label("missed", 0.2), contact=True),
     Fault("sliding along one line", "force-directions", _one_line, contact=True),
 )
 """Every planted fault."""

@@ -66,7 +66,7 @@ ON_IIWA = (
     "degrees",
     "torque of the wrong sign",
     "joints exchanged",
-    "current",
+    "current, at 14 to 6 N m/A",
     "torque less gravity",
 )
 

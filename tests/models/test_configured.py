@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
+import inspect
+import pkgutil
 import re
 from pathlib import Path
 
@@ -9,19 +13,22 @@ import pytest
 
 from forcegp import CoregionalPrior, DisturbancePrior, LearningOptions
 from forcegp.errors import SceneError, UnknownNameError
-from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.forces import priors
+from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
+from forcegp.gp import kernels
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
 from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
-from forcegp.models.configured import KEYS, Configured, configured
+from forcegp.models.configured import COMMON, KEYS, Configured, configured
 from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import SHALLOW, NeuralNetwork
 from forcegp.models.registry import MODELS
 from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
+from forcegp.models.structured_spec import CLASSES
 from forcegp.scene import load_model_table, load_scene
 from forcegp.scene.model_section import LearningSection, ModelSection
 from logs import random_log
@@ -183,6 +190,36 @@ def test_a_model_that_the_caller_misspells_is_not_blamed_on_the_file(made) -> No
 
 def test_every_kind_of_model_has_its_keys() -> None:
     assert {entry.kind for entry in MODELS.values()} == set(KEYS)
+
+
+@pytest.mark.parametrize("made", [StructuredGP, AnalyticalModel, NeuralNetwork, IndependentGP])
+def test_every_argument_of_a_model_has_a_key(made: type) -> None:
+    """What the constructor takes, a table can give; a new argument needs a key."""
+    named = {"force_priors": "priors", "analytical_parameters": "analytical", "learn": "analytical"}
+    arguments = [name for name in inspect.signature(made).parameters if name != "system"]
+    keys = {*COMMON, *KEYS[made.kind]}
+    assert {named.get(name, name) for name in arguments} <= keys
+    assert keys <= set(ModelSection.model_fields)
+
+
+@pytest.mark.parametrize("options", [LearningOptions, BatchOptions])
+def test_every_option_of_learning_has_a_key(options: type) -> None:
+    assert {field.name for field in dataclasses.fields(options)} <= set(LearningSection.model_fields)
+
+
+def test_every_prior_and_kernel_of_the_library_can_be_described() -> None:
+    """Those that take a function of Python's aside."""
+    described = set(CLASSES.values())
+    for module, base in ((priors, ForcePrior), (kernels, kernels.Kernel)):
+        names = [info.name for info in pkgutil.iter_modules(getattr(module, "__path__", []))]
+        found = [module, *(importlib.import_module(f"{module.__name__}.{name}") for name in names)]
+        made = {
+            part
+            for place in found
+            for part in vars(place).values()
+            if isinstance(part, type) and issubclass(part, base) and not inspect.isabstract(part)
+        }
+        assert {part.__name__ for part in made - described} <= {"OperatorForcePrior"}
 
 
 def test_the_template_is_valid_and_shows_every_key() -> None:

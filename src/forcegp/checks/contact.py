@@ -26,6 +26,10 @@ TOUCH = 2e-4
 """Distance within which a tip touches, at least: surfaces and arms are no stiffer [m]."""
 ROUGH = 8.0
 """Robust standard deviations of the distance in contact within which a tip touches."""
+LANDING = 5
+"""Rows within which a tip that lands stops."""
+STOPS = 2.0
+"""Factor by which a landing tip is faster than one that rests."""
 DRIFT = 2e-3
 """Distance that a tip may gain and lose while it touches: soft ground, a bent arm, a drift [m]."""
 RUN_SECONDS = 0.02
@@ -89,15 +93,15 @@ def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Findin
     if closed.sum() < LEAST_ROWS:
         return []
     found, distance = _placement(contact, path, closed, log)
-    touch = max(TOUCH, ROUGH * float(robust_std(distance[closed])))
-    return [*found, *_labels(contact, path, closed, usable, distance, touch, log)]
+    rough = ROUGH * float(robust_std(distance[closed]))
+    return [*found, *_labels(contact, path, closed, usable, distance, rough, log)]
 
 
 def _placement(
     contact: SurfaceContact, path: Path, closed: np.ndarray, log: Log
 ) -> tuple[list[Finding], Array]:
     """Displacement and tilt of the surface, and the distance from it once they are undone."""
-    offset, tilt, shift = _fit_surface(contact, path, closed)
+    offset, tilt, shift = fit_surface(contact, path, closed)
     rows = intervals(closed)
     name, evidence = contact.name, {"offset_m": offset, "tilt_deg": float(np.degrees(np.linalg.norm(tilt)))}
     distance = path.c - shift
@@ -115,7 +119,7 @@ def _placement(
     return found, distance if found else path.c
 
 
-def _fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
+def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
     """Offset in the middle of the path [m], slope along the surface `(3,)`, distance they make `(n,)`.
 
     Rows that stay off the fit, such as those labelled too early, are trimmed round by round.
@@ -151,10 +155,18 @@ def _labels(
     closed: np.ndarray,
     usable: np.ndarray,
     c: Array,
-    touch: float,
+    rough: float,
     log: Log,
 ) -> list[Finding]:
-    """Rows labelled closed off the surface, by their place in the interval, and open ones that slide."""
+    """Rows labelled closed off the surface, by their place in the interval, and open ones that slide.
+
+    A run is found where the tip is farther off than surfaces and arms give way. It reaches to the row
+    at which the tip moves along the normal no faster than in the rest of the contact.
+    """
+    touch = max(TOUCH, rough)
+    approach = np.abs((path.v * path.normal).sum(axis=1))
+    slow = ROUGH * float(robust_std(approach[closed]))
+    settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     off = closed & (np.abs(c) > touch)
     runs: dict[str, list[tuple[int, int]]] = {"contact-early": [], "contact-late": [], "contact-far": []}
@@ -164,6 +176,13 @@ def _labels(
                 kind = "contact-early" if a == 0 and b < stop - start else "contact-late"
                 inside = (a > 0 and b < stop - start) or (a == 0 and b == stop - start)
                 if inside and float(np.abs(c[start + a : start + b]).max()) <= max(DRIFT, touch):
+                    continue
+                if not inside:
+                    a, b = _until_settled(a, b, settled[start:stop])
+                far = float(np.abs(c[start + a : start + b]).max()) > max(DRIFT, touch)
+                # A tip that lands stops at once; a constraint missed by a little is approached slowly.
+                landing = approach[start + max(a, b - LANDING) : start + b].max()
+                if kind == "contact-early" and not far and landing <= STOPS * slow:
                     continue
                 runs["contact-far" if inside else kind].append((start + a, start + b))
     texts = {
@@ -180,6 +199,13 @@ def _labels(
             text = f"contact {contact.name!r} is {texts[kind]}, {where}"
             found.append(Finding(kind, text, rows, contact=contact.name, evidence={"distance_m": most}))
     return [*found, *_missed(contact, path, usable & ~closed, c, touch, log)]
+
+
+def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
+    """A run at the start or the end of an interval, extended to where the tip settles."""
+    if a == 0:
+        return a, b + int(np.argmax(settled[b:])) if settled[b:].any() else b
+    return (a - int(np.argmax(settled[:a][::-1])) if settled[:a].any() else a), b
 
 
 def _missed(

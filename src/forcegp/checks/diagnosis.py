@@ -25,8 +25,8 @@ SMALL_ANGLE = np.radians(0.5)
 """Encoder offsets below this are within calibration, or an error of a centre of mass [rad]."""
 SMALL_GAIN = 0.2
 """Gains closer to 1 than this may as well be errors of the masses of a robot file."""
-EXPLAINED = 0.3
-"""Share of the torque that a gain may leave unexplained."""
+EXPLAINED = 0.5
+"""Share of the torque that a gain may leave unexplained, as any useful model may."""
 SMALL_TILT = 1.0
 """Bases are levelled to better than this [degrees]."""
 SMALL_GRAVITY = 0.05
@@ -66,10 +66,15 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
     return hypothesis.change(log)
 
 
-def finding_of(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> list[Finding]:
-    """The finding that a hypothesis stands for."""
+def finding_of(
+    system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit, alike: tuple[int, ...] = ()
+) -> list[Finding]:
+    """The finding that a hypothesis stands for; `alike` are the joints of those that explain the same."""
     names = tuple(log.joint_names[j] for j in hypothesis.joints)
     listed = "all joints" if len(names) == log.nq > 1 else " and ".join(names)
+    if hypothesis.name == "joint-sign" and len(alike) > 1:
+        names = tuple(log.joint_names[j] for j in alike)
+        listed = " or ".join(names)
     texts = {
         "torque-sign": f"the torque of {listed} fits the motion with the opposite sign",
         "joint-sign": f"{listed} fits the robot file when it turns the other way",
@@ -97,6 +102,10 @@ def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit
     names = tuple(log.joint_names[j] for j in hypothesis.joints)
     evidence = {f"factor {name}": gain for name, gain in zip(names, gains, strict=True)}
     listed = ", ".join(f"{name} {gain:.3g}" for name, gain in zip(names, gains, strict=True))
+    negative = tuple(name for name, gain in zip(names, gains, strict=True) if gain < 0.0)
+    if negative:
+        text = f"torques fit when multiplied by {listed}: the sign is wrong"
+        return Finding("torque-sign", text, log.all_rows, negative, evidence=evidence)
     factor = np.exp(np.abs(np.log(np.abs(gains) + 1e-12)))
     if 2 * len(names) > log.nq > 1 and np.median(factor) > CURRENT:
         text = f"torques fit when multiplied by {listed}: currents, or torques on the motor side"

@@ -16,12 +16,13 @@ import numpy as np
 
 from forcegp.checks.diagnosis import corrected, finding_of, plausible
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import Fit, Problem, cross_validate, gain_of
+from forcegp.checks.fit import Fit, Problem, cross_validate, gain_of, pooled_gain_of, score_of
 from forcegp.checks.hypotheses import (
     LAGS,
     ROBOT,
     Hypothesis,
     continuous,
+    delays,
     discrete,
     encoder_hypothesis,
     gain_hypothesis,
@@ -43,6 +44,8 @@ SIGNIFICANT = 4.0
 """Standard errors by which the held-out score must drop; there are about a hundred hypotheses."""
 SHARE = 0.03
 """Share of the best drop that a simpler hypothesis may leave to a second round."""
+SAME = 1e-3
+"""Relative difference of errors that are equal."""
 MATERIAL = 0.15
 """Drop of Σ_j log error that matters: 14 % less error in one joint."""
 MATERIAL_EACH = 0.05
@@ -85,8 +88,8 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
         chosen = _best(system, log, rows, problem, kept, prior, taken)
         if chosen is None:
             break
-        hypothesis, fit = chosen
-        found = finding_of(system, log, hypothesis, fit)
+        hypothesis, fit, alike = chosen
+        found = finding_of(system, log, hypothesis, fit, alike)
         findings += found
         taken.add((hypothesis.name, hypothesis.joints))
         if hypothesis.name not in ROBOT:
@@ -135,8 +138,11 @@ def _best(
     kept: Array,
     prior: Array,
     taken: set,
-) -> tuple[Hypothesis, Fit] | None:
-    """The simplest hypothesis within one standard error of the best, if it explains enough."""
+) -> tuple[Hypothesis, Fit, tuple[int, ...]] | None:
+    """The simplest hypothesis within one standard error of the best, if it explains enough.
+
+    The third result lists the joints of those of its kind that explain exactly as much.
+    """
     null = cross_validate(problem, kept, prior)
     tried = [
         (hypothesis, fit)
@@ -145,8 +151,9 @@ def _best(
     ]
     good = []
     for hypothesis, fit in tried:
-        gain = gain_of(fit.score, null.score)
-        if _significant(gain, len(hypothesis.joints) or log.nq) and plausible(system, hypothesis, fit):
+        if significant(fit.shares, null.shares, len(hypothesis.joints) or log.nq) and plausible(
+            system, hypothesis, fit
+        ):
             good.append((hypothesis, fit))
     if not good:
         return None
@@ -156,7 +163,14 @@ def _best(
         loss, error = gain_of(best[1].score, fit.score)
         if loss <= max(error, SHARE * most) + 1e-9:
             near.append((hypothesis, fit))
-    return min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
+    chosen, fit = min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
+    alike = [h.joints for h, other in near if h.name == chosen.name and _same(other, fit)]
+    return chosen, fit, tuple(dict.fromkeys(j for joints in alike for j in joints))
+
+
+def _same(fit: Fit, other: Fit) -> bool:
+    """Whether two fits leave the same errors but for rounding: those of an arm and of its mirror image."""
+    return bool(np.allclose(fit.error, other.error, rtol=SAME, atol=0.0))
 
 
 def _fits(
@@ -166,12 +180,15 @@ def _fits(
     for hypothesis in _promising(system, log, rows, problem) if not len(prior) else ():
         changed = with_log(problem, system, hypothesis.change(log), rows)
         yield hypothesis, cross_validate(changed)
+    for hypothesis in delays(log) if len(prior) else ():
+        # A delay leaves the motion, and with it the columns of the robot's parameters, as they are.
+        yield hypothesis, cross_validate(with_log(problem, system, hypothesis.change(log), rows), kept, prior)
     tried = continuous(system, log, rows) if not len(prior) else robot_hypotheses(system, log, rows)
-    null, off = cross_validate(problem, kept, prior).score, []
+    null, off = cross_validate(problem, kept, prior), []
     for hypothesis in tried:
         fit = _fit(problem, hypothesis, kept, prior)
         yield hypothesis, fit
-        if hypothesis.name == "gains" and _significant(gain_of(fit.score, null), 1):
+        if hypothesis.name == "gains" and significant(fit.shares, null.shares, 1):
             off += hypothesis.joints
     if len(off) > 1:
         together = gain_hypothesis(log, rows, tuple(off))
@@ -186,10 +203,16 @@ def _fit(problem: Problem, hypothesis: Hypothesis, kept: Array, prior: Array) ->
     return cross_validate(problem, columns, np.concatenate([hypothesis.prior, prior]), gains)
 
 
-def _significant(gain: tuple[float, float], concerned: int) -> bool:
-    """Whether a drop of the score matters for the number of joints concerned, and is not due to chance."""
+def significant(better: Array, worse: Array, concerned: int) -> bool:
+    """Whether a drop of the score matters for the number of joints concerned, and is not due to chance.
+
+    Args:
+        better, worse: `(blocks, nq)` errors as shares of the torque.
+        concerned: number of joints.
+    """
     least = max(MATERIAL, MATERIAL_EACH * concerned)
-    return gain[0] > least and gain[0] > SIGNIFICANT * gain[1]
+    gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
+    return gains[0][0] > least and any(gain > SIGNIFICANT * error for gain, error in gains)
 
 
 def _promising(

@@ -38,17 +38,22 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
             rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(ROWS, len(rows))).astype(np.int64))]
             if len(rows) >= LEAST_ROWS:
                 found += _directions(contact, path, log)
-                if log.nq > 3:
-                    force = _force(replace(system, contacts=[contact]), log, rows)
-                    found += _pulls(contact, path, force, rows, log) or _friction(
-                        contact, path, force, rows, log
-                    )
+                force = _force(replace(system, contacts=[contact]), log, rows, path)
+                pulls = _pulls(contact, path, force, rows, log)
+                found += pulls or (_friction(contact, path, force, rows, log) if log.nq > 3 else [])
     return found, log
 
 
-def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Force `(n, 3)` at the touching point that explains the torque best, r = Jᵀ F."""
+def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) -> Array:
+    """Force `(n, 3)` at the touching point that explains the torque best, r = Jᵀ F.
+
+    With three torques or fewer, which any force would explain, it is the best one along the normal, r = Aᵀ λ.
+    """
     left = residual(system, log, rows)
+    if log.nq <= 3:
+        A = left.J[:, 0]
+        size = np.maximum((A * A).sum(axis=1), 1e-12)
+        return ((A * left.r).sum(axis=1) / size)[:, None] * path.normal[rows]
     gram = left.J @ left.J.transpose(0, 2, 1)
     return np.linalg.solve(gram + 1e-9 * np.eye(3), (left.J @ left.r[..., None]))[..., 0]
 

@@ -26,6 +26,8 @@ MOMENT_ARM = 0.1
 """How far centres of mass may be off [m]."""
 TOOL_MASS = 5.0
 """How heavy a tool may be that the robot file lacks [kg]."""
+SHARPER = (2.0, 10.0)
+"""Factors by which dry friction may rise more sharply than declared: its law near rest is rarely known."""
 SLOW = 0.01
 """Sliding speed below which dry friction of a contact is smooth [m/s]."""
 GRAVITY = 10.0
@@ -68,6 +70,13 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
     qd = log.qd[rows]
     smooth = np.tanh(qd / system.robot.friction_velocity.numpy())
     return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
+
+
+def sharper_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
+    """Declared Coulomb friction at parts of its smoothing velocity, less that at all of it `(n, nq, p)`."""
+    x, declared = log.qd[rows] / system.robot.friction_velocity.numpy(), system.robot.friction.numpy() > 0.0
+    columns = [_diagonal(np.tanh(k * x) - np.tanh(x))[..., np.flatnonzero(declared)] for k in SHARPER]
+    return np.concatenate(columns, axis=-1)
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
@@ -134,7 +143,7 @@ def delayed(log: Log, shift: int) -> Log:
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
     """Signs, orders and delays: explanations without a parameter to fit."""
-    every, motion, lags = tuple(range(log.nq)), ("q", "qd", "qdd"), LAGS if log.stretches else ()
+    every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
         yield Hypothesis("torque-sign", 0, partial(flipped, j=slice(None), names=("tau",)), joints=every)
     for j in every:
@@ -144,7 +153,12 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
     for i, j in combinations(every, 2):
         yield Hypothesis("torque-order", 0, partial(swapped, i=i, j=j, names=("tau",)), joints=(i, j))
         yield Hypothesis("joint-order", 0, partial(swapped, i=i, j=j, names=(*motion, "tau")), joints=(i, j))
-    for shift in (sign * lag for lag in lags for sign in (1, -1)):
+    yield from delays(log)
+
+
+def delays(log: Log) -> Iterator[Hypothesis]:
+    """Torques that are logged before or after the motion."""
+    for shift in (sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)):
         yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
 
 

@@ -122,6 +122,7 @@ _TABLE: tuple[tuple[str, str, Severity, str, str], ...] = (
     ("joint-still", "excitation", "warning", "a joint does not move", "move the joint through its range"),
     ("few-reversals", "excitation", "note", "few changes of direction", "reverse each joint several times"),
     ("poor-excitation", "excitation", "note", "parameters not identified", "add the motion stated"),
+    ("faults-hidden", "excitation", "note", "faults too small to be seen", "move these joints more"),
     ("force-directions", "excitation", "warning", "one sliding direction", "slide in several directions"),
 )
 

@@ -10,11 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from forcegp import dynamics
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.limits import DEGREE
 from forcegp.checks.log import Log
+from forcegp.checks.residual import tensors
 from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
@@ -24,7 +27,7 @@ WINDOW = 0.05
 TOLERANCE = 0.05
 """A slope within this of 1 is right: filters and uneven clocks cost a few percent."""
 INSTANT = 0.15
-"""The same for accelerations: at an instant, that of a light damped joint is not its mean over a period."""
+"""The same for accelerations, which change within a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
 EXCHANGED = 0.9
@@ -33,6 +36,10 @@ CLEARLY = 5.0
 """Factor of unexplained variance by which that order must be better."""
 JUMPS = 0.05
 """Largest share of windows that impacts cross: the velocity jumps there, which no acceleration holds."""
+INERTIA_ROWS = 200
+"""Rows at which inertias are computed."""
+ALIKE = 0.02
+"""Slopes of all joints within this of one factor have one cause: the clock."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
 """Seconds over the unit of a clock in ns, µs, ms or ks."""
 UNIT_TOLERANCE = 0.1
@@ -43,7 +50,8 @@ class Match:
     """Changes and integrals of one level, and the slopes between them.
 
     Attributes:
-        change, integral: `(w, nq)` over windows.
+        change, integral: `(w, nq)` over windows, zero where an impact crosses one.
+        whole: both as they are.
         low, high: `(nq,)` bounds of the slope.
         correlation: `(nq,)`.
         moving: `(nq,)` bool, joints whose change stands out from noise.
@@ -51,15 +59,18 @@ class Match:
 
     change: Array
     integral: Array
+    whole: tuple[Array, Array]
     low: Array
     high: Array
     correlation: Array
     moving: np.ndarray
 
-    def right(self, factor: float = 1.0, tolerance: float = TOLERANCE) -> np.ndarray:
-        """`(nq,)` bool, whether a slope can be this factor."""
+    def right(
+        self, factor: float = 1.0, tolerance: float = TOLERANCE, least: Array | float = 1.0
+    ) -> np.ndarray:
+        """`(nq,)` bool, whether a slope can lie between `least` times this factor and the factor."""
         ratio = np.stack([self.low, self.high]) / factor
-        return (ratio.min(axis=0) < 1.0 + tolerance) & (ratio.max(axis=0) > 1.0 - tolerance)
+        return (ratio.min(axis=0) < 1.0 + tolerance) & (ratio.max(axis=0) > least * (1.0 - tolerance))
 
 
 def match(log: Log, value: str, rate: str) -> Match | None:
@@ -74,7 +85,8 @@ def match(log: Log, value: str, rate: str) -> Match | None:
         integrals.append(np.diff(total[::width], axis=0))
     if sum(map(len, changes)) < 20:
         return None
-    change, integral = _without_jumps(np.concatenate(changes), np.concatenate(integrals))
+    whole = np.concatenate(changes), np.concatenate(integrals)
+    change, integral = _without_jumps(*whole)
     cross, own, other = (
         (a * b).sum(axis=0) for a, b in ((change, integral), (integral, integral), (change, change))
     )
@@ -83,7 +95,7 @@ def match(log: Log, value: str, rate: str) -> Match | None:
     speed = np.sqrt(other)
     moving = speed > 1e-3 * speed.max()
     low, high, correlation = np.nan_to_num((low, high, correlation))
-    return Match(change, integral, low, high, correlation, moving)
+    return Match(change, integral, whole, low, high, correlation, moving)
 
 
 def _without_jumps(change: Array, integral: Array) -> tuple[Array, Array]:
@@ -131,11 +143,21 @@ def _check_long_step(log: Log) -> Outcome:
         first = match(log, "q", "qd")
         factor = float(np.median(first.low[first.moving])) if first is not None else 1.0
         near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
-        return _clock_finding(log, factor) if near else ([], log)
+        alike = first is not None and _one_factor(first, factor)
+        return _clock_finding(log, factor) if near or alike else ([], log)
     if log.dt < 1.0:
         return [], log
     text = f"rows are {log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
     return [Finding("time-unit", text, log.all_rows, evidence={"period": log.dt})], log
+
+
+def _one_factor(level: Match, factor: float) -> bool:
+    """Whether several joints share one slope that is neither right nor that of degrees."""
+    degrees = any(abs(np.log(abs(factor) * unit)) <= UNIT_TOLERANCE for unit in (DEGREE, 1.0 / DEGREE))
+    if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or degrees or level.moving.sum() < 2:
+        return False
+    related = np.abs(level.correlation[level.moving]) >= EXCHANGED
+    return bool(related.all() and level.right(factor, ALIKE)[level.moving].all())
 
 
 def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -198,19 +220,19 @@ def _permutation(level: Match) -> np.ndarray | None:
     """The order of rates that fits the changes of all joints where their own does not, if there is one."""
     from scipy.optimize import linear_sum_assignment
 
-    size = np.sqrt((level.change**2).sum(axis=0)), np.sqrt((level.integral**2).sum(axis=0))
+    # Windows without impacts are those in which a joint fits its own rate, which here is the wrong one.
+    change, integral = level.whole
+    size = np.sqrt((change**2).sum(axis=0)), np.sqrt((integral**2).sum(axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        alike = np.nan_to_num(level.change.T @ level.integral / np.outer(*size))
+        alike = np.nan_to_num(change.T @ integral / np.outer(*size))
     _, order = linear_sum_assignment(-alike)
-    moved = order != np.arange(len(order))
+    moved = (order != np.arange(len(order))) & level.moving
     if not moved.any():
         return None
-    fits = alike[np.arange(len(order)), order][moved & level.moving]
-    own = level.correlation[moved & level.moving]
-    if not len(fits) or fits.min() < EXCHANGED:
-        return None
+    fits, own = alike[np.arange(len(order)), order][moved], np.diag(alike)[moved]
     # Joints that move together are alike in any order; the right one leaves far less unexplained.
-    return order if ((1.0 - own**2) > CLEARLY * (1.0 - fits**2)).all() else None
+    better = (1.0 - own**2) > CLEARLY * (1.0 - fits**2)
+    return order if fits.min() >= EXCHANGED and better.all() else None
 
 
 def _follow(log: Log, permutation: np.ndarray) -> Array:
@@ -221,6 +243,21 @@ def _follow(log: Log, permutation: np.ndarray) -> Array:
     return log.qdd[:, permutation] if together else log.qdd
 
 
+def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
+    """`(nq,)` mean acceleration over a period in which the torque is held, over that at its start.
+
+    Viscous friction d slows a joint of inertia m as exp(−d t/m), which leaves (1 − exp(−x))/x, x = d dt/m:
+    after a change of the torque, light damped joints accelerate more than their velocity will change.
+    """
+    (q,) = tensors(log, log.rows(INERTIA_ROWS), "q")
+    if not len(q):
+        return np.ones(log.nq)
+    with torch.no_grad():
+        inverse = torch.linalg.inv(dynamics.mass_matrix(system.robot, q)).diagonal(dim1=-2, dim2=-1)
+    x = np.maximum(system.robot.damping.numpy() * log.dt * inverse.median(dim=0).values.numpy(), 1e-6)
+    return -np.expm1(-x) / x
+
+
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     """Accelerations that are not the derivative of the velocities, beyond what their noise explains."""
     if not log.stretches or log.derived:
@@ -229,7 +266,7 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     if level is None:
         return [], log
     related = np.abs(level.correlation) > 0.3
-    wrong = level.moving & related & ~level.right(tolerance=INSTANT)
+    wrong = level.moving & related & ~level.right(tolerance=INSTANT, least=_held_torque(system, log))
     # An acceleration without relation to the motion shows where its integral is as large as the change.
     size = np.sqrt((level.integral**2).sum(axis=0) / np.maximum((level.change**2).sum(axis=0), 1e-300))
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))

@@ -10,12 +10,19 @@ from forcegp.checks.clock import Outcome
 from forcegp.checks.excitation import still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of
-from forcegp.checks.hypotheses import LAGS, contact_friction_columns, friction_columns, robot_columns
+from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of, robust_parameters
+from forcegp.checks.hypotheses import (
+    LAGS,
+    contact_friction_columns,
+    friction_columns,
+    robot_columns,
+    sharper_friction_columns,
+)
 from forcegp.checks.log import Log
 from forcegp.checks.residual import projector, residual
 from forcegp.checks.smooth import smoothed
 from forcegp.checks.statistics import any_row, describe, intervals
+from forcegp.checks.visibility import check_visibility
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
@@ -61,9 +68,10 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         told = explain(system, smooth.mask(rows))
     found = [
         *told.findings,
-        *_friction(system.robot, _with_contact_friction(system, told)),
+        *_friction(system.robot, _with_other_friction(system, told)),
         *_offsets(told),
         *_unexplained(told),
+        *check_visibility(system, told),
     ]
     for repair in told.repairs:
         log = repair(log)
@@ -112,9 +120,15 @@ def _part(told: Explanation, j: int, columns: list[int]) -> _Part:
     return _Part(gain, error)
 
 
-def _with_contact_friction(system: ConstrainedSystem, told: Explanation) -> Explanation:
-    """The explanation beside friction of the contacts, which must not pass for that of the joints."""
-    columns = contact_friction_columns(system, told.log, told.rows)
+def _with_other_friction(system: ConstrainedSystem, told: Explanation) -> Explanation:
+    """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
+    columns = np.concatenate(
+        [
+            contact_friction_columns(system, told.log, told.rows),
+            sharper_friction_columns(system, told.log, told.rows),
+        ],
+        axis=-1,
+    )
     if not columns.shape[-1]:
         return told
     problem = replace(told.problem, nuisance=np.concatenate([told.problem.nuisance, columns], axis=-1))
@@ -178,13 +192,8 @@ def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Fi
     width = max(1, round(DISTURBANCE_SECONDS / stride))
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
-    # An arm at rest leaves little unexplained; it says nothing of one that moves.
-    speed = np.abs(log.qd[rows]).max(axis=1)
-    moving = level[speed >= MOVING * np.percentile(speed, 99)]
-    middle = np.median(moving)
-    spread = max(float(robust_std(moving)), 0.2)
     visible = any_row(np.abs(trace) > VISIBLE * told.problem.size)
-    bad = level > min(middle + DISTURBANCE * spread, np.percentile(moving, 90) + 2.0 * np.log(LOUD))
+    bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)
     mask = np.zeros(len(log), bool)
@@ -203,14 +212,32 @@ def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Fi
     return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence=evidence)], mask
 
 
+def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
+    """`(n,)` bool, rows at which more is unexplained than is usual in the same state of the contacts."""
+    # An arm at rest leaves little unexplained; it says nothing of one that moves.
+    speed = np.abs(log.qd[rows]).max(axis=1)
+    moving, bad = speed >= MOVING * np.percentile(speed, 99), np.zeros(len(rows), bool)
+    labels = [label[rows] for label in log.contact.values()]
+    state = np.unique(np.array(labels), axis=1, return_inverse=True)[1].ravel() if labels else 0 * level
+    for number in np.unique(state):
+        here = state == number
+        usual = level[here & moving]
+        if len(usual) < LEAST_ROWS:
+            usual = level[moving]
+        spread = max(float(robust_std(usual)), 0.2)
+        most = np.median(usual) + DISTURBANCE * spread
+        bad[here] = level[here] > min(most, np.percentile(usual, 90) + 2.0 * np.log(LOUD))
+    return bad
+
+
 def residual_trace(system: ConstrainedSystem, told: Explanation, rows: np.ndarray) -> Array:
     """Torque that remains at some rows, contact forces taken out, `(n, nq)` [N m, N]."""
-    parts = []
+    parts, known = [], robust_parameters(told.problem, told.columns, told.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
         left = residual(system, told.log, index)
         columns = [robot_columns(system, told.log, index, name)[0] for name in told.robot]
         columns = np.concatenate([*columns, friction_columns(system, told.log, index)], axis=-1)
-        r = left.r - columns @ np.concatenate([told.fit.theta, told.fit.known])
+        r = left.r - columns @ known
         P, scale = projector(left.J, told.problem.scale), told.problem.scale
         parts.append((P @ (r / scale)[..., None])[..., 0] * scale)
     return np.concatenate(parts)

@@ -19,6 +19,7 @@ from forcegp.checks import (
     limits,
     mechanics,
     noise,
+    placement,
     values,
 )
 from forcegp.checks.clock import Outcome
@@ -66,6 +67,7 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("length", excitation.check_length),
     ("motion", excitation.check_motion),
     ("noise", noise.check_noise),
+    ("placement of the tip", placement.check_placement),
     ("dynamics", mechanics.check_dynamics),
     ("contact", contact.check_contacts),
     ("contact force", force.check_forces),

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
+from forcegp import dynamics
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.log import Log
+from forcegp.checks.residual import tensors
 from forcegp.checks.statistics import Array, describe, intervals, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.fields import JOINT_VECTORS
@@ -27,6 +30,8 @@ SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
 robust standard deviations."""
 SPIKE_SHARED = 0.05
 """A departure of another channel by this share of a value's own says that the motion jumped."""
+DRIVEN = 0.5
+"""Share of a departing acceleration that a step of the torque must make to be its cause."""
 FEWEST = 50
 """Values that a scale is taken from."""
 SPIKE_VISIBLE = (0.01, 0.002)
@@ -131,6 +136,8 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
             & _one_value(own, scale)
             & ~_shocks(log, departures, name)
         )
+        if name == "qdd" and "tau" in vectors:
+            outlier &= ~_driven(system, log, own, outlier)
         # The neighbours of a spike are off as well, by less.
         for j in np.flatnonzero(outlier.any(axis=0)):
             peak = outlier[:, j] & (np.abs(own[:, j]) >= _neighbour_peak(np.abs(own[:, j])))
@@ -173,6 +180,18 @@ def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: s
         # No shock exceeds the range of the whole motion.
         confirmed[:, j] = (most > SPIKE_SHARED * size[name][:, j]) & (size[name][:, j] < 1.0)
     return confirmed
+
+
+def _driven(system: ConstrainedSystem, log: Log, own: Array, outlier: np.ndarray) -> np.ndarray:
+    """`(n, nq)` bool, accelerations that a step of the joint's own torque makes: Δτ_j (M⁻¹)_jj."""
+    step = np.pad(np.abs(np.diff(log.tau, axis=0)), ((1, 1), (0, 0)))
+    step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
+    rows = np.flatnonzero(outlier.any(axis=1))
+    if len(rows):
+        M = dynamics.mass_matrix(system.robot, tensors(log, rows, "q")[0])
+        inverse = torch.linalg.inv(M).diagonal(dim1=-2, dim2=-1).detach().numpy()
+        driven[rows] = step[rows] * inverse > DRIVEN * np.abs(own[rows])
+    return driven
 
 
 def _size(log: Log, name: str, own: Array, around: Array, scale: Array) -> Array:

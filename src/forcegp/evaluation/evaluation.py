@@ -158,7 +158,7 @@ def evaluate(
     """
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
-    data.check_robot(model.system.robot)
+    data.check_robot(getattr(model, "specified", model.system).robot)
     model.system.announce_states(len(data), 2.0, f"an evaluation on {len(data):,} samples")
     before = system or getattr(model, "specified", model.system)
     predicted = predict_all(model, data, system or model.system, progress)

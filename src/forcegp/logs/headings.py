@@ -10,14 +10,49 @@ from scipy.optimize import linear_sum_assignment
 
 from forcegp.errors import MappingError
 from forcegp.logs import units
+from forcegp.logs.columns_by_value import find_by_values
 from forcegp.logs.draft import Draft, Family
 from forcegp.logs.table import LogTable, Stream
 from forcegp.robot import RobotModel
 
 WORDS = {
-    "acceleration": ("qdd", "ddq", "acc", "accel", "acceleration", "accelerations", "qddot"),
-    "velocity": ("qd", "dq", "vel", "velocity", "velocities", "speed", "omega", "qdot", "mdq", "w"),
-    "torque": ("tau", "torque", "torques", "effort", "trq", "mtorque", "moment", "tq", "current", "currents"),
+    "acceleration": (
+        "qdd",
+        "ddq",
+        "acc",
+        "accel",
+        "acceleration",
+        "accelerations",
+        "qddot",
+        "beschleunigung",
+    ),
+    "velocity": (
+        "qd",
+        "dq",
+        "vel",
+        "velocity",
+        "velocities",
+        "speed",
+        "omega",
+        "qdot",
+        "mdq",
+        "w",
+        "geschwindigkeit",
+        "drehzahl",
+    ),
+    "torque": (
+        "tau",
+        "torque",
+        "torques",
+        "effort",
+        "trq",
+        "mtorque",
+        "moment",
+        "tq",
+        "current",
+        "currents",
+        "drehmoment",
+    ),
     "position": (
         "q",
         "pos",
@@ -30,6 +65,7 @@ WORDS = {
         "phi",
         "state",
         "joint",
+        "winkel",
     ),
 }
 """Words that name a quantity, by quantity, in the order in which they are looked for."""
@@ -116,6 +152,9 @@ def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
         MappingError: no family of columns is the position or the torque of the robot's joints.
     """
     families = _families(stream, robot)
+    if not any(re.search("[A-Za-z]", name) for name in stream.columns):
+        find_by_values(stream, robot.joint_names, draft)
+        families = []
     for quantity in WORDS:
         rated = [(rating, family) for family in families if (rating := _rate(family, quantity)) > 0.0]
         rated.sort(key=lambda item: -item[0])

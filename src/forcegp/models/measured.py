@@ -56,7 +56,7 @@ def measured_if_logged(system: ConstrainedSystem, data: Dataset, quantity: str) 
 
 def score(model: Predicts, data: Dataset, quantity: str) -> float:
     """R² of the predicted mean, averaged over the components; `Predictor.score` documents it."""
-    data.check_robot(model.system.robot)
+    data.check_robot(getattr(model, "specified", model.system).robot)
     if len(data) < 2:
         raise DataError("a score needs two samples or more", got=len(data))
     true = measured(model.system, data, quantity)

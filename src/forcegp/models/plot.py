@@ -30,7 +30,7 @@ def plot_model(
 ) -> list[Axes]:
     """Draw predictions at logged states; `Predictor.plot` documents the arguments."""
     system = settings.get("system") or model.system
-    data.check_robot(system.robot)
+    data.check_robot((settings.get("system") or getattr(model, "specified", system)).robot)
     data = data[:: max(1, -(-len(data) // MOST_SAMPLES))]
     found = predicted(model, data, quantity, **settings)
     names, kinds = component_names(system, quantity), system.robot.joint_types

@@ -224,6 +224,11 @@ class StructuredFit(FittedModel):
         return None if learned is None else learned.exp()
 
     @property
+    def specified(self) -> ConstrainedSystem:
+        """The system before the fit, with the robot of the file."""
+        return self.specification.system
+
+    @property
     def torque_disturbance(self) -> Tensor | None:
         """s √T of torque noise with standard deviation s that is correlated for a time T, `(nq,)` [N m √s].
 

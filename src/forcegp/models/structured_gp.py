@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
@@ -224,9 +225,10 @@ class StructuredGP(Model[StructuredFit]):
         options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
         chosen = None if learn is None else self._chosen(learn)
         training, doubts = self._training(known, chosen)
+        armature = None if self._fitted is None else self._fitted.system.robot.armature
         if self._fitted is None and chosen is None:
             self.specification, found = spec.with_inertia_of(training)
-            doubts = (*doubts, *found)
+            doubts, armature = (*doubts, *found.doubts), found.robot.armature
             if self.specification.priors != spec.priors:
                 training, _ = self._training(known, chosen)
             spec = self.specification
@@ -237,6 +239,10 @@ class StructuredGP(Model[StructuredFit]):
             log = Pass(spec, sample, file, progress, distributed)
             neighbours = neighbours_of(spec, sample, training)
         problem = spec.problem(training)
+        robot = spec.system.robot
+        if armature is not None and spec.parameters is None and not torch.equal(armature, robot.armature):
+            robot = robot.replace(armature=armature)
+            problem = dataclasses.replace(problem, system=spec.system.with_robot(robot))
         search, saved = self._search(problem, chosen, options), None
         if search.start:
             if file is not None:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.inertia import inertia_of
+from forcegp.forces.inertia import Inertia, inertia_of
 from forcegp.forces.learn import Problem, analytical_parameters
 from forcegp.forces.measurements import (
     NoiseStd,
@@ -135,16 +135,15 @@ class Specification:
         """Whether the noise of the motor torque is learned."""
         return isinstance(self.torque_noise, str)
 
-    def with_inertia_of(self, training: Training) -> tuple[Specification, tuple[str, ...]]:
-        """The specification with the inertia that the training samples ask for, and doubts about it."""
+    def with_inertia_of(self, training: Training) -> tuple[Specification, Inertia]:
+        """The specification with the priors on inertia that the training samples ask for, and their robot."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
         asks = self.inertia == "auto" and "actuation" in self.mean.terms and self.parameters is None
         if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
-            return self, ()
+            return self, Inertia(self.system.robot)
         found = inertia_of(self.system, friction, self.mean, training)
         priors = (*self.priors, InertialPrior()) if found.learned else self.priors
-        system = self.system.with_robot(found.robot)
-        return dataclasses.replace(self, system=system, priors=priors, inertia="file"), found.doubts
+        return dataclasses.replace(self, priors=priors), found
 
     def problem(self, training: Training) -> Problem:
         """The learning problem of training data."""

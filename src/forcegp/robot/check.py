@@ -173,10 +173,12 @@ def _check_kinds(tree: Tree) -> None:
         )
     moving = sum(joint.kind != "fixed" for joint in tree.joints)
     if not 1 <= moving <= MAX_JOINTS:
+        what = "too many moving joints" if moving else "nothing in this file moves"
         raise RobotFileError(
-            f"{tree.label}: unsupported number of moving joints",
+            f"{tree.label}: {what}",
             expected=f"1 to {MAX_JOINTS} moving joints",
             got=moving,
+            hint=None if moving else "the file describes an object; a robot has revolute or prismatic joints",
         )
 
 

@@ -102,7 +102,9 @@ def parse_xml(data: bytes, label: str) -> Element:
             f"{label}: not well-formed XML",
             expected="a complete URDF or MJCF document",
             got=str(error),
-            hint="the file may be truncated, or may not be XML",
+            hint="delete what stands before <?xml"
+            if "not at start" in str(error)
+            else "the file may be truncated, or may not be XML",
         ) from error
     except (LookupError, UnicodeError, ValueError, AssertionError) as error:
         if isinstance(error, RobotFileError):

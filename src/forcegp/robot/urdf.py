@@ -30,6 +30,12 @@ _NEEDED = {
     "child": ("link",),
     "mimic": ("joint",),
 }
+_INSTEAD = {
+    "floating": "attach the robot to the base with a fixed joint",
+    "spherical": "write it as three revolute joints with links without mass between them",
+    "planar": "write it as two prismatic joints and a revolute one",
+}
+"""What to write for joint types that are not supported."""
 _MOVING = ("revolute", "continuous", "prismatic")
 WORLD = "world"
 """Name of the fixed surroundings, which some files use as a link without declaring it."""
@@ -98,7 +104,7 @@ def _copy_joint(document: Element, joint: Element, label: str) -> None:
             f"{where} is of type {kind!r}",
             expected="revolute, continuous, prismatic or fixed",
             got=kind,
-            hint="attach the robot to the base with a fixed joint" if kind == "floating" else None,
+            hint=_INSTEAD.get(kind),
         )
     _copy(document, joint, _JOINT_PARTS, where)
     for part in ("parent", "child"):
