@@ -10,6 +10,8 @@ from forcegp.evaluation.scores import JointErrors
 
 TINY = 1e-12
 """Errors below this are equal: rounding of accelerations of the order of one."""
+EQUAL = 1e-9
+"""Error ratios that are this close to one are equal, up to rounding."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Verdict:
     @property
     def better(self) -> bool:
         """Whether the model is better in torque and in acceleration."""
-        return self.torque < 1.0 and self.acceleration < 1.0
+        return max(self.torque, self.acceleration) < 1.0 - EQUAL
 
     def text(self) -> str:
         """The comparison as one sentence."""
@@ -73,7 +75,7 @@ def verdicts(scores: Sequence[PredictorScores], joint_names: Sequence[str]) -> t
         }
         worse = [
             name for name, pair in zip(joint_names, zip(*ratios.values(), strict=True), strict=True)
-            if max(pair) > 1.0
+            if max(pair) > 1.0 + EQUAL
         ]  # fmt: skip
         worse = ["every joint"] if len(worse) == len(joint_names) else worse
         means = {unit: math.exp(sum(map(math.log, r)) / len(r)) for unit, r in ratios.items()}
