@@ -17,7 +17,7 @@ from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.limits import DEGREE
 from forcegp.checks.log import Log
-from forcegp.checks.residual import tensors
+from forcegp.checks.residual import residual, tensors
 from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
@@ -38,6 +38,12 @@ JUMPS = 0.05
 """Largest share of windows that impacts cross: the velocity jumps there, which no acceleration holds."""
 INERTIA_ROWS = 200
 """Rows at which inertias are computed."""
+FRICTION_ROWS = 4000
+"""Rows from which viscous friction is estimated."""
+LEVER = 1e-6
+"""A contact without this lever arm does not act on a joint [m]."""
+AUTOCORRELATED = 20
+"""Neighbouring rows that are counted as one."""
 ALIKE = 0.02
 """Slopes of all joints within this of one factor have one cause: the clock."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
@@ -249,13 +255,34 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
     Viscous friction d slows a joint of inertia m as exp(−d t/m), which leaves (1 − exp(−x))/x, x = d dt/m:
     after a change of the torque, light damped joints accelerate more than their velocity will change.
     """
-    (q,) = tensors(log, log.rows(INERTIA_ROWS), "q")
+    rows = log.rows(INERTIA_ROWS)
+    (q,) = tensors(log, rows, "q")
     if not len(q):
         return np.ones(log.nq)
     with torch.no_grad():
         inverse = torch.linalg.inv(dynamics.mass_matrix(system.robot, q)).diagonal(dim1=-2, dim2=-1)
-    x = np.maximum(system.robot.damping.numpy() * log.dt * inverse.median(dim=0).values.numpy(), 1e-6)
+    damping = system.robot.damping.numpy() + _undeclared_damping(system, log)
+    x = np.maximum(damping * log.dt * inverse.median(dim=0).values.numpy(), 1e-6)
     return -np.expm1(-x) / x
+
+
+def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
+    """`(nq,)` viscous friction that the robot file lacks, 0 where the torques do not show it [N m s/rad]."""
+    rows = log.rows(FRICTION_ROWS)
+    found = np.zeros(log.nq)
+    told = residual(system, log, rows)
+    for j in range(log.nq):
+        free = np.linalg.norm(told.J[:, :, j], axis=1) < LEVER
+        qd, r = log.qd[rows, j][free], told.r[free, j]
+        if len(r) < 20:
+            continue
+        X = -np.stack([qd, np.sign(qd), np.ones_like(qd)], axis=1)
+        w, *_ = np.linalg.lstsq(X, r, rcond=None)
+        variance = ((r - X @ w) ** 2).sum() / (len(r) - 3) * np.linalg.pinv(X.T @ X)[0, 0]
+        # Neighbouring rows err alike, so only clear cases count.
+        if w[0] > CLEARLY * np.sqrt(AUTOCORRELATED * variance):
+            found[j] = w[0]
+    return found
 
 
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:

@@ -107,23 +107,38 @@ class ContactSolverEngine:
         return torch.tensor(q, dtype=dtype), torch.tensor(qd, dtype=dtype)
 
     def forces(self, torque: np.ndarray) -> SolvedForces:
-        """Acceleration and forces at the present state under a motor torque `(nq,)` [N m]."""
+        """Acceleration and forces at the present state under a motor torque `(nq,)` [N m].
+
+        The engine's step takes viscous friction at its end, (M + h D) q̈ = Q(q, q̇), which for light joints
+        differs much from M⁻¹Q: q̈ and the friction are those of the step, so that the velocity changes by h q̈.
+        """
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque
         self._mujoco.mj_forward(self._model, data)
+        qdd, later = self._of_the_step()
         contacts = [self._contact_force(pair) for pair in self._pairs]
         Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else self._no_contact
         Q_I, Q_z = Q.sum(0)
         whole = data.qfrc_applied + data.qfrc_passive + data.qfrc_constraint - data.qfrc_bias
         return SolvedForces(
-            qdd=data.qacc[dof].copy(),
-            Q=whole[dof] - Q_I - Q_z,
+            qdd=qdd[dof],
+            Q=(whole + later)[dof] - Q_I - Q_z,
             Q_I=Q_I,
             Q_z=Q_z,
             multiplier=np.linalg.norm(F[:, 0], axis=-1),
             F_I=F[:, 0],
             F_z=F[:, 1],
         )
+
+    def _of_the_step(self) -> tuple[np.ndarray, np.ndarray]:
+        """q̈ with which the engine's next step changes the velocity, and −h D q̈, by which friction differs then."""
+        model, data = self._model, self._data
+        M = np.zeros((model.nv, model.nv))
+        for column, unit in zip(M, np.eye(model.nv), strict=True):
+            self._mujoco.mj_mulM(model, data, column, unit)
+        hD = model.opt.timestep * model.dof_damping
+        qdd = np.linalg.solve(M + np.diag(hD), M @ data.qacc)
+        return qdd, -hD * qdd
 
     def step(self) -> None:
         """Advance by the sampling period under the torque last given to `forces`."""
