@@ -101,7 +101,8 @@ def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[F
         column = encoder_hypothesis(system, log, rows, j).columns
         assert column is not None
         yield Fault("encoder-offset", joint, column[..., 0], 1)
-    yield Fault("torque-delay", "", _rate(system, log, rows), log.nq)
+    if log.header.ordered:  # rows in order of selection have no neighbours in time
+        yield Fault("torque-delay", "", _rate(system, log, rows), log.nq)
     yield Fault("base-tilted", "", _tilt(system, log, rows), log.nq)
     yield Fault("masses-mismatch", "", _masses(system, log, rows), log.nq)
 

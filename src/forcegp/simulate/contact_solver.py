@@ -131,7 +131,7 @@ class ContactSolverEngine:
         )
 
     def _of_the_step(self) -> tuple[np.ndarray, np.ndarray]:
-        """q̈ with which the engine's next step changes the velocity, and −h D q̈, by which friction differs then."""
+        """q̈ with which the next step changes the velocity, and −h D q̈, by which friction differs then."""
         model, data = self._model, self._data
         M = np.zeros((model.nv, model.nv))
         for column, unit in zip(M, np.eye(model.nv), strict=True):
