@@ -34,6 +34,8 @@ from forcegp.robot.model import RobotModel
 
 LEAST, MOST = 200, 4000
 """Samples in free motion needed at least, and used at most, evenly spaced."""
+MOVES = 0.1
+"""Share of the samples in which a joint moves at least, for its sticking to matter."""
 VOLUME_STATES = 60
 """States that log |M| is averaged over."""
 SIGNIFICANT = 2.0
@@ -183,6 +185,9 @@ def _rows(
         free = (~m.active.any(-1)).nonzero()[:, 0]
         if quantity != "qdd" or len(free) < LEAST:
             continue
+        free = free[~_sticking(m.qd[free], min(prior.speeds))]
+        if len(free) < LEAST:
+            continue
         m = m[free[torch.linspace(0, len(free) - 1, min(MOST, len(free))).round().long().to(free.device)]]
         _, group = stretches(m.segment).unique(return_inverse=True)
         at = m.at(system)
@@ -192,6 +197,15 @@ def _rows(
         residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
         return Rows(m.q, m.qd, m.values, residual, Phi, group, m.segment)
     return None
+
+
+def _sticking(qd: Tensor, speed: float) -> Tensor:
+    """Samples `(n,)` at which a joint sticks, so that its friction is whatever holds it.
+
+    Joints that move in less than a tenth of the samples do not count.
+    """
+    slow = qd.abs() < speed
+    return (slow & (slow.double().mean(0) < 1.0 - MOVES)).any(-1)
 
 
 def sums(rows: Rows, columns: Tensor) -> Sums:

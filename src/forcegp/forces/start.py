@@ -78,19 +78,22 @@ def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block
     # Some priors share the hyperparameters of another one.
     for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
-        scale = _force_scale(p, blocks)
+        scale = _force_scale(p, blocks, prior.commensurate)
         initial = prior.kernel.initial(len(scale), widths, scale.log().cpu().double())
         params |= {f"{prior.name}.{name}": value.to(scale.device) for name, value in initial.items()}
     return params
 
 
-def _force_scale(p: int, blocks: Sequence[Block]) -> Tensor:
+def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool) -> Tensor:
     """Root mean square of the least-squares force of prior p, `(components,)`.
 
-    Rows tell only the sum of components that act along one direction, such as viscous and dry friction, and
-    the least norm would divide it by their units. Each of these starts as if it were alone.
+    Rows tell only the sum of components that act along one direction. The least norm divides it evenly where
+    all have one unit; that of viscous and dry friction it would divide by their units, so each of these
+    starts as if it were alone.
     """
-    first = _first_parallel([block.operators[p] for block in blocks])
+    operators = [block.operators[p] for block in blocks]
+    each = torch.arange(operators[0].shape[-1], device=operators[0].device)
+    first = each if commensurate else _first_parallel(operators)
     own, alone = first.unique(), (first[:, None] == first).sum(0) == 1
     total = torch.zeros_like(blocks[0].operators[p][0, 0])
     weight = torch.zeros_like(total)

@@ -110,7 +110,7 @@ class StructuredGP(Model[StructuredFit]):
         inference: str = "auto",
         inducing_points: int = LIMIT,
         state_noise: tuple[NoiseStd, NoiseStd] | None = None,
-        inertia: str = "file",
+        inertia: str | None = None,
         standardize: bool = True,
         degrees_of_freedom: float | None = None,
     ) -> None:

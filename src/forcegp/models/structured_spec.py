@@ -96,7 +96,8 @@ class Specification:
         inducing_points: maximum number of inducing points of one prior.
         automatic: whether the priors depend on whether the data are simulated or measured.
         state_noise: standard deviations of the noise of q and of q̇, or `None` for none.
-        inertia: `"file"`, or `"auto"` where the log may show another one.
+        inertia: `"file"`, or `"auto"` where the log may show another one; `None` for `"auto"` with the
+            defaults of a measured robot and `"file"` elsewhere.
         standardize: whether the inputs of kernels are standardized.
         degrees_of_freedom: ν of noise with heavy tails, or `None` for Gaussian noise.
     """
@@ -112,7 +113,7 @@ class Specification:
     inducing_points: int = LIMIT
     automatic: bool = False
     state_noise: tuple[NoiseStd, NoiseStd] | None = None
-    inertia: str = "file"
+    inertia: str | None = None
     standardize: bool = True
     degrees_of_freedom: float | None = None
 
@@ -125,7 +126,9 @@ class Specification:
         spec, observations = self, observations_of(data)
         if spec.automatic and not is_simulated(observations):
             priors = measured_priors(spec.system)
-            spec = dataclasses.replace(spec, priors=priors, torque_noise="learn", inertia="auto")
+            spec = dataclasses.replace(
+                spec, priors=priors, torque_noise="learn", inertia=spec.inertia or "auto"
+            )
         if spec.learns_torque_noise and spec.noise_std is None and not states_noise(observations):
             spec = dataclasses.replace(spec, learn_noise=True)
         return dataclasses.replace(spec, automatic=False)
@@ -177,13 +180,13 @@ def torque_noise_of(given: NoiseStd | str | None, priors: Sequence[ForcePrior]) 
     return given
 
 
-def check_inertia(inertia: str) -> str:
+def check_inertia(inertia: str | None) -> str | None:
     """Where the inertia of the robot is from.
 
     Raises:
         UnknownNameError: neither "file" nor "auto".
     """
-    if inertia not in INERTIAS:
+    if inertia is not None and inertia not in INERTIAS:
         raise UnknownNameError("inertia", inertia, INERTIAS)
     return inertia
 

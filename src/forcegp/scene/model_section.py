@@ -64,7 +64,7 @@ class ModelSection(Section):
     state_noise: tuple[State, State] | None = None
     sensor_noise_std: PositiveFloat | None = None
     inference: Literal["auto", "exact", "sparse"] = "auto"
-    inertia: Literal["file", "auto"] = "file"
+    inertia: Literal["file", "auto"] | None = None
     inducing_points: PositiveInt = 100
     standardize: bool = True
     degrees_of_freedom: PositiveFloat | None = None

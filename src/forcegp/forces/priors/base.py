@@ -97,6 +97,8 @@ class ForcePrior(ABC):
     """Whether Coulomb friction that is proportional to the multiplier goes with the prior."""
     vectors: tuple[str, ...] = ()
     """Inputs whose components are standardized by one scale, as turning the axes must change nothing."""
+    commensurate: bool = True
+    """Whether all components of f have one unit."""
     sticks: bool = False
     """Whether the force has dry friction of joints in it, which `States.slip` tells apart."""
     in_time: bool = False
