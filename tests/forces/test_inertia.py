@@ -141,3 +141,17 @@ def test_correlation_times_of_known_processes() -> None:
 def test_an_unknown_source_of_inertia_is_named(file: RobotModel) -> None:
     with pytest.raises(UnknownNameError, match="guess"):
         forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical", inertia="guess")
+
+
+def test_the_file_is_kept_where_the_user_says_so(file: RobotModel) -> None:
+    """The defaults of a measured log add what a light robot lacks, and "file" forbids it."""
+    light = file.replace(mass=0.3 * file.mass, inertia=0.3 * file.inertia)
+    data = log(file)[::4]
+    system = forcegp.ConstrainedSystem(light)
+    told = {
+        name: forcegp.StructuredGP(system, "analytical", inertia=name).fit(data) for name in ("auto", "file")
+    }
+    assert told["auto"].result.warnings != told["file"].result.warnings
+    assert torch.equal(told["file"].system.robot.mass, light.mass)
+    assert not bool(told["file"].system.robot.armature.any())
+    assert [prior.name for prior in told["file"].posterior.priors] == ["joint_friction"]

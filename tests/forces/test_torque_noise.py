@@ -130,6 +130,7 @@ def test_a_joint_that_sticks_has_a_spread_of_its_own() -> None:
     t = torch.arange(n, dtype=torch.float64) * 0.01
     data = forcegp.Dataset(t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names)
     fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", noise_std=0.01).fit(data)
+    assert not bool(fit.system.robot.armature.any()), "what holds a joint is not inertia"
     assert float(fit.hyperparameters[STICK_NOISE].exp()[0]) == pytest.approx(2.0, rel=0.2)
     assert fit.torque_std is not None and float(fit.torque_std[0]) < 0.2
     at = torch.zeros(2, 2, dtype=torch.float64), torch.tensor([[0.0, 1.0], [1.0, 1.0]]).double()
