@@ -104,7 +104,7 @@ def test_sums_give_the_dense_least_squares() -> None:
     Phi = torch.randn(n, nq, f, generator=random, dtype=torch.float64)
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
-    by_stretch = sums(Rows(r, r, r, r, Phi, group, group), C)
+    by_stretch = sums(Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group), C)
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
         H, h = given.quadratic(NOISE)

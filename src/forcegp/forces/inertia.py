@@ -35,7 +35,7 @@ from forcegp.robot.model import RobotModel
 LEAST, MOST = 200, 4000
 """Samples in free motion needed at least, and used at most, evenly spaced."""
 MOVES = 0.1
-"""Share of the samples in which a joint moves at least, for its sticking to matter."""
+"""Share of the samples in which a joint moves at least, for its sticking to count."""
 VOLUME_STATES = 60
 """States that log |M| is averaged over."""
 SIGNIFICANT = 2.0
@@ -71,6 +71,8 @@ class Rows:
         q, qd, qdd: `(n, nq)`.
         residual: torque that the robot of the file leaves `(n, nq)`.
         friction: Φ, features of the friction of each joint and its offset `(n, nq, f)`.
+        slides: `(n, nq)` bool, joints that move; the friction of one that sticks is whatever holds it, so its
+            torque says nothing there.
         group: stretch of each sample `(n,)`, from 0 without gaps.
         segment: `(n,)`.
     """
@@ -80,13 +82,14 @@ class Rows:
     qdd: Tensor
     residual: Tensor
     friction: Tensor
+    slides: Tensor
     group: Tensor
     segment: Tensor
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Σ XᵀX `(..., nq, p + f, p + f)`, Σ Xᵀr, Σ r² and the number of samples, with X = (C, Φ) by joint."""
+    """Σ XᵀX `(..., nq, p + f, p + f)`, Σ Xᵀr, Σ r² and the numbers of samples, with X = (C, Φ) by joint."""
 
     gram: Tensor
     right: Tensor
@@ -118,7 +121,7 @@ class Sums:
     def _stiff(self) -> Tensor:
         p = self.unknowns
         eye = torch.eye(self.gram.shape[-1] - p, dtype=self.gram.dtype, device=self.gram.device)
-        return self.gram[:, p:, p:] + RIDGE * self.count * eye
+        return self.gram[:, p:, p:] + RIDGE * self.count[:, None, None] * eye
 
     def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
         """H and h with Σ_j |ε_j|²/s_j² = δᵀH δ − 2 hᵀδ + …, friction at its best."""
@@ -185,9 +188,6 @@ def _rows(
         free = (~m.active.any(-1)).nonzero()[:, 0]
         if quantity != "qdd" or len(free) < LEAST:
             continue
-        free = free[~_sticking(m.qd[free], min(prior.speeds))]
-        if len(free) < LEAST:
-            continue
         m = m[free[torch.linspace(0, len(free) - 1, min(MOST, len(free))).round().long().to(free.device)]]
         _, group = stretches(m.segment).unique(return_inverse=True)
         at = m.at(system)
@@ -195,17 +195,10 @@ def _rows(
         Phi = torch.cat(features, dim=-1)
         Phi = Phi / Phi.square().mean(0).sqrt().clamp(min=1e-12)
         residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
-        return Rows(m.q, m.qd, m.values, residual, Phi, group, m.segment)
+        slides = m.qd.abs() >= min(prior.speeds)
+        slides = slides | (slides.double().mean(0) < MOVES)
+        return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment)
     return None
-
-
-def _sticking(qd: Tensor, speed: float) -> Tensor:
-    """Samples `(n,)` at which a joint sticks, so that its friction is whatever holds it.
-
-    Joints that move in less than a tenth of the samples do not count.
-    """
-    slow = qd.abs() < speed
-    return (slow & (slow.double().mean(0) < 1.0 - MOVES)).any(-1)
 
 
 def sums(rows: Rows, columns: Tensor) -> Sums:
@@ -214,9 +207,11 @@ def sums(rows: Rows, columns: Tensor) -> Sums:
     found = []
     for g in range(groups):
         own = rows.group == g
-        X = torch.cat([columns[own], rows.friction[own]], dim=-1).transpose(0, 1)
-        r = rows.residual[own].mT
-        found.append((X.mT @ X, (X.mT @ r[..., None])[..., 0], r.square().sum(-1), own.sum().to(r.dtype)))
+        slides = rows.slides[own]
+        X = (slides[..., None] * torch.cat([columns[own], rows.friction[own]], dim=-1)).transpose(0, 1)
+        r = (slides * rows.residual[own]).mT
+        count = slides.sum(0).to(r.dtype).clamp(min=1.0)
+        found.append((X.mT @ X, (X.mT @ r[..., None])[..., 0], r.square().sum(-1), count))
     gram, right, square, count = (torch.stack(parts) for parts in zip(*found, strict=True))
     return Sums(gram, right, square, count, columns.shape[-1])
 
@@ -280,7 +275,7 @@ def _power(by_stretch: Sums, rows: Rows, columns: Tensor, noise: Tensor) -> floa
     """κ = 1/τ̄ of the torque that friction leaves, as in `likelihood_power`."""
     every = by_stretch.total()
     none = rows.qdd.new_zeros(by_stretch.unknowns)
-    left = rows.residual - (rows.friction * every.friction(none)).sum(-1)
+    left = rows.slides * (rows.residual - (rows.friction * every.friction(none)).sum(-1))
     return min(1.0, math.exp(-float(autocorrelation_time(left / noise, rows.segment).log().mean())))
 
 
@@ -300,7 +295,7 @@ def inertia_of_drives(
     def is_sane(armature: Tensor) -> bool:
         """Whether accelerations are predicted as well as by their mean, by the geometric mean of joints."""
         friction = by_stretch.total().friction(armature)
-        left = rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1)
+        left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
         missed = torch.linalg.solve(M + torch.diag(armature), left[..., None])[..., 0]
         spread = rows.qdd - rows.qdd.mean(0)
         return float((missed.square().mean(0) / spread.square().mean(0)).log().mean()) <= 0.0
@@ -320,7 +315,7 @@ def inertia_of_drives(
 def _drives(given: Sums, noise: Tensor, M: Tensor, weight: float) -> Tensor:
     """a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a|, both over all samples."""
     H, h = given.quadratic(noise)
-    n, M = float(given.count), M[:: max(1, len(M) // VOLUME_STATES)]
+    n, M = float(given.count.max()), M[:: max(1, len(M) // VOLUME_STATES)]
     scale = M.diagonal(dim1=-2, dim2=-1).mean(0)
     H, h = (H * scale[:, None] * scale / n).numpy(), (h * scale / n).numpy()
     relative = (M / (scale[:, None] * scale).sqrt()).numpy()
