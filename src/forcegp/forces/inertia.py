@@ -34,6 +34,8 @@ from forcegp.robot.model import RobotModel
 
 LEAST, MOST = 200, 4000
 """Samples in free motion needed at least, and used at most, evenly spaced."""
+SCATTER = 4.0
+"""Ratio of mean squares of the torque at rest and in motion from which a joint sticks at rest."""
 MOVES = 0.1
 """Share of the samples in which a joint moves at least, for its sticking to count."""
 VOLUME_STATES = 60
@@ -195,10 +197,27 @@ def _rows(
         Phi = torch.cat(features, dim=-1)
         Phi = Phi / Phi.square().mean(0).sqrt().clamp(min=1e-12)
         residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
-        slides = m.qd.abs() >= min(prior.speeds)
-        slides = slides | (slides.double().mean(0) < MOVES)
+        slides = _slides(m.qd.abs() >= min(prior.speeds), Phi, residual)
         return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment)
     return None
+
+
+def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
+    """`(n, nq)` bool, without the joints that stick: that hardly move, and whose torque then scatters more.
+
+    Args:
+        moving: `(n, nq)` bool, faster than the sharpest dry friction.
+        Phi: features of friction `(n, nq, f)`.
+        residual: `(n, nq)` torque that the robot of the file leaves.
+    """
+    weighted = moving[..., None] * Phi
+    w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
+    left = (residual - (Phi * w).sum(-1)).square()
+    at_rest, sliding = (
+        (part * left).sum(0) / part.sum(0).clamp(min=1) for part in ((~moving).double(), moving.double())
+    )
+    sticks = (at_rest > SCATTER * sliding) & (moving.double().mean(0) >= MOVES)
+    return moving | ~sticks
 
 
 def sums(rows: Rows, columns: Tensor) -> Sums:
