@@ -63,7 +63,7 @@ def test_inertia_of_drives_that_the_file_lacks_is_found(file: RobotModel) -> Non
     """Not taken for inertia of the links, which would load the other joint too."""
     armature = torch.tensor([0.3, 0.1], dtype=torch.float64)
     result = found(file, log(file.replace(armature=armature)))
-    assert not result.learned and "drives" in result.doubts[0]
+    assert not result.learned and "the drives have inertia" in result.doubts[0]
     torch.testing.assert_close(result.robot.armature, armature, rtol=0.1, atol=0.0)
 
 
@@ -84,7 +84,11 @@ def test_accelerations_below_the_noise_of_the_torque_damp_the_drives_without_har
     light = file.replace(mass=0.02 * file.mass, inertia=0.02 * file.inertia)
     data, test = log(light, speed=0.15), log(light, speed=0.15, seed=1)
     result = found(light, data)
-    assert not result.learned and float(result.robot.armature.min()) > 0.0 and "drives" in result.doubts[0]
+    assert (
+        not result.learned
+        and float(result.robot.armature.min()) > 0.0
+        and "the drives have inertia" in result.doubts[0]
+    )
 
     def errors(robot: RobotModel) -> tuple[Tensor, Tensor]:
         friction = 0.3 * test.qd + 0.4 * torch.tanh(test.qd / 0.02)

@@ -44,6 +44,13 @@ UNITS = {
     "torque-delay": "a torque delay under {size:.2g} s",
     "masses-mismatch": "masses wrong by less than {size:.0%}",
 }
+NEVER = {
+    "torque-gain": "any wrong gain of {joint}",
+    "encoder-offset": "any encoder offset of {joint}",
+    "base-tilted": "any tilt of the base",
+    "torque-delay": "any torque delay",
+    "masses-mismatch": "any error of the masses",
+}
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,7 @@ def check_visibility(system: ConstrainedSystem, told: Explanation) -> list[Findi
     if not hidden:
         return []
     texts = [
-        f"{kind} of {joint or 'the robot'}" if size >= LARGEST else UNITS[kind].format(joint=joint, size=size)
+        NEVER[kind].format(joint=joint) if size >= LARGEST else UNITS[kind].format(joint=joint, size=size)
         for (kind, joint), size in hidden.items()
     ]
     more = f" and {len(texts) - 5} more" if len(texts) > 5 else ""

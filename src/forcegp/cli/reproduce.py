@@ -14,9 +14,9 @@ def reproduce(
     profile: Annotated[
         Literal["quick", "paper", "paper-exact", "large", "real-contact"],
         typer.Option(
-            help="A few minutes; the paper's sizes; the paper's models too, in all that it states; all "
-            "samples of a ten-minute log; or from a log in CSV to "
-            "the contact force, on scenes whose contact MuJoCo's solver makes."
+            help="quick: a few minutes; paper: the paper's sizes; paper-exact: also the paper's models and "
+            "settings; large: all samples of a ten-minute log; real-contact: from a log in CSV to the "
+            "contact force, on scenes whose contact MuJoCo's solver makes."
         ),
     ] = "quick",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the page and its data.")] = Path("out"),

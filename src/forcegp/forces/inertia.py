@@ -177,8 +177,9 @@ def inertia_of(
     armature = inertia_of_drives(rows, drives, noise, M, alone, helped)
     if not bool(armature.any()):
         return Inertia(robot)
-    found = " ".join(f"{a:.2g}" for a in armature.tolist())
-    text = f"inertia of drives was added to the robot file's: {found} kg m² (kg for sliding joints)"
+    pairs = zip(robot.joint_names, armature.tolist(), strict=True)
+    found = ", ".join(f"{name} {a:.2g}" for name, a in pairs if a > 0.0)
+    text = f"the drives have inertia that the robot file lacks [kg m², kg for sliding joints]: {found}"
     return Inertia(robot.replace(armature=robot.armature + armature), doubts=(text,))
 
 

@@ -224,14 +224,8 @@ class StructuredGP(Model[StructuredFit]):
         spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
         options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
         chosen = None if learn is None else self._chosen(learn)
-        training, doubts = self._training(known, chosen)
-        armature = None if self._fitted is None else self._fitted.system.robot.armature
-        if self._fitted is None and chosen is None:
-            self.specification, found = spec.with_inertia_of(training)
-            doubts, armature = (*doubts, *found.doubts), found.robot.armature
-            if self.specification.priors != spec.priors:
-                training, _ = self._training(known, chosen)
-            spec = self.specification
+        training, armature, doubts = self._with_inertia(known, chosen)
+        spec = self.specification
         spec.system.announce_states(training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
         log = None
         if sample is not None:
@@ -267,6 +261,21 @@ class StructuredGP(Model[StructuredFit]):
                 if kept is not None:
                     kept.remove()
         return fitted
+
+    def _with_inertia(
+        self, data: Dataset | Sequence[Observation], chosen: Sequence[str] | None
+    ) -> tuple[Training, Tensor | None, tuple[str, ...]]:
+        """Training data, the drives' inertia, and doubts; a first fit may add a prior on inertia."""
+        training, doubts = self._training(data, chosen)
+        if self._fitted is not None:
+            return training, self._fitted.system.robot.armature, doubts
+        if chosen is not None:
+            return training, None, doubts
+        before = self.specification.priors
+        self.specification, found = self.specification.with_inertia_of(training)
+        if self.specification.priors != before:
+            training, _ = self._training(data, chosen)
+        return training, found.robot.armature, (*doubts, *found.doubts)
 
     def _search(self, problem: Problem, chosen: Sequence[str] | None, options: LearningOptions) -> Search:
         """What is learned of a problem, from where, and what keeps its values."""

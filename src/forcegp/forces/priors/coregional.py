@@ -52,12 +52,12 @@ class CoregionalPrior(ForcePrior):
     inputs: tuple[str, ...] = ("q", "qd")
     name: str = "coregional"
     target: str = JOINT
+    _mixing: Tensor | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         check_inputs(self.name, self.inputs, ("q", "qd", "tau"))
         if self.causes < 1:
             raise ModelError("a coregionalised force needs a cause", expected="1 or more", got=self.causes)
-        object.__setattr__(self, "_mixing", None)
 
     def outputs(self, robot: RobotModel) -> int:
         return self.causes + robot.nq
@@ -79,8 +79,7 @@ class CoregionalPrior(ForcePrior):
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         robot = system.robot
-        mixing: Tensor | None = self._mixing  # pyright: ignore[reportAttributeAccessIssue]
-        W = self.initial_parameters(robot)[MIXING] if mixing is None else mixing
+        W = self.initial_parameters(robot)[MIXING] if self._mixing is None else self._mixing
         # Unit columns: their length is the standard deviation of the cause.
         columns = W / W.norm(dim=0).clamp(min=1e-12)
         eye = torch.eye(robot.nq, dtype=at.q.dtype, device=at.q.device)
