@@ -7,7 +7,7 @@ operator, a function) has no JSON form and is refused. Reading checks names and 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -30,7 +30,7 @@ def encode(value: Any, classes: Classes) -> Any:
     """
     names = {kind: name for name, kind in classes.items()}
     if type(value) in names:
-        own = {field.name: encode(getattr(value, field.name), classes) for field in fields(value)}
+        own = {field.name: encode(getattr(value, field.name), classes) for field in _written(value)}
         return {"type": names[type(value)], **own}
     if isinstance(value, tuple | list):
         return [encode(part, classes) for part in value]
@@ -83,11 +83,16 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bo
         raise ModelError.at(place, cause) from cause
 
 
+def _written(kind: Any) -> list[Field[Any]]:
+    """The fields that a description is made from; others hold what learning adds."""
+    return [field for field in fields(kind) if field.init]
+
+
 def _check_fields(kind: type, name: str, given: Mapping[str, Any], place: str, whole: bool) -> None:
     """Raise `ModelError` where a field is unknown or missing."""
     assert is_dataclass(kind)
-    known = {field.name for field in fields(kind)}
-    without = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
+    known = {field.name for field in _written(kind)}
+    without = {f.name for f in _written(kind) if f.default is MISSING and f.default_factory is MISSING}
     needed = known if whole else without
     if needed <= set(given) <= known:
         return
