@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import forcegp
-from forcegp.checks import Report, check
+from forcegp.checks import Report, check, visibility
 from forcegp.constraints import ConstrainedSystem
 from forcegp.simulate import make_engine
 from planted_faults import FAULTS, REAL, Case, Fault, found, free_log, real_iiwa, real_pendulum, serious
@@ -100,6 +100,46 @@ def test_one_fault_does_not_hide_another(free: Case) -> None:
     tau[:, 2] += 4.0
     kinds = serious(check(system, log.replace(t=1e3 * log.t, tau=tau)))
     assert {"time-unit", "torque-sign", "torque-offset"} <= kinds
+
+
+def test_filtered_noise_is_reported_unless_the_log_declares_it(free: Case) -> None:
+    filtered = next(fault for fault in FAULTS if fault.kind == "noise-filtered")
+    system, log, _ = filtered.plant(*free)
+    assert serious(check(system, log)) == {"noise-filtered"}
+    declared = log.header.model_copy(update={"filtered": True})
+    assert serious(check(system, log.replace(header=declared))) == set()
+    small = declared.model_copy(update={"noise_std": 1e-3})
+    assert "noise-understated" in serious(check(system, log.replace(header=small)))
+
+
+def test_a_joint_that_turns_more_than_once_is_not_in_degrees() -> None:
+    robot = forcegp.load_robot("ur5")
+    log = free_log(robot, seconds=10.0)
+    q = log.q.copy()
+    q[:, 5] += 9.0
+    state = [torch.from_numpy(x) for x in (q, log.qd, log.qdd)]
+    tau = forcegp.dynamics.inverse_dynamics(robot, *state) - forcegp.dynamics.damping_force(robot, state[1])
+    for factor in (1.0, 0.1, -1.0):  # whatever the unit and sign of the torque
+        kinds = serious(check(ConstrainedSystem(robot, []), log.replace(q=q, tau=factor * tau.numpy())))
+        assert "position-limit" in kinds and "degrees" not in kinds
+
+
+def test_what_no_fault_can_reach_is_not_given_as_a_size(free: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An encoder off by more than half a turn, or a base on its head, is no size to wait for."""
+    sizes = {"encoder-offset": 4.0, "base-tilted": 181.0}
+    monkeypatch.setattr(visibility, "visible_size", lambda told, fault: sizes.get(fault.kind, 0.0))
+    (note,) = [finding for finding in check(*free).findings if finding.kind == "faults-hidden"]
+    assert "any encoder offset" in note.message and " rad" not in note.message
+    monkeypatch.setattr(visibility, "visible_size", lambda told, fault: 3.0)
+    (note,) = [finding for finding in check(*free).findings if finding.kind == "faults-hidden"]
+    assert "under 3 rad" in note.message
+
+
+def test_a_robot_without_contacts_is_not_said_to_lack_their_checks(free: Case) -> None:
+    wrong = next(fault for fault in FAULTS if fault.kind == "masses-mismatch")
+    system, log, _ = wrong.plant(*free)
+    report = check(system, log)
+    assert "masses-mismatch" in serious(report) and not report.skipped
 
 
 def test_an_empty_or_broken_log_is_refused_or_stopped(free: Case) -> None:

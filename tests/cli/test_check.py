@@ -93,3 +93,19 @@ def test_the_function_takes_a_data_set(log: Log) -> None:
     data = forcegp.Dataset(**columns, joint_names=robot.joint_names)
     report = forcegp.check(forcegp.ConstrainedSystem(robot), data)
     assert report.usable and report.count("error") == 0
+
+
+def test_a_robot_without_contacts_needs_no_scene(folder: Path, log: Log) -> None:
+    write(log, folder / "run.parquet")
+    data = ["-d", str(folder / "run.parquet")]
+    done = CliRunner().invoke(app, ["check", "--robot", "double_pendulum", *data])
+    assert done.exit_code == 0 and done.stdout.splitlines()[-1] == "verdict: go on", done.output
+    out = folder / "model"
+    done = CliRunner().invoke(
+        app, ["fit", "--robot", "double_pendulum", *data, "-m", "analytical", "-o", str(out)]
+    )
+    assert done.exit_code == 0 and out.is_dir(), done.output
+    for named in ([], ["--robot", "double_pendulum", "-s", str(folder / "scene.toml")]):
+        for command in (["check"], ["fit", "-o", str(folder / "other")]):
+            done = CliRunner().invoke(app, [*command, *data, *named])
+            assert done.exit_code != 0 and "either --scene or --robot" in str(done.exception), done.output

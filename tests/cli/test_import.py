@@ -42,7 +42,7 @@ def test_a_log_in_degrees_and_milliseconds_by_two_commands(tmp_path: Path) -> No
     told = run(log, "--robot", "double_pendulum", "--guess", mapping)
     assert "doubt 1" in told and "--mapping" in told and not out.exists()
     told = run(log, "--robot", "double_pendulum", "--mapping", mapping, "--out", out)
-    assert "300 of 300" in told and "segments" in told and "Savitzky-Golay" in told
+    assert "300 from 300 logged" in told and "segments" in told and "Savitzky-Golay" in told
     data = Dataset.read(out)
     # One multiplication and one division by a factor.
     np.testing.assert_allclose(data.q.numpy(), m.q, rtol=0.0, atol=1e-14)

@@ -127,6 +127,26 @@ def test_the_report_says_what_was_done(tmp_path: Path, robot: forcegp.RobotModel
     assert imported.report.format == "text" and imported.report.rows_read == 300
     assert any("Savitzky-Golay" in step for step in imported.data.header.provenance)
     assert seen[-1][0] == seen[-1][1] == path.stat().st_size
+    assert imported.data.header.filtered
+
+
+def test_a_log_that_holds_accelerations_is_not_said_to_be_filtered(
+    tmp_path: Path, robot: forcegp.RobotModel
+) -> None:
+    m = motion()
+    head = ",".join(["t", *(f"{name}.{joint}" for name in ("q", "qd", "qdd", "tau") for joint in (1, 2))])
+    path = tmp_path / "run.csv"
+    table = np.column_stack([m.t, m.q, m.qd, -np.array([4.0, 9.0]) * m.q, m.tau])
+    np.savetxt(path, table, delimiter=",", header=head, comments="")
+    toml = """
+    time = { column = "t" }
+    joints = { shoulder = "1", elbow = "2" }
+    position = { column = "q.{joint}", unit = "rad" }
+    velocity = { column = "qd.{joint}", unit = "rad/s" }
+    acceleration = { column = "qdd.{joint}", unit = "rad/s2" }
+    torque = { column = "tau.{joint}", unit = "Nm" }
+    """
+    assert not read_log(path, robot, parse_mapping(toml.encode(), "m.toml")).header.filtered
 
 
 def ur(name: str) -> forcegp.RobotModel:

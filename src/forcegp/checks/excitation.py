@@ -50,7 +50,10 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     still, found = still_joints(log), []
     if still.any():
         joints = tuple(log.joint_names[j] for j in np.flatnonzero(still))
-        text = f"{', '.join(joints)} moves by less than {STILL} rad: its friction and inertia are not seen"
+        verb, whose = ("moves", "its") if len(joints) == 1 else ("move", "their")
+        text = (
+            f"{', '.join(joints)} {verb} by less than {STILL} rad: {whose} friction and inertia are not seen"
+        )
         found.append(Finding("joint-still", text, log.all_rows, joints))
     if not log.header.ordered:
         return found, log
@@ -65,7 +68,8 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     if few.any():
         joints = tuple(log.joint_names[j] for j in np.flatnonzero(few))
         why = "friction looks like an offset"
-        text = f"{', '.join(joints)} changes direction fewer than {REVERSALS} times: {why}"
+        verb = "changes" if len(joints) == 1 else "change"
+        text = f"{', '.join(joints)} {verb} direction fewer than {REVERSALS} times: {why}"
         found.append(Finding("few-reversals", text, log.all_rows, joints))
     return found, log
 

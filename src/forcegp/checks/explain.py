@@ -212,7 +212,9 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
     """
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
-    return gains[0][0] > least and any(gain > SIGNIFICANT * error for gain, error in gains)
+    # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.
+    agree = all(gain > error for gain, error in gains)
+    return gains[0][0] > least and agree and any(gain > SIGNIFICANT * error for gain, error in gains)
 
 
 def _promising(

@@ -6,6 +6,8 @@ import numpy as np
 
 from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
+from forcegp.checks.fit import cross_validate
+from forcegp.checks.hypotheses import gain_hypothesis, problem_of
 from forcegp.checks.log import Log
 from forcegp.checks.statistics import Array, any_row, describe, intervals
 from forcegp.constraints import ConstrainedSystem
@@ -20,6 +22,8 @@ OFTENER = 5.0
 """Factor by which a clipped value occurs more often than its neighbours."""
 OFTEN = 0.05
 """Share of rows beyond the limits from which a wrong unit is considered."""
+UNIT_ROWS = 400
+"""Rows whose torque tells degrees from joints that turn more than once."""
 
 
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
@@ -32,7 +36,10 @@ def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
 
 
 def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Angles that leave the joint's range often, and would stay within it if they were in degrees."""
+    """Angles that leave the joint's range often, and would stay within it if they were in degrees.
+
+    A joint that turns more than once also leaves its range, so that the torque has to fit degrees better.
+    """
     low, high = _limits(system)["q"]
     turning = system.robot.revolute.cpu().numpy() > 0.0
     low, high = np.where(np.isfinite(low), low, -TURN), np.where(np.isfinite(high), high, TURN)
@@ -45,14 +52,26 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
     largest = float(np.abs(q[:, turning]).max())
     if outside < OFTEN or still > 0.0 or largest < TURN:
         return [], log
+    factor = np.where(turning, DEGREE, 1.0)
+    # Velocities follow the angles where they are their derivative; the check of units comes after.
+    radians = log.replace(**{name: getattr(log, name) * factor for name in _angles(log, turning)})
+    if _misfit(system, radians) > _misfit(system, log):
+        return [], log
     text = (
         f"angles reach {largest:.4g}, beyond the joint limits in {100 * outside:.0f} % of the rows: degrees"
     )
     names = tuple(np.array(log.joint_names)[turning])
-    factor = np.where(turning, DEGREE, 1.0)
-    found = Finding("degrees", text, log.all_rows, names, evidence={"largest": largest})
-    # Velocities follow the angles where they are their derivative; the check of units comes after.
-    return [found], log.replace(**{name: getattr(log, name) * factor for name in _angles(log, turning)})
+    return [Finding("degrees", text, log.all_rows, names, evidence={"largest": largest})], radians
+
+
+def _misfit(system: ConstrainedSystem, log: Log) -> float:
+    """Held-out error of the torque, each joint's up to a gain; 0 where no torque tells anything."""
+    rows = log.rows(UNIT_ROWS)
+    if len(rows) < UNIT_ROWS or not log.tau[rows].any():
+        return 0.0
+    gains = gain_hypothesis(log, rows, tuple(range(log.nq)))
+    fit = cross_validate(problem_of(system, log, rows), gains.columns, gains.prior, gains.joints)
+    return float(fit.score.mean())
 
 
 def _angles(log: Log, turning: np.ndarray) -> list[str]:

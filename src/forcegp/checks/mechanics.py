@@ -67,7 +67,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         # What happened in these rows must pass neither for friction nor for a mass.
         told = explain(system, smooth.mask(rows))
     found = [
-        *told.findings,
+        *_confounded(told),
         *_friction(system.robot, _with_other_friction(system, told)),
         *_offsets(told),
         *_unexplained(told),
@@ -133,6 +133,22 @@ def _with_other_friction(system: ConstrainedSystem, told: Explanation) -> Explan
         return told
     problem = replace(told.problem, nuisance=np.concatenate([told.problem.nuisance, columns], axis=-1))
     return replace(told, problem=problem, fit=cross_validate(problem, told.columns, told.prior))
+
+
+def _confounded(told: Explanation) -> list[Finding]:
+    """The faults found; gains are no error beside masses that do not fit, which are their yardstick."""
+    if "masses" not in told.robot:
+        return told.findings
+    return [
+        replace(
+            finding,
+            message=f"{finding.message}; or the masses, which do not fit either, are to blame for both",
+            weight="warning",
+        )
+        if finding.kind == "torque-current"
+        else finding
+        for finding in told.findings
+    ]
 
 
 def _friction(robot: RobotModel, told: Explanation) -> list[Finding]:

@@ -25,6 +25,8 @@ from forcegp.identification import parameter_vector, regressor
 
 LARGEST = 1e3
 """Sizes beyond this are not looked for."""
+MOST = {"encoder-offset": np.pi, "base-tilted": 180.0}
+"""Largest sizes that faults can have: half a turn, in rad and degrees."""
 SIZES = np.geomspace(1e-3, LARGEST, 200)
 """Sizes that are tried."""
 SPAN = 1
@@ -72,7 +74,9 @@ def check_visibility(system: ConstrainedSystem, told: Explanation) -> list[Findi
     if not hidden:
         return []
     texts = [
-        NEVER[kind].format(joint=joint) if size >= LARGEST else UNITS[kind].format(joint=joint, size=size)
+        NEVER[kind].format(joint=joint)
+        if size >= MOST.get(kind, LARGEST)
+        else UNITS[kind].format(joint=joint, size=size)
         for (kind, joint), size in hidden.items()
     ]
     more = f" and {len(texts) - 5} more" if len(texts) > 5 else ""

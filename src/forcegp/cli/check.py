@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, SceneName, check_apart, progress_bar, show
+from forcegp.cli.common import AsJson, RobotName, SceneOrNone, check_apart, progress_bar, show, system_of
 
 if TYPE_CHECKING:
     from forcegp.checks import Report
@@ -18,10 +18,11 @@ COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 
 def check(
-    scene: SceneName,
     data: Annotated[
         Path, typer.Option("--data", "-d", help="Log, .parquet or .csv; NaN and gaps are findings.")
     ],
+    scene: SceneOrNone = None,
+    robot: RobotName = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="HTML page with a picture of each finding.")
     ] = None,
@@ -37,23 +38,24 @@ def check(
     forcegp check --scene kuka_plane --data run.parquet
 
     forcegp check -s my_scene.toml -d run.parquet --out check.html --json
+
+    forcegp check --robot ur3.urdf --data run.parquet
     """
     from forcegp.checks import check as run
     from forcegp.checks import read_log
     from forcegp.destination import check_destination, write_or_keep
-    from forcegp.scene import load_scene
 
     if out is not None:
         check_destination(out)
         check_apart(out, data)
-    system = load_scene(scene).system()
+    system = system_of(scene, robot)
     log = read_log(data)
     with progress_bar("checking", 1) as progress:
         report = run(system, log, progress=progress)
     if out is not None:
         from forcegp.report.check import write_check
 
-        title = f"{data} on {scene}"
+        title = f"{data} on {scene or robot}"
         write_or_keep(lambda path: write_check(path, title, report, system, log), out)
     if as_json:
         show({**report.to_dict(), "page": str(out) if out else None}, as_json)

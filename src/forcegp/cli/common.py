@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
 import typer
 
 if TYPE_CHECKING:
+    from forcegp.constraints import ConstrainedSystem
     from forcegp.data import Dataset
     from forcegp.robot import RobotModel
-    from forcegp.scene import ModelTable, Scene
+    from forcegp.scene import ModelTable
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 SCENES = sorted(
@@ -24,6 +25,16 @@ SCENES = sorted(
 SceneName = Annotated[
     str,
     typer.Option("--scene", "-s", help=f"Scene file, or the name of a bundled one: {', '.join(SCENES)}."),
+]
+SceneOrNone = Annotated[
+    str | None,
+    typer.Option("--scene", "-s", help=f"Scene file, or the name of a bundled one: {', '.join(SCENES)}."),
+]
+RobotName = Annotated[
+    str | None,
+    typer.Option(
+        "--robot", help="In place of a scene without contacts: URDF or MJCF file, or a bundled robot."
+    ),
 ]
 ModelFolder = Annotated[Path, typer.Option("--model", "-m", help="Folder of a fitted model.")]
 DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
@@ -79,8 +90,12 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
     shown = {name: value for name, value in result.items() if value is not None and value != ()}
     width = max(len(name) for name in shown)
     for name, value in shown.items():
-        text = f"{value:.6g}" if isinstance(value, float) else str(value)
+        text = f"{value:.6g}" if isinstance(value, float) else _listed(value)
         typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
+
+
+def _listed(value: object) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def check_apart(out: Path, *inputs: Path) -> None:
@@ -126,8 +141,39 @@ def data_of_robot(data: Dataset, robot: RobotModel) -> Dataset:
     return data
 
 
-def model_table(config: Path | None, scene: Scene) -> ModelTable:
-    """The table [model] of a file of its own where one is given, else that of the scene."""
-    from forcegp.scene import load_model_table
+def check_robot_named(scene: str | None, robot: str | None) -> None:
+    """Check that either a scene or a robot was given.
 
-    return scene.model if config is None else load_model_table(config)
+    Raises:
+        ForceGPError: neither was, or both.
+    """
+    from forcegp.errors import ForceGPError
+
+    if (scene is None) == (robot is None):
+        problem = (
+            "nothing says which robot moved" if scene is None else "both --scene and --robot name a robot"
+        )
+        raise ForceGPError(problem, hint="give either --scene or --robot")
+
+
+def system_of(scene: str | None, robot: str | None) -> ConstrainedSystem:
+    """The robot of a scene with its contacts, or a robot without any.
+
+    Raises:
+        ForceGPError: neither is given, or both, or the file is not valid.
+    """
+    from forcegp.constraints import ConstrainedSystem
+    from forcegp.robot import load_robot
+    from forcegp.scene import load_scene
+
+    check_robot_named(scene, robot)
+    return load_scene(scene).system() if scene is not None else ConstrainedSystem(load_robot(str(robot)))
+
+
+def model_table(config: Path | None, scene: str | None) -> ModelTable:
+    """The table [model] of a file of its own where one is given, else that of the scene, if there is one."""
+    from forcegp.scene import default_model_table, load_model_table, load_scene
+
+    if config is not None:
+        return load_model_table(config)
+    return default_model_table() if scene is None else load_scene(scene).model

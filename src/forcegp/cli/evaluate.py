@@ -112,9 +112,8 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
             "nothing says which model to evaluate",
             expected="--model FOLDER, or --scene and --train to fit one",
         )
-    read = load_scene(scene)
-    system = read.system()
-    regression = configured(model_table(config, read), system)
+    system = load_scene(scene).system()
+    regression = configured(model_table(config, scene), system)
     training = data_of_robot(read_data(train), system.robot)
     with progress_bar(f"fitting {regression.name}", 1) as progress:
         return regression.fit(

@@ -14,13 +14,15 @@ from forcegp.cli.common import (
     Config,
     DataFiles,
     Differentiate,
-    SceneName,
+    RobotName,
+    SceneOrNone,
     check_apart,
     data_of_robot,
     model_table,
     progress_bar,
     read_data,
     show,
+    system_of,
 )
 
 if TYPE_CHECKING:
@@ -33,9 +35,10 @@ STREAM_ROWS = 100_000
 
 
 def fit(
-    scene: SceneName,
     data: DataFiles,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fitted model.")],
+    scene: SceneOrNone = None,
+    robot: RobotName = None,
     model: Annotated[
         str | None,
         typer.Option(
@@ -73,12 +76,13 @@ def fit(
 
     forcegp fit -s my_scene.toml -d train.parquet --config model.toml -o model/
 
+    forcegp fit --robot ur3.urdf -d train.parquet -o model/
+
     forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model/
     """
     from forcegp.destination import check_destination, write_or_keep
     from forcegp.errors import DestinationError
     from forcegp.models.configured import configured
-    from forcegp.scene import load_scene
     from forcegp.storage.folder import check_model_destination
     from forcegp.storage.sums import beside
 
@@ -92,9 +96,8 @@ def fit(
                 got=checkpoint,
                 hint="name a file outside of it",
             )
-    read = load_scene(scene)
-    system = read.system()
-    regression = configured(model_table(config, read), system, name=model, noise_std=noise_std, seed=seed)
+    system = system_of(scene, robot)
+    regression = configured(model_table(config, scene), system, name=model, noise_std=noise_std, seed=seed)
     training = _training(regression.model, data, differentiate, system.robot)
     with progress_bar(f"fitting {regression.name}", 1) as progress:
         fitted = regression.fit(
@@ -111,6 +114,8 @@ def fit(
             file.unlink(missing_ok=True)
     _warn(fitted.result)
     figures = {name: value for name, value in asdict(fitted.result).items() if name != "history"}
+    if not as_json:
+        del figures["warnings"]  # printed above
     show({"model": regression.name, "training_points": len(training), **figures, "folder": str(out)}, as_json)
 
 

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from forcegp.cli.common import AsJson, check_apart, progress_bar, show
+from forcegp.cli.common import (
+    AsJson,
+    RobotName,
+    SceneOrNone,
+    check_apart,
+    check_robot_named,
+    progress_bar,
+    show,
+    system_of,
+)
 
 if TYPE_CHECKING:
     from forcegp.constraints import ConstrainedSystem
@@ -16,12 +25,8 @@ if TYPE_CHECKING:
 
 def import_(
     log: Annotated[Path, typer.Argument(help="Log file or folder.")],
-    scene: Annotated[
-        str | None, typer.Option("--scene", "-s", help="Scene file, or the name of a bundled one.")
-    ] = None,
-    robot: Annotated[
-        str | None, typer.Option(help="In place of a scene: URDF or MJCF file, or a bundled robot.")
-    ] = None,
+    scene: SceneOrNone = None,
+    robot: RobotName = None,
     mapping: Annotated[
         str | None, typer.Option("--mapping", "-m", help="Mapping file, or the name of a bundled one.")
     ] = None,
@@ -60,18 +65,17 @@ def import_(
     from forcegp.errors import ForceGPError
     from forcegp.logs import import_log
 
-    if (scene is None) == (robot is None):
-        raise ForceGPError("nothing says which robot moved", hint="give either --scene or --robot")
+    check_robot_named(scene, robot)
     if guess is not None:
         check_destination(guess)
         check_apart(guess, log)
-        show(_guess(log, _system(scene, robot), guess), as_json)
+        show(_guess(log, system_of(scene, robot), guess), as_json)
         return
     if out is None or out.suffix.lower() != ".parquet":
         raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
     check_destination(out)
     check_apart(out, log)
-    system = _system(scene, robot)
+    system = system_of(scene, robot)
     with progress_bar(f"reading {log.name}", 1) as advance:
         imported = import_log(log, system, mapping, progress=advance)
     write_or_keep(imported.data.write, out)
@@ -79,14 +83,6 @@ def import_(
     if fit_surface is not None:
         result |= _surfaces(imported, system, fit_surface, _tip_radius(tip_radius))
     show(result | {"file": str(out)}, as_json)
-
-
-def _system(scene: str | None, robot: str | None) -> ConstrainedSystem:
-    from forcegp.constraints import ConstrainedSystem
-    from forcegp.robot import load_robot
-    from forcegp.scene import load_scene
-
-    return load_scene(scene).system() if scene is not None else ConstrainedSystem(load_robot(str(robot)))
 
 
 def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]:
@@ -105,7 +101,7 @@ def _summary(imported: Imported) -> dict[str, object]:
     """Rows, trajectories and period, then what was found and done."""
     data, report = imported.data, imported.report
     result: dict[str, object] = {
-        "rows": f"{len(data)} of {report.rows_read}",
+        "rows": f"{len(data)} from {report.rows_read} logged",
         "segments": int(data.segment[-1]) + 1,
         "period_s": data.header.dt,
     }

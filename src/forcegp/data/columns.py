@@ -176,4 +176,4 @@ def _fill_in(
     if "qdd" not in absent:
         return header.with_step(step)
     noise = float(np.sqrt(np.mean(fields["extras"]["qdd_std"] ** 2)))
-    return header.with_step(step, noise_std=noise)
+    return header.with_step(step, noise_std=noise, filtered=True)

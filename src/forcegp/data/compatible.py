@@ -36,8 +36,14 @@ def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
         f"joint {missing[0]!r} of robot {robot!r} is not in the data",
         expected=", ".join(want),
         got=", ".join(have),
-        hint=f"is {near[0]!r} in the data the same joint? Rename its columns" if near else None,
+        hint=f"is {near[0]!r} in the data the same joint? Rename its columns" if near else lock_hint(missing),
     )
+
+
+def lock_hint(joints: Sequence[str]) -> str:
+    """How to treat joints that a log lacks, such as those of a gripper, as fixed."""
+    positions = ", ".join(f"{joint} = 0.0" for joint in joints)
+    return f"if they did not move, lock them: locked_joints = {{ {positions} }} under [robot] in a scene file"
 
 
 def check_robot(data: Fields, robot: RobotModel) -> None:
@@ -98,6 +104,7 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))
     agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
     agreed["ordered"] = all(header.ordered for header in headers)
+    agreed["filtered"] = any(header.filtered for header in headers)
     return DataHeader(**agreed)
 
 

@@ -15,6 +15,8 @@ class DataHeader(Header):
     Attributes:
         dt: sampling period [s].
         noise_std: standard deviation of the noise on q̈ [rad/s²].
+        filtered: q̈ was computed by a filter, so that its noise is correlated in time; otherwise `noise_std`
+            claims white noise.
         robot: name of the robot.
         robot_fingerprint: `RobotModel.fingerprint` of the robot that moved.
         seed: seed of the random numbers that went into the data.
@@ -28,6 +30,7 @@ class DataHeader(Header):
 
     dt: PositiveFloat | None = None
     noise_std: NonNegativeFloat | None = None
+    filtered: bool = False
     robot: str | None = None
     robot_fingerprint: str | None = None
     seed: int | None = None

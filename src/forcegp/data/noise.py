@@ -26,7 +26,9 @@ def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset
     clean = data.extras.get("qdd_clean", data.qdd)
     noise = torch.randn(clean.shape, dtype=clean.dtype, device=generator.device, generator=generator)
     header = data.header.with_step(
-        f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}", noise_std=std
+        f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}",
+        noise_std=std,
+        filtered=False,
     )
     return data.replace(
         qdd=clean + std * noise.to(clean.device), extras={**data.extras, "qdd_clean": clean}, header=header

@@ -172,6 +172,7 @@ def _dataset(
     header = DataHeader(
         dt=dt,
         noise_std=None if std is None else float(np.sqrt(np.mean(std**2))),
+        filtered=std is not None,
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,
         provenance=tuple(report.steps),

@@ -12,6 +12,7 @@ from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 
+from forcegp.data.compatible import lock_hint
 from forcegp.errors import MappingError
 from forcegp.logs import units
 from forcegp.logs.sections import MappingSections, PerJoint, QuantitySection
@@ -63,8 +64,12 @@ class Mapping:
             elif section.column is not None and (joint in self.sections.joints or not self.sections.joints):
                 found.append(section.column.replace("{joint}", self.sections.joints.get(joint, joint)))
             else:
+                missing = [j for j in joints if j not in section.columns and j not in self.sections.joints]
                 raise self.error(
-                    (name,), f"joint {joint!r} has no column", expected=f"{joint} = under columns"
+                    (name,),
+                    f"joint {joint!r} has no column",
+                    expected=f"{joint} = under columns",
+                    hint=lock_hint(missing),
                 )
         if len(set(found)) < len(found):
             twice = next(c for c in found if found.count(c) > 1)

@@ -108,7 +108,7 @@ def unit_axis(axis: np.ndarray, where: str) -> np.ndarray:
 
 
 def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
-    """The tree with some joints fixed at given positions [rad, m].
+    """The tree with some joints fixed at given positions [rad, m], and with them the joints that follow them.
 
     Raises:
         UnknownNameError: a joint does not exist.
@@ -121,10 +121,23 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
         if not np.isfinite(q):
             raise RobotFileError(f"{tree.label}: joint {name!r} cannot be locked", expected="a number", got=q)
 
+    held = _with_followers(tree, locked)
+
     def lock(joint: Joint) -> Joint:
-        if joint.kind == "fixed" or joint.name not in locked:
+        if joint.kind == "fixed" or joint.name not in held:
             return joint
-        motion = joint_motion(joint.kind, joint.axis, float(locked[joint.name]))
+        motion = joint_motion(joint.kind, joint.axis, held[joint.name])
         return replace(joint, kind="fixed", placement=joint.placement @ motion, refused="")
 
     return replace(tree, joints=tuple(lock(joint) for joint in tree.joints))
+
+
+def _with_followers(tree: Tree, locked: Mapping[str, float]) -> dict[str, float]:
+    """Positions of locked joints and of those that mimic them, q = multiplier · leader + offset."""
+    held = {name: float(q) for name, q in locked.items()}
+    for _ in tree.joints:  # a follower may lead another joint
+        for joint in tree.joints:
+            if joint.follows is not None and joint.follows[0] in held:
+                leader, multiplier, offset = joint.follows
+                held.setdefault(joint.name, multiplier * held[leader] + offset)
+    return held

@@ -1,5 +1,5 @@
 """Scene files."""
 
-from forcegp.scene.load import BUNDLED, ModelTable, Scene, load_model_table, load_scene
+from forcegp.scene.load import BUNDLED, ModelTable, Scene, default_model_table, load_model_table, load_scene
 
-__all__ = ["BUNDLED", "ModelTable", "Scene", "load_model_table", "load_scene"]
+__all__ = ["BUNDLED", "ModelTable", "Scene", "default_model_table", "load_model_table", "load_scene"]

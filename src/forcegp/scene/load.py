@@ -145,6 +145,11 @@ def load_scene(source: str | Path) -> Scene:
     return Scene(document.validated(SceneSections), document, path.parent)
 
 
+def default_model_table() -> ModelTable:
+    """The table `[model]` of a scene that has none."""
+    return ModelTable(ModelSection(), Document(b"", "default model"))
+
+
 def load_model_table(path: str | Path) -> ModelTable:
     """Read a file with the table `[model]` alone.
 
