@@ -3,10 +3,10 @@
     python benchmarks/solver_arms.py --json result.json          # some minutes
     python benchmarks/solver_arms.py --arm ur5 --seed 3
 
-Each arm differs from its file: masses of links, inertia of drives, dry and viscous friction, offsets and gains
-of the torque sensors, all drawn at random. Encoders are rounded, torques are noisy, accelerations come from
-the encoders alone. None of this library's equations of motion plays a part. Nothing in the library was chosen
-on these logs; errors are counted as on real logs (`real_logs.py`), on another motion than that of the training.
+Each arm differs from its file in masses of links, inertia of drives, dry and viscous friction, offsets and
+gains of the torque sensors, all drawn at random. Encoders are rounded, torques noisy, and accelerations come
+from the encoders alone. None of this library's equations of motion plays a part. Errors are counted as on
+real logs (`real_logs.py`), on another motion than that of the training.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def sines(
     q = np.tile((low + high) / 2.0, (len(t), 1))
     qd, qdd = np.zeros_like(q), np.zeros_like(q)
     for k in range(1, 6):
-        w = 0.2 * np.pi * k
+        w = 0.2 * np.pi * k * random.uniform(0.8, 1.2, robot.nq)  # a motion that does not repeat itself
         size = REACH * (high - low) / 5.0 * random.uniform(0.3, 1.0, robot.nq) / k**0.5
         angle = w * t[:, None] + random.uniform(0.0, 2.0 * np.pi, robot.nq)
         q, qd, qdd = (

@@ -73,9 +73,9 @@ class StructuredGP(Model[StructuredFit]):
             and the result of the fit says where more would help.
         state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
             or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
-        inertia: `"file"` keeps that of the robot; `"auto"` adds inertia of drives or an `InertialPrior`
-            where held-out stretches of the log ask for it (`forces/inertia.py`), as the defaults of a
-            measured robot do. It needs a `JointFrictionPrior` and a mean with the motor torque.
+        inertia: `"file"` keeps that of the robot; `"auto"` identifies links and drives where held-out
+            stretches of the log ask for it (`forces/inertia.py`), as the defaults of a measured robot do. It
+            needs a `JointFrictionPrior` and a mean with the motor torque.
         standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
             in the paper.
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
