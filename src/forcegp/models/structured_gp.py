@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
@@ -30,6 +29,7 @@ from forcegp.forces.priors.base import (
     mean_of,
 )
 from forcegp.forces.priors.default import default_priors
+from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.start import Search, initial
 from forcegp.forces.state_noise import state_std_of
 from forcegp.forces.student_t import check_degrees
@@ -40,6 +40,7 @@ from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Lesson, in_motion, prepared, solve
 from forcegp.models.structured_spec import Specification, check_inertia, torque_noise_of
 from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
+from forcegp.robot.model import RobotModel
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
@@ -72,9 +73,9 @@ class StructuredGP(Model[StructuredFit]):
             and the result of the fit says where more would help.
         state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
             or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
-        inertia: `"file"` keeps that of the robot; `"auto"` adds inertia of drives or an `InertialPrior`
-            where held-out stretches of the log ask for it (`forces/inertia.py`), as the defaults of a
-            measured robot do. It needs a `JointFrictionPrior` and a mean with the motor torque.
+        inertia: `"file"` keeps that of the robot; `"auto"` identifies links and drives where held-out
+            stretches of the log ask for it (`forces/inertia.py`), as the defaults of a measured robot do. It
+            needs a `JointFrictionPrior` and a mean with the motor torque.
         standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
             in the paper.
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
@@ -224,7 +225,7 @@ class StructuredGP(Model[StructuredFit]):
         spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
         options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
         chosen = None if learn is None else self._chosen(learn)
-        training, armature, doubts = self._with_inertia(known, chosen)
+        training, robot, pinned, doubts = self._with_inertia(known, chosen)
         spec = self.specification
         spec.system.announce_states(training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
         log = None
@@ -233,10 +234,8 @@ class StructuredGP(Model[StructuredFit]):
             log = Pass(spec, sample, file, progress, distributed)
             neighbours = neighbours_of(spec, sample, training)
         problem = spec.problem(training)
-        robot = spec.system.robot
-        if armature is not None and spec.parameters is None and not torch.equal(armature, robot.armature):
-            robot = robot.replace(armature=armature)
-            problem = dataclasses.replace(problem, system=spec.system.with_robot(robot))
+        if robot is not spec.system.robot:
+            problem = dataclasses.replace(problem, system=spec.system.with_robot(robot), pinned=pinned)
         search, saved = self._search(problem, chosen, options), None
         if search.start:
             if file is not None:
@@ -264,18 +263,25 @@ class StructuredGP(Model[StructuredFit]):
 
     def _with_inertia(
         self, data: Dataset | Sequence[Observation], chosen: Sequence[str] | None
-    ) -> tuple[Training, Tensor | None, tuple[str, ...]]:
-        """Training data, the drives' inertia, and doubts; a first fit may add a prior on inertia."""
+    ) -> tuple[Training, RobotModel, tuple[str, ...], tuple[str, ...]]:
+        """Training data, the robot to learn with, the priors whose force it contains, and doubts.
+
+        A first fit may identify the robot, and then adds a prior on what it does not know of it.
+        """
         training, doubts = self._training(data, chosen)
-        if self._fitted is not None:
-            return training, self._fitted.system.robot.armature, doubts
-        if chosen is not None:
-            return training, None, doubts
-        before = self.specification.priors
-        self.specification, found = self.specification.with_inertia_of(training)
-        if self.specification.priors != before:
-            training, _ = self._training(data, chosen)
-        return training, found.robot.armature, (*doubts, *found.doubts)
+        spec = self.specification
+        if self._fitted is not None and not self._fitted.problem.offsets:
+            return training, self._fitted.system.robot, self._fitted.problem.pinned, doubts
+        if self._fitted is not None or chosen is not None:
+            return training, spec.system.robot, (), doubts
+        found = spec.inertia_of(training)
+        doubts = (*doubts, *found.doubts)
+        if not found.identified:
+            return training, found.robot, (), doubts
+        left = InertialPrior().around(spec.system.robot)
+        self.specification = dataclasses.replace(spec, priors=(*spec.priors, left))
+        training, _ = self._training(data, chosen)
+        return training, found.robot, (left.name,), doubts
 
     def _search(self, problem: Problem, chosen: Sequence[str] | None, options: LearningOptions) -> Search:
         """What is learned of a problem, from where, and what keeps its values."""
