@@ -114,8 +114,8 @@ class Equations:
     def rank(self) -> Tensor:
         """`(*batch,)` number of independent active constraint rows."""
         W = self.scaled_jacobian
-        if W.shape[-2] == 0:
-            return torch.zeros(W.shape[:-2], dtype=torch.int64, device=W.device)
+        if W.shape[-2] <= 1:
+            return W.any(-1).sum(-1)
         return torch.linalg.matrix_rank(W, rtol=rank_tolerance(W.dtype))
 
     @cached_property

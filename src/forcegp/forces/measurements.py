@@ -215,7 +215,7 @@ def _checked_noise(noise: NoiseStd, quantity: str, values: Tensor) -> Tensor:
             expected=f"one number, {values.shape[-1]}, or {tuple(values.shape)}",
             got=f"shape {tuple(std.shape)}",
         )
-    if not bool((std > 0.0).all()) or not bool(torch.isfinite(std).all()):
+    if not bool(((std > 0.0) & (std < math.inf)).all()):
         raise ModelError("a noise standard deviation must be positive and finite", got=noise)
     return std.clone() if std.ndim == 2 else std.expand(values.shape[-1]).clone()
 

@@ -137,7 +137,11 @@ def _moving_point(position: Vector, jacobian: Vector, bias: Vector, qd: Vector) 
 
 def _contact_points(contacts: Sequence[Constraint], found: Sequence) -> dict[str, ContactPoint]:
     named = ((contact.name, terms.point) for contact, terms in zip(contacts, found, strict=True))
-    return {name: ContactPoint(*(x.numpy() for x in at)) for name, at in named if at is not None}
+    return {
+        name: ContactPoint(*(x.numpy() for x in (at.position, at.velocity, at.jacobian, at.normal)))
+        for name, at in named
+        if at is not None
+    }
 
 
 def _blocks(system: ConstrainedSystem, anchors: Sequence[Anchor]) -> tuple[Blocks, bool]:
