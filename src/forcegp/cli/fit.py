@@ -75,23 +75,12 @@ def fit(
 
     forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model/
     """
-    from forcegp.destination import check_destination, write_or_keep
-    from forcegp.errors import DestinationError
+    from forcegp.destination import write_or_keep
     from forcegp.models.configured import configured
     from forcegp.scene import load_scene
-    from forcegp.storage.folder import check_model_destination
     from forcegp.storage.sums import beside
 
-    check_model_destination(out)
-    if checkpoint is not None:
-        check_destination(checkpoint)
-        check_apart(checkpoint, *data)
-        if out.resolve() in checkpoint.resolve().parents:
-            raise DestinationError(
-                "the checkpoint would lie in the folder of the model, which is written as a whole",
-                got=checkpoint,
-                hint="name a file outside of it",
-            )
+    _check_places(out, checkpoint, data)
     read = load_scene(scene)
     system = read.system()
     regression = configured(model_table(config, read), system, name=model, noise_std=noise_std, seed=seed)
@@ -112,6 +101,29 @@ def fit(
     _warn(fitted.result)
     figures = {name: value for name, value in asdict(fitted.result).items() if name != "history"}
     show({"model": regression.name, "training_points": len(training), **figures, "folder": str(out)}, as_json)
+
+
+def _check_places(out: Path, checkpoint: Path | None, data: list[Path]) -> None:
+    """Check that the model and the checkpoint can be written, apart from the data and from each other.
+
+    Raises:
+        DestinationError: they cannot.
+    """
+    from forcegp.destination import check_destination
+    from forcegp.errors import DestinationError
+    from forcegp.storage.folder import check_model_destination
+
+    check_model_destination(out)
+    if checkpoint is None:
+        return
+    check_destination(checkpoint)
+    check_apart(checkpoint, *data)
+    if out.resolve() in checkpoint.resolve().parents:
+        raise DestinationError(
+            "the checkpoint would lie in the folder of the model, which is written as a whole",
+            got=checkpoint,
+            hint="name a file outside of it",
+        )
 
 
 def _training(

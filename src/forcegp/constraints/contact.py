@@ -72,16 +72,12 @@ class ContactPoint:
         return normalize(self.normal, dim=-1)
 
     @cached_property
-    def sliding_jacobian(self) -> Tensor:
-        """(1 − n nᵀ) J_E `(*batch, 3, nq)`, the motion along the surface."""
+    def sliding(self) -> tuple[Tensor, Tensor]:
+        """Jacobian (1 − n nᵀ) J_E `(*batch, 3, nq)` and velocity (1 − n nᵀ) ṗ `(*batch, 3)` along the
+        surface."""
         n = self.unit_normal[..., None]
-        return self.jacobian - n @ (n.mT @ self.jacobian)
-
-    @cached_property
-    def sliding_velocity(self) -> Tensor:
-        """(1 − n nᵀ) ṗ `(*batch, 3)`, the velocity along the surface."""
-        n = self.unit_normal
-        return self.velocity - n * (n * self.velocity).sum(-1, keepdim=True)
+        along = self.velocity - (n @ (n.mT @ self.velocity[..., None]))[..., 0]
+        return self.jacobian - n @ (n.mT @ self.jacobian), along
 
 
 class ConstraintTerms(NamedTuple):

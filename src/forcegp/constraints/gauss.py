@@ -156,6 +156,14 @@ class Equations:
         free = self.free_acceleration(Q_bar)
         return free + (self.L @ (self.b - (self.A @ free[..., None])[..., 0])[..., None])[..., 0]
 
+    def motion_under(self, Q_bar: JointVector) -> tuple[JointVector, ConstraintVector]:
+        """q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, as a step of a rollout needs them."""
+        free = self.free_acceleration(Q_bar)
+        multiplier = (self.constraint_inertia @ (self.b - (self.A @ free[..., None])[..., 0])[..., None])[
+            ..., 0
+        ]
+        return free + (self.M_inv_At @ multiplier[..., None])[..., 0], multiplier
+
     def multiplier(self, Q_bar: JointVector) -> ConstraintVector:
         """λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) (eq. 16, with all impressed forces), `(*batch, m)`."""
         residual = self.b - (self.A @ self.free_acceleration(Q_bar)[..., None])[..., 0]

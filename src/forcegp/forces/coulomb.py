@@ -80,10 +80,8 @@ def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
 
 def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tensor:
     """u = −J_Eᵀ s(v), the generalized force of a unit friction force, `(n, nq)`."""
-    point = at.eom.contact_points[contact]
-    v = point.sliding_velocity
-    s = v / (v.square().sum(-1, keepdim=True) + smoothing**2).sqrt()
-    return -(point.sliding_jacobian.mT @ s[..., None])[..., 0]
+    J, v = at.eom.contact_points[contact].sliding
+    return -(J.mT @ (v / (v.square().sum(-1, keepdim=True) + smoothing**2).sqrt())[..., None])[..., 0]
 
 
 def coupled(

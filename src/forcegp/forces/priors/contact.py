@@ -94,7 +94,7 @@ def _along(point: ContactPoint, name: str) -> Tensor:
     """An input along the surface: `position` or `velocity` in the tangent frame, or the sliding `speed`."""
     if name == "speed":
         # The floor keeps the derivative of the root finite at rest.
-        return point.sliding_velocity.square().sum(-1, keepdim=True).clamp(min=1e-30).sqrt()
+        return point.sliding[1].square().sum(-1, keepdim=True).clamp(min=1e-30).sqrt()
     return (tangent_frame(point.unit_normal).mT @ getattr(point, name)[..., None])[..., 0]
 
 

@@ -103,9 +103,9 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return len(self.terms)
 
     def directions(self, system: ConstrainedSystem, at: States) -> Tensor:
-        point = at.eom.contact_points[self.contact]
-        square = point.sliding_velocity.square().sum(-1, keepdim=True)
-        against = -(point.sliding_jacobian.mT @ point.sliding_velocity[..., None])[..., 0]
+        J, v = at.eom.contact_points[self.contact].sliding
+        square = v.square().sum(-1, keepdim=True)
+        against = -(J.mT @ v[..., None])[..., 0]
         dry = against / (square + self.smoothing**2).sqrt()
         columns = {"viscous": against, "dry": dry}
         if set(self.terms) & set(LOADED):
