@@ -11,7 +11,7 @@ from forcegp import dynamics
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import correlation_times
 from forcegp.forces.inertia import Inertia, Rows, difference, inertia_of, is_harmless, sums
-from forcegp.forces.measurements import training_of
+from forcegp.forces.observations import training_of
 from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior

@@ -18,7 +18,7 @@ from torch import Tensor
 import forcegp
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.errors import DataError, ForceGPError, ModelError, ShapeError, UnknownNameError
-from forcegp.forces.measurements import Observation
+from forcegp.forces.observations import Observation
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.operator import OperatorForcePrior

@@ -18,7 +18,8 @@ from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.inference import check_method
 from forcegp.forces.learn import Problem
-from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
+from forcegp.forces.measurements import Training
+from forcegp.forces.observations import NoiseStd, Observation, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import (
     ANALYTICAL,
