@@ -227,11 +227,12 @@ def _run(
     system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
     problem = Problem(mechanics, law, inputs, unilateral, options.sticking)
+    initial = _initial(problem, start, whole, active)
     with one_thread() if n <= FEW else nullcontext():
         found = integrate(
             problem,
             METHODS[options.method],
-            _initial(problem, start, whole, active),
+            initial,
             dt,
             steps,
             project=options.stabilization == "projection",
