@@ -210,17 +210,19 @@ def whiten(
     if not has_fixed:
         block, log_determinant = everything.whitened(weight)
         return WhitenedRows([block], lambda: log_determinant + _log_scale(std, weight))
-    A, groups, blocks, log_determinants = at.eom.A * std[:, None, :], _by_rank(at.eom.rank), [], []
+    A, b, values = at.eom.A, at.eom.b, measurement.values
+    scaled, groups, blocks, log_determinants = A * std[:, None, :], _by_rank(at.eom.rank), [], []
     for rank, own in groups:
-        U = null_space_basis(_independent(A[own], rank)[0], rank)
+        U = null_space_basis(_independent(scaled[own], rank)[0], rank)
         block, log_determinant = everything.of(own, U).whitened(None if weight is None else weight[own])
         blocks.append(block)
         log_determinants.append(log_determinant)
 
     def constant() -> Tensor:
-        violated = (at.eom.A @ measurement.values[..., None])[..., 0] - at.eom.b
+        # What this function keeps alive is small beside the equations of motion.
+        violated = (A @ values[..., None])[..., 0] - b
         weights = torch.ones_like(violated[:, 0]) if weight is None else weight
-        fixed = [_fixed(A[own], rank, violated[own], weights[own]) for rank, own in groups]
+        fixed = [_fixed(scaled[own], rank, violated[own], weights[own]) for rank, own in groups]
         return sum([*log_determinants, *fixed], start=_log_scale(std, weight))
 
     return WhitenedRows(blocks, constant)
