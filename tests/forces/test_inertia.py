@@ -10,7 +10,8 @@ import forcegp
 from forcegp import dynamics
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import correlation_times
-from forcegp.forces.inertia import Inertia, Rows, difference, inertia_of, is_harmless, sums
+from forcegp.forces.inertia import Inertia, difference, inertia_of, is_harmless
+from forcegp.forces.inverse_dynamics import APART, Rows, instrumental, partners, products, sums
 from forcegp.forces.observations import training_of
 from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.inertial import InertialPrior
@@ -24,7 +25,12 @@ ROUNDING = 1e-8
 
 
 def log(
-    robot: RobotModel, n: int = 1600, speed: float = 1.0, seed: int = 0, segments: int = 8
+    robot: RobotModel,
+    n: int = 1600,
+    speed: float = 1.0,
+    seed: int = 0,
+    segments: int = 8,
+    acceleration_noise: float = 0.0,
 ) -> forcegp.Dataset:
     """Torques that move a robot with joint friction along sums of sines, measured with noise."""
     generator = torch.Generator().manual_seed(seed)
@@ -38,6 +44,7 @@ def log(
     noise = NOISE * torch.randn(n, 2, generator=generator, dtype=torch.float64)
     friction = 0.3 * qd + 0.4 * torch.tanh(qd / 0.02)
     tau = dynamics.inverse_dynamics(robot, q, qd, qdd) + friction + noise
+    qdd = qdd + acceleration_noise * torch.randn(n, 2, generator=generator, dtype=torch.float64)
     return forcegp.Dataset(t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names, segment=segment)
 
 
@@ -56,25 +63,77 @@ def found(file: RobotModel, data: forcegp.Dataset) -> Inertia:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_right_file_is_kept(file: RobotModel, seed: int) -> None:
     result = found(file, log(file, seed=seed))
-    assert result.robot is file and not result.learned and not result.doubts
+    assert result.robot is file and not result.identified and not result.doubts
 
 
 def test_inertia_of_drives_that_the_file_lacks_is_found(file: RobotModel) -> None:
     """Not taken for inertia of the links, which would load the other joint too."""
     armature = torch.tensor([0.3, 0.1], dtype=torch.float64)
     result = found(file, log(file.replace(armature=armature)))
-    assert not result.learned and "the drives have inertia" in result.doubts[0]
+    assert not result.identified and "the drives have inertia" in result.doubts[0]
     torch.testing.assert_close(result.robot.armature, armature, rtol=0.1, atol=0.0)
 
 
-def test_links_that_the_file_describes_wrongly_are_learned(file: RobotModel) -> None:
+def inertia_error(robot: RobotModel, truth: RobotModel, data: forcegp.Dataset) -> float:
+    """Relative error of the mass matrix over a log."""
+    M, exact = (dynamics.mass_matrix(each, data.q) for each in (robot, truth))
+    return float(((M - exact).square().sum() / exact.square().sum()).sqrt())
+
+
+def test_links_that_the_file_describes_wrongly_are_identified(file: RobotModel) -> None:
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
-    result = found(file, log(truth))
-    assert result.learned and result.robot is file and "inertial parameters" in result.doubts[0]
+    data = log(truth)
+    result = found(file, data)
+    assert result.identified and "inertial parameters" in result.doubts[0]
+    assert inertia_error(result.robot, truth, data) < 0.25 * inertia_error(file, truth, data)
     system = forcegp.ConstrainedSystem(file)
     model = forcegp.StructuredGP(system, "analytical")
-    model.fit(log(truth, 800))
-    assert any(isinstance(prior, InertialPrior) for prior in model.force_priors)
+    fitted = model.fit(log(truth, 800))
+    assert inertia_error(fitted.system.robot, truth, data) < 0.25 * inertia_error(file, truth, data)
+    prior = next(prior for prior in model.force_priors if isinstance(prior, InertialPrior))
+    assert fitted.problem.pinned == (prior.name,), "its mean is in the robot, its uncertainty remains"
+    again = model.fit(log(truth, 800), learn=["joint_friction"])
+    torch.testing.assert_close(again.system.robot.mass, fitted.system.robot.mass, rtol=0.0, atol=0.0)
+    assert again.problem.pinned == (prior.name,)
+
+
+def test_links_and_drives_are_identified_together(file: RobotModel) -> None:
+    armature = torch.tensor([0.3, 0.1], dtype=torch.float64)
+    truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com, armature=armature)
+    data = log(truth)
+    result = found(file, data)
+    assert result.identified and "the drives have inertia" in result.doubts[1]
+    assert inertia_error(result.robot, truth, data) < 0.15 * inertia_error(file, truth, data)
+
+
+@pytest.mark.parametrize("noise", [0.0, 10.0])
+def test_noise_of_accelerations_does_not_make_inertia_smaller(file: RobotModel, noise: float) -> None:
+    """As large as a third of the accelerations; least squares lose a tenth of the inertia by it."""
+    truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
+    data = log(truth, 6400, 2.0, acceleration_noise=noise)
+    result = found(file, data)
+    assert result.identified
+    own, exact = (dynamics.mass_matrix(each, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
+                  for each in (result.robot, truth))  # fmt: skip
+    torch.testing.assert_close(own, exact, rtol=0.04, atol=0.0)
+
+
+def test_a_partner_is_later_in_the_same_trajectory(file: RobotModel) -> None:
+    system, prior = forcegp.ConstrainedSystem(file), JointFrictionPrior()
+    data = log(file, speed=0.5)
+    m = training_of(data, system, (prior,), None, {}).measurements[0]
+    later = partners(m)
+    paired = (later >= 0).nonzero()[:, 0]
+    assert len(paired) == len(data) - 8 * 5, "five samples of 0.01 s at the end of each of eight trajectories"
+    assert bool((m.segment[later[paired]] == m.segment[paired]).all())
+    torch.testing.assert_close(m.t[later[paired]] - m.t[paired], torch.full((len(paired),), APART).double())
+    shuffled = torch.randperm(len(m.t), generator=torch.Generator().manual_seed(0))
+    again = m[shuffled]
+    found = partners(again)
+    torch.testing.assert_close(
+        again.t[found[found >= 0]] - again.t[found >= 0], m.t[later[paired]] - m.t[paired]
+    )
+    assert not bool((partners(m[torch.arange(0, len(m.t), 50)]) >= 0).any()), "half a second apart is too far"
 
 
 def test_accelerations_below_the_noise_of_the_torque_damp_the_drives_without_harm_to_torques(
@@ -85,7 +144,7 @@ def test_accelerations_below_the_noise_of_the_torque_damp_the_drives_without_har
     data, test = log(light, speed=0.15), log(light, speed=0.15, seed=1)
     result = found(light, data)
     assert (
-        not result.learned
+        not result.identified
         and float(result.robot.armature.min()) > 0.0
         and "the drives have inertia" in result.doubts[0]
     )
@@ -108,7 +167,9 @@ def test_sums_give_the_dense_least_squares() -> None:
     Phi = torch.randn(n, nq, f, generator=random, dtype=torch.float64)
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
-    by_stretch = sums(Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group), C)
+    by_stretch = sums(
+        Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, torch.arange(n)), C
+    )
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
         H, h = given.quadratic(NOISE)
@@ -122,6 +183,33 @@ def test_sums_give_the_dense_least_squares() -> None:
         torch.testing.assert_close(torch.cat([delta, w.flatten()]), dense, rtol=ROUNDING, atol=ROUNDING)
         left = r[own] - (C[own] @ delta) - (Phi[own] * w).sum(-1)
         torch.testing.assert_close(given.error(delta, w), left.square().mean(0), rtol=1e-9, atol=0.0)
+
+
+def test_instruments_give_the_textbook_estimate() -> None:
+    """(ZᵀX)⁻¹Zᵀr with the partners' columns for the unknowns; products of errors, one by one."""
+    random = torch.Generator().manual_seed(1)
+    n, nq, f, p = 60, 2, 3, 4
+    C = torch.randn(n, nq, p, generator=random, dtype=torch.float64)
+    Phi = torch.randn(n, nq, f, generator=random, dtype=torch.float64)
+    r = torch.randn(n, nq, generator=random, dtype=torch.float64)
+    partner = torch.cat([torch.arange(n // 2) + n // 2, torch.arange(n // 2)])
+    group = torch.arange(n // 2).repeat(2) * 3 // (n // 2)
+    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner)
+    every = instrumental(rows, C).total()
+    delta = torch.linalg.solve(*every.quadratic(NOISE))
+    X, Z = (torch.zeros(n, nq, p + nq * f, dtype=torch.float64) for _ in range(2))
+    X[..., :p], Z[..., :p] = C, C[partner]
+    for j in range(nq):
+        X[:, j, p + j * f : p + (j + 1) * f] = Z[:, j, p + j * f : p + (j + 1) * f] = Phi[:, j]
+    # Friction belongs to one joint, so its equations do not depend on the weights.
+    weighted = (Z / NOISE[:, None] ** 2).flatten(0, 1)
+    dense = torch.linalg.solve(weighted.mT @ X.flatten(0, 1), weighted.mT @ r.flatten())
+    torch.testing.assert_close(
+        torch.cat([delta, every.friction(delta).flatten()]), dense, rtol=ROUNDING, atol=ROUNDING
+    )
+    left = r - X @ dense
+    found = products(rows, C).total().error(delta, every.friction(delta))
+    torch.testing.assert_close(found, (left * left[partner]).mean(0), rtol=1e-7, atol=1e-10)
 
 
 def test_harm_is_what_one_joint_suffers() -> None:

@@ -1,8 +1,7 @@
-"""Which inertia a measured robot has: that of its file, of drives that the file lacks, or one to be learned.
+"""Which inertia a measured robot has: that of its file, with drives that the file lacks, or another one.
 
-In free motion τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with friction Φ w of each joint on its own. Each
-column of C is the torque of one unknown: the inertia of a drive, or an inertial parameter of a link.
-Stretches of the log that an estimate has not seen say whether it predicts torques better than the file.
+Stretches of the log that an estimate has not seen say whether it predicts torques better than the file
+(`inverse_dynamics.py`). Where other inertial parameters of the links do, the robot gets them (`links.py`).
 
 Torques do not settle everything. In a closed loop the noise of the torque sensor exceeds the torque
 that accelerates a light joint; divided by the inertia of the file it predicts accelerations that are larger
@@ -14,7 +13,6 @@ mean, as long as the error of no joint's torque on held-out stretches grows by m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,20 +22,14 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
-from forcegp.forces.calibration import autocorrelation_time, stretches
+from forcegp.forces.inverse_dynamics import Rows, Sums, free_rows, held_out, sums
+from forcegp.forces.links import rigid_robot
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import ForceMean
-from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
-from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
 
-LEAST, MOST = 200, 4000
-"""Samples in free motion needed at least, and used at most, evenly spaced."""
-SCATTER = 4.0
-"""Ratio of mean squares of the torque at rest and in motion from which a joint sticks at rest."""
-MOVES = 0.1
-"""Share of the samples in which a joint moves at least, for its sticking to count."""
+LEAST_SQUARE = 1e-300
 VOLUME_STATES = 60
 """States that log |M| is averaged over."""
 SIGNIFICANT = 2.0
@@ -46,8 +38,6 @@ TOLERATED = 0.02
 """Relative increase of the held-out torque error of a joint that is worth better accelerations."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
 """Weights v of the volume, from 1/1024 to 1."""
-RIDGE = 1e-8
-"""Of the scaled friction columns, relative to the number of samples."""
 
 
 @dataclass(frozen=True)
@@ -55,94 +45,14 @@ class Inertia:
     """What the log says of the inertia.
 
     Attributes:
-        robot: with the inertia of drives that was found.
-        learned: whether all inertial parameters are to be learned with the forces.
+        robot: that of the file, with the inertia that was found.
+        identified: whether inertial parameters of links were, of which some uncertainty remains.
         doubts: what a user should know.
     """
 
     robot: RobotModel
-    learned: bool = False
+    identified: bool = False
     doubts: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Samples in free motion.
-
-    Attributes:
-        q, qd, qdd: `(n, nq)`.
-        residual: torque that the robot of the file leaves `(n, nq)`.
-        friction: Φ, features of the friction of each joint and its offset `(n, nq, f)`.
-        slides: `(n, nq)` bool, joints that move; the friction of one that sticks is whatever holds it, so its
-            torque says nothing there.
-        group: stretch of each sample `(n,)`, from 0 without gaps.
-        segment: `(n,)`.
-    """
-
-    q: Tensor
-    qd: Tensor
-    qdd: Tensor
-    residual: Tensor
-    friction: Tensor
-    slides: Tensor
-    group: Tensor
-    segment: Tensor
-
-
-@dataclass(frozen=True)
-class Sums:
-    """Σ XᵀX `(..., nq, p + f, p + f)`, Σ Xᵀr, Σ r² and the numbers of samples, with X = (C, Φ) by joint."""
-
-    gram: Tensor
-    right: Tensor
-    square: Tensor
-    count: Tensor
-    unknowns: int
-
-    def total(self) -> Sums:
-        """Over all stretches."""
-        return self._each(lambda x: x.sum(0))
-
-    def of(self, g: int) -> Sums:
-        """One stretch."""
-        return self._each(lambda x: x[g])
-
-    def without(self, g: int) -> Sums:
-        """All stretches but one."""
-        return self._each(lambda x: x.sum(0) - x[g])
-
-    def _each(self, part: Callable[[Tensor], Tensor]) -> Sums:
-        return Sums(part(self.gram), part(self.right), part(self.square), part(self.count), self.unknowns)
-
-    def friction(self, delta: Tensor) -> Tensor:
-        """w `(nq, f)` that explains what δ leaves."""
-        p = self.unknowns
-        right = self.right[:, p:] - self.gram[:, p:, :p] @ delta
-        return torch.linalg.solve(self._stiff(), right[..., None])[..., 0]
-
-    def _stiff(self) -> Tensor:
-        p = self.unknowns
-        eye = torch.eye(self.gram.shape[-1] - p, dtype=self.gram.dtype, device=self.gram.device)
-        return self.gram[:, p:, p:] + RIDGE * self.count[:, None, None] * eye
-
-    def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """H and h with Σ_j |ε_j|²/s_j² = δᵀH δ − 2 hᵀδ + …, friction at its best."""
-        p = self.unknowns
-        share = torch.linalg.solve(self._stiff(), self.gram[:, p:, :p])
-        H = self.gram[:, :p, :p] - self.gram[:, :p, p:] @ share
-        h = self.right[:, :p] - (share.mT @ self.right[:, p:, None])[..., 0]
-        weight = noise**-2
-        return torch.einsum("j,jpq->pq", weight, H), weight @ h
-
-    def error(self, delta: Tensor, friction: Tensor) -> Tensor:
-        """Mean square of ε, `(nq,)`."""
-        x = torch.cat([delta.expand(len(friction), -1), friction], dim=-1)
-        fitted = 2.0 * (x * self.right).sum(-1) - torch.einsum("jp,jpq,jq->j", x, self.gram, x)
-        return (self.square - fitted).clamp(min=1e-300) / self.count
-
-
-Estimate = Callable[[Sums], Tensor]
-"""δ from sums."""
 
 
 @torch.no_grad()
@@ -158,98 +68,43 @@ def inertia_of(
         training: samples in motion.
     """
     robot = system.robot
-    rows = _rows(system, friction, mean, training)
+    rows = free_rows(system, friction, mean, training)
     if rows is None:
         return Inertia(robot)
+    identified = rigid_robot(robot, rows)
+    if identified is not None:
+        text = "held-out torques ask for other inertial parameters than the robot file's, now identified"
+        return Inertia(identified, True, (text, *_told(robot, identified.armature - robot.armature)))
     drives = sums(rows, torch.diag_embed(rows.qdd))
     none = rows.qdd.new_zeros(robot.nq)
     before = held_out(drives, lambda _: none)
     every = drives.total()
-    noise = every.error(none, every.friction(none)).sqrt()
+    noise = every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
     M = mass_matrix(robot, rows.q)
     alone = held_out(drives, lambda given: _drives(given, noise, M, 0.0))
-    helped = is_better(alone, before)
-    if links_are_wrong(robot, rows, noise, alone if helped else before):
-        text = (
-            "held-out torques ask for other inertial parameters than the robot file's: they are learned too"
-        )
-        return Inertia(robot, learned=True, doubts=(text,))
-    armature = inertia_of_drives(rows, drives, noise, M, alone, helped)
+    armature = inertia_of_drives(rows, drives, noise, M, alone, is_better(alone, before))
     if not bool(armature.any()):
         return Inertia(robot)
+    return Inertia(robot.replace(armature=robot.armature + armature), doubts=_told(robot, armature))
+
+
+def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
+    """What a user is told of drives whose inertia was found `(nq,)`."""
     pairs = zip(robot.joint_names, armature.tolist(), strict=True)
     found = ", ".join(f"{name} {a:.2g}" for name, a in pairs if a > 0.0)
-    text = f"the drives have inertia that the robot file lacks [kg m², kg for sliding joints]: {found}"
-    return Inertia(robot.replace(armature=robot.armature + armature), doubts=(text,))
-
-
-def _rows(
-    system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
-) -> Rows | None:
-    """The samples in free motion; `None` where there are too few."""
-    for quantity, m in zip(training.quantities, training.measurements, strict=True):
-        free = (~m.active.any(-1)).nonzero()[:, 0]
-        if quantity != "qdd" or len(free) < LEAST:
-            continue
-        m = m[free[torch.linspace(0, len(free) - 1, min(MOST, len(free))).round().long().to(free.device)]]
-        _, group = stretches(m.segment).unique(return_inverse=True)
-        at = m.at(system)
-        features = [*prior.features(system, at).values(), torch.ones_like(at.q)[..., None]]
-        Phi = torch.cat(features, dim=-1)
-        Phi = Phi / Phi.square().mean(0).sqrt().clamp(min=1e-12)
-        residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
-        slides = _slides(m.qd.abs() >= min(prior.speeds), Phi, residual)
-        return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment)
-    return None
-
-
-def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
-    """`(n, nq)` bool, without the joints that stick: that hardly move, and whose torque then scatters more.
-
-    Args:
-        moving: `(n, nq)` bool, faster than the sharpest dry friction.
-        Phi: features of friction `(n, nq, f)`.
-        residual: `(n, nq)` torque that the robot of the file leaves.
-    """
-    weighted = moving[..., None] * Phi
-    w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
-    left = (residual - (Phi * w).sum(-1)).square()
-    at_rest, sliding = (
-        (part * left).sum(0) / part.sum(0).clamp(min=1) for part in ((~moving).double(), moving.double())
-    )
-    sticks = (at_rest > SCATTER * sliding) & (moving.double().mean(0) >= MOVES)
-    return moving | ~sticks
-
-
-def sums(rows: Rows, columns: Tensor) -> Sums:
-    """Sums by stretch, with C `(n, nq, p)`."""
-    groups = int(rows.group.max()) + 1
-    found = []
-    for g in range(groups):
-        own = rows.group == g
-        slides = rows.slides[own]
-        X = (slides[..., None] * torch.cat([columns[own], rows.friction[own]], dim=-1)).transpose(0, 1)
-        r = (slides * rows.residual[own]).mT
-        count = slides.sum(0).to(r.dtype).clamp(min=1.0)
-        found.append((X.mT @ X, (X.mT @ r[..., None])[..., 0], r.square().sum(-1), count))
-    gram, right, square, count = (torch.stack(parts) for parts in zip(*found, strict=True))
-    return Sums(gram, right, square, count, columns.shape[-1])
-
-
-def held_out(by_stretch: Sums, estimate: Estimate) -> Tensor:
-    """Mean squares of torque errors on stretches that neither δ nor friction have seen, `(groups, nq)`."""
-    errors = []
-    for g in range(len(by_stretch.gram)):
-        rest = by_stretch.without(g)
-        delta = estimate(rest)
-        errors.append(by_stretch.of(g).error(delta, rest.friction(delta)))
-    return torch.stack(errors)
+    lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints]"
+    return (f"{lacks}: {found}",) if found else ()
 
 
 def difference(after: Tensor, before: Tensor) -> tuple[float, float]:
     """Mean log ratio of root mean squares `(groups, nq)`, and its standard error over the stretches."""
-    ratio = 0.5 * (after / before).log().mean(-1)
+    ratio = _log_ratio(after, before).mean(-1)
     return float(ratio.mean()), float(ratio.std() / math.sqrt(len(ratio)))
+
+
+def _log_ratio(after: Tensor, before: Tensor) -> Tensor:
+    """Of root mean squares; a joint that does not move in a stretch has none."""
+    return 0.5 * (after.clamp(min=LEAST_SQUARE) / before.clamp(min=LEAST_SQUARE)).log()
 
 
 def is_better(after: Tensor, before: Tensor) -> bool:
@@ -260,43 +115,7 @@ def is_better(after: Tensor, before: Tensor) -> bool:
 
 def is_harmless(after: Tensor, before: Tensor) -> bool:
     """Whether the errors of no joint are larger by more than is tolerated."""
-    return bool((0.5 * (after / before).log().mean(0) <= TOLERATED).all())
-
-
-def links_are_wrong(robot: RobotModel, rows: Rows, noise: Tensor, before: Tensor) -> bool:
-    """Whether learned inertial parameters predict held-out torques significantly better than what is known.
-
-    They have to do so twice: as free parameters on held-out stretches, and as those of the consistent robot
-    that `InertialPrior` moves to.
-    """
-    prior = InertialPrior()
-    columns = regressor(robot, rows.q, rows.qd, rows.qdd) * prior.scale(robot)
-    by_stretch = sums(rows, columns)
-    power = _power(by_stretch, rows, columns, noise)
-
-    def posterior(given: Sums) -> tuple[Tensor, Tensor]:
-        H, h = given.quadratic(noise)
-        precision = power * H + torch.eye(len(h), dtype=h.dtype, device=h.device)
-        return torch.linalg.solve(precision, power * h), precision
-
-    if not is_better(held_out(by_stretch, lambda given: posterior(given)[0]), before):
-        return False
-    weight = power * len(rows.q)
-    states = rows.q[:: max(1, len(rows.q) // VOLUME_STATES)]
-
-    def log_volume(of: RobotModel) -> Tensor:
-        return weight * torch.logdet(mass_matrix(of, states)).mean()
-
-    _, delta = prior.updated(robot, *posterior(by_stretch.total()), log_volume)
-    return is_better(held_out(by_stretch, lambda _: delta), before)
-
-
-def _power(by_stretch: Sums, rows: Rows, columns: Tensor, noise: Tensor) -> float:
-    """κ = 1/τ̄ of the torque that friction leaves, as in `likelihood_power`."""
-    every = by_stretch.total()
-    none = rows.qdd.new_zeros(by_stretch.unknowns)
-    left = rows.slides * (rows.residual - (rows.friction * every.friction(none)).sum(-1))
-    return min(1.0, math.exp(-float(autocorrelation_time(left / noise, rows.segment).log().mean())))
+    return bool((_log_ratio(after, before).mean(0) <= TOLERATED).all())
 
 
 def inertia_of_drives(

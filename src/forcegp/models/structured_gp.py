@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
@@ -31,6 +30,7 @@ from forcegp.forces.priors.base import (
     mean_of,
 )
 from forcegp.forces.priors.default import default_priors
+from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.start import Search, initial
 from forcegp.forces.state_noise import state_std_of
 from forcegp.forces.student_t import check_degrees
@@ -42,6 +42,7 @@ from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import in_motion, prepared
 from forcegp.models.structured_spec import Specification, check_inertia, torque_noise_of
 from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
+from forcegp.robot.model import RobotModel
 
 FIT_COPIES = 3.0
 """Memory of a fit besides the matrices of its inference, in that of the equations of motion."""
@@ -72,9 +73,9 @@ class StructuredGP(Model[StructuredFit]):
             and the result of the fit says where more would help.
         state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
             or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
-        inertia: `"file"` keeps that of the robot; `"auto"` adds inertia of drives or an `InertialPrior`
-            where held-out stretches of the log ask for it (`forces/inertia.py`), as the defaults of a
-            measured robot do. It needs a `JointFrictionPrior` and a mean with the motor torque.
+        inertia: `"file"` keeps that of the robot; `"auto"` identifies links and drives where held-out
+            stretches of the log ask for it (`forces/inertia.py`), as the defaults of a measured robot do. It
+            needs a `JointFrictionPrior` and a mean with the motor torque.
         standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
             in the paper.
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
@@ -223,7 +224,7 @@ class StructuredGP(Model[StructuredFit]):
         if self._fitted is None:
             self.specification = self.specification.for_data(known)
         chosen = None if learn is None else self._chosen(learn)
-        training, armature, doubts = self._with_inertia(known, chosen)
+        training, robot, pinned, doubts = self._with_inertia(known, chosen)
         spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
         spec.system.announce_states(training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
         log, neighbours, forces = None, None, None
@@ -231,7 +232,9 @@ class StructuredGP(Model[StructuredFit]):
             training = dataclasses.replace(training, part_of=sample.count)
             log = Pass(spec, sample, file, progress, distributed)
             neighbours = neighbours_of(spec, sample, training)
-        problem = self._problem(training, armature)
+        problem = spec.problem(training)
+        if robot is not spec.system.robot:
+            problem = dataclasses.replace(problem, system=spec.system.with_robot(robot), pinned=pinned)
         search = self._search(problem, chosen, options)
         lesson, saved = learned(spec, problem, search, file, progress, begin, neighbours)
         values, doubts = lesson.hyperparameters, (*doubts, *lesson.warnings)
@@ -247,27 +250,25 @@ class StructuredGP(Model[StructuredFit]):
 
     def _with_inertia(
         self, data: Dataset | Sequence[Observation], chosen: Sequence[str] | None
-    ) -> tuple[Training, Tensor | None, tuple[str, ...]]:
-        """Training data, the drives' inertia, and doubts; a first fit may add a prior on inertia."""
-        training, doubts = self._training(data, chosen)
-        if self._fitted is not None:
-            return training, self._fitted.system.robot.armature, doubts
-        if chosen is not None:
-            return training, None, doubts
-        before = self.specification.priors
-        self.specification, found = self.specification.with_inertia_of(training)
-        if self.specification.priors != before:
-            training, _ = self._training(data, chosen)
-        return training, found.robot.armature, (*doubts, *found.doubts)
+    ) -> tuple[Training, RobotModel, tuple[str, ...], tuple[str, ...]]:
+        """Training data, the robot to learn with, the priors whose force it contains, and doubts.
 
-    def _problem(self, training: Training, armature: Tensor | None) -> Problem:
-        """What is learned from training data, with the drives' inertia that was found."""
+        A first fit may identify the robot, and then adds a prior on what it does not know of it.
+        """
+        training, doubts = self._training(data, chosen)
         spec = self.specification
-        problem, robot = spec.problem(training), spec.system.robot
-        if armature is None or spec.parameters is not None or torch.equal(armature, robot.armature):
-            return problem
-        system = spec.system.with_robot(robot.replace(armature=armature))
-        return dataclasses.replace(problem, system=system)
+        if self._fitted is not None and not self._fitted.problem.offsets:
+            return training, self._fitted.system.robot, self._fitted.problem.pinned, doubts
+        if self._fitted is not None or chosen is not None:
+            return training, spec.system.robot, (), doubts
+        found = spec.inertia_of(training)
+        doubts = (*doubts, *found.doubts)
+        if not found.identified:
+            return training, found.robot, (), doubts
+        left = InertialPrior().around(spec.system.robot)
+        self.specification = dataclasses.replace(spec, priors=(*spec.priors, left))
+        training, _ = self._training(data, chosen)
+        return training, found.robot, (left.name,), doubts
 
     def _search(
         self, problem: Problem, chosen: Sequence[str] | None, options: LearningOptions | None

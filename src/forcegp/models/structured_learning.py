@@ -186,7 +186,8 @@ def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]
 def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """The problem with the robot at the posterior mean of its inertial parameters (a Gauss–Newton step)."""
     for p, prior in enumerate(problem.priors):
-        if isinstance(prior, InertialPrior) and problem.parameters is None:
+        contained = prior.name in problem.pinned
+        if isinstance(prior, InertialPrior) and problem.parameters is None and not contained:
             posterior = force_posterior(problem, values)
             features = _one_row(posterior, problem)
             mean = posterior.latent.latent_mean(p, features[p])[0]

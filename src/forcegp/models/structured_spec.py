@@ -138,15 +138,13 @@ class Specification:
         """Whether the noise of the motor torque is learned."""
         return isinstance(self.torque_noise, str)
 
-    def with_inertia_of(self, training: Training) -> tuple[Specification, Inertia]:
-        """The specification with the priors on inertia that the training samples ask for, and their robot."""
+    def inertia_of(self, training: Training) -> Inertia:
+        """The robot that the training samples ask for, where the model is to find it."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
         asks = self.inertia == "auto" and "actuation" in self.mean.terms and self.parameters is None
         if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
-            return self, Inertia(self.system.robot)
-        found = inertia_of(self.system, friction, self.mean, training)
-        priors = (*self.priors, InertialPrior()) if found.learned else self.priors
-        return dataclasses.replace(self, priors=priors), found
+            return Inertia(self.system.robot)
+        return inertia_of(self.system, friction, self.mean, training)
 
     def problem(self, training: Training) -> Problem:
         """The learning problem of training data."""

@@ -1,0 +1,253 @@
+"""Inverse dynamics of a measured robot as a linear regression, with held-out stretches of the log.
+
+In free motion τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with friction Φ w of each joint on its own. Each
+column of C is the torque of one unknown: the inertia of a drive, or an inertial parameter of a link.
+
+Noise of the accelerations in C makes inertia look smaller than it is to least squares. So each sample has a
+partner, further away in time than noise is correlated: columns C′ of the partner serve as instruments,
+C′ᵀ(C δ + Φ w − r) = 0, and errors are judged by the product ε ε′, in which noise vanishes in expectation
+(Söderström and Stoica, *Instrumental Variable Methods for System Identification*, 1983).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.calibration import stretches
+from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.priors.base import ForceMean
+from forcegp.forces.priors.joint_friction import JointFrictionPrior
+
+LEAST, MOST = 200, 4000
+"""Samples in free motion needed at least, and used at most, evenly spaced."""
+SCATTER = 4.0
+"""Ratio of mean squares of the torque at rest and in motion from which a joint sticks at rest."""
+MOVES = 0.1
+"""Share of the samples in which a joint moves at least, for its sticking to count."""
+RIDGE = 1e-8
+"""Of the scaled friction columns, relative to the number of samples."""
+APART = 0.05
+"""Time between a sample and its partner [s], longer than filters of accelerations reach."""
+COHERENT = 0.9
+"""Autocorrelation that the velocities of the two have at least, the median of the joints."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Samples in free motion.
+
+    Attributes:
+        q, qd, qdd: `(n, nq)`.
+        residual: torque that the robot of the file leaves `(n, nq)`.
+        friction: Φ, features of the friction of each joint and its offset `(n, nq, f)`.
+        slides: `(n, nq)` bool, joints that move; the friction of one that sticks is whatever holds it, so its
+            torque says nothing there.
+        group: stretch of each sample `(n,)`, from 0 without gaps.
+        segment: `(n,)`.
+        partner: index of each sample's partner `(n,)`; its own where the log has none.
+    """
+
+    q: Tensor
+    qd: Tensor
+    qdd: Tensor
+    residual: Tensor
+    friction: Tensor
+    slides: Tensor
+    group: Tensor
+    segment: Tensor
+    partner: Tensor
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Σ ZᵀX `(..., nq, p + f, p + f)`, Σ Zᵀr, Σ r² and the numbers of samples, by joint.
+
+    X = (C, Φ), and Z = X or (C′, Φ) with instruments. In sums of products r², XᵀX and Xᵀr are r r′,
+    ½ (XᵀX′ + X′ᵀX) and ½ (Xᵀr′ + X′ᵀr).
+    """
+
+    gram: Tensor
+    right: Tensor
+    square: Tensor
+    count: Tensor
+    unknowns: int
+
+    def total(self) -> Sums:
+        """Over all stretches."""
+        return self._each(lambda x: x.sum(0))
+
+    def of(self, g: int) -> Sums:
+        """One stretch."""
+        return self._each(lambda x: x[g])
+
+    def without(self, g: int) -> Sums:
+        """All stretches but one."""
+        return self._each(lambda x: x.sum(0) - x[g])
+
+    def _each(self, part: Callable[[Tensor], Tensor]) -> Sums:
+        return Sums(part(self.gram), part(self.right), part(self.square), part(self.count), self.unknowns)
+
+    def friction(self, delta: Tensor) -> Tensor:
+        """w `(nq, f)` that explains what δ leaves."""
+        p = self.unknowns
+        right = self.right[:, p:] - self.gram[:, p:, :p] @ delta
+        return torch.linalg.solve(self._stiff(), right[..., None])[..., 0]
+
+    def _stiff(self) -> Tensor:
+        p = self.unknowns
+        eye = torch.eye(self.gram.shape[-1] - p, dtype=self.gram.dtype, device=self.gram.device)
+        return self.gram[:, p:, p:] + RIDGE * self.count[:, None, None] * eye
+
+    def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """H and h of H δ = h, with friction at its best; of Σ_j |ε_j|²/s_j² without instruments."""
+        p = self.unknowns
+        known = torch.cat([self.gram[:, p:, :p], self.right[:, p:, None]], dim=-1)
+        left = torch.cat([self.gram[:, :p, :p], self.right[:, :p, None]], dim=-1)
+        left = left - self.gram[:, :p, p:] @ torch.linalg.solve(self._stiff(), known)
+        H, h = left[..., :-1], left[..., -1]
+        weight = noise**-2
+        return torch.einsum("j,jpq->pq", weight, H), weight @ h
+
+    def error(self, delta: Tensor, friction: Tensor) -> Tensor:
+        """Mean of ε², or of ε ε′, `(nq,)`."""
+        x = torch.cat([delta.expand(len(friction), -1), friction], dim=-1)
+        fitted = 2.0 * (x * self.right).sum(-1) - torch.einsum("jp,jpq,jq->j", x, self.gram, x)
+        return (self.square - fitted) / self.count
+
+
+Estimate = Callable[[Sums], Tensor]
+"""δ from sums."""
+
+
+def free_rows(
+    system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
+) -> Rows | None:
+    """Samples in free motion and their partners; `None` where there are too few."""
+    for quantity, m in zip(training.quantities, training.measurements, strict=True):
+        free = (~m.active.any(-1)).nonzero()[:, 0]
+        if quantity != "qdd" or len(free) < LEAST:
+            continue
+        m = m[free]
+        later = partners(m)
+        first = (later >= 0).nonzero()[:, 0]
+        paired = len(first) >= LEAST
+        if not paired:
+            first = torch.arange(len(free), device=free.device)
+        first = first[torch.linspace(0, len(first) - 1, min(MOST, len(first))).round().long().to(free.device)]
+        _, group = stretches(m.segment[first]).unique(return_inverse=True)
+        i = torch.arange(len(first), device=free.device)
+        if not paired:
+            return _rows(system, prior, mean, m[first], group, i)
+        both, n = m[torch.cat([first, later[first]])], len(first)
+        return _rows(system, prior, mean, both, group.repeat(2), torch.cat([i + n, i]))
+    return None
+
+
+def partners(m: Measurement) -> Tensor:
+    """The sample of the same trajectory that is later by `APART`, or −1, `(n,)`.
+
+    By less where velocities would change too much meanwhile, but never by nothing.
+    """
+    found = torch.full((len(m.t),), -1, device=m.t.device)
+    order = torch.argsort(m.t, stable=True)
+    order = order[torch.argsort(m.segment[order], stable=True)]
+    t, qd, segment = m.t[order], m.qd[order], m.segment[order]
+    steps = t.diff()[segment[1:] == segment[:-1]]
+    if not len(steps) or float(steps.median()) <= 0.0:
+        return found
+    step, scale = float(steps.median()), qd.square().mean(0).clamp(min=1e-300)
+    for lag in range(1, max(1, round(APART / step)) + 1):
+        near = (segment[lag:] == segment[:-lag]) & ((t[lag:] - t[:-lag] - lag * step).abs() < 0.5 * step)
+        coherence = (qd[lag:] * qd[:-lag])[near].mean(0) / scale
+        if int(near.sum()) < LEAST or float(coherence.median()) < COHERENT:
+            break
+        found.fill_(-1)
+        found[order[:-lag][near]] = order[lag:][near]
+    return found
+
+
+def _rows(
+    system: ConstrainedSystem,
+    prior: JointFrictionPrior,
+    mean: ForceMean,
+    m: Measurement,
+    group: Tensor,
+    partner: Tensor,
+) -> Rows:
+    at = m.at(system)
+    Phi = torch.cat([*prior.features(system, at).values(), torch.ones_like(at.q)[..., None]], dim=-1)
+    Phi = Phi / Phi.square().mean(0).sqrt().clamp(min=1e-12)
+    residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
+    slides = _slides(m.qd.abs() >= min(prior.speeds), Phi, residual)
+    return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment, partner)
+
+
+def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
+    """`(n, nq)` bool, without the joints that stick: that hardly move, and whose torque then scatters more.
+
+    Args:
+        moving: `(n, nq)` bool, faster than the sharpest dry friction.
+        Phi: features of friction `(n, nq, f)`.
+        residual: `(n, nq)` torque that the robot of the file leaves.
+    """
+    weighted = moving[..., None] * Phi
+    w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
+    left = (residual - (Phi * w).sum(-1)).square()
+    at_rest, sliding = (
+        (part * left).sum(0) / part.sum(0).clamp(min=1) for part in ((~moving).double(), moving.double())
+    )
+    sticks = (at_rest > SCATTER * sliding) & (moving.double().mean(0) >= MOVES)
+    return moving | ~sticks
+
+
+def sums(rows: Rows, columns: Tensor) -> Sums:
+    """Sums by stretch, with C `(n, nq, p)`."""
+    X, r = _equations(rows, columns)
+    return _by_stretch(rows, X, X, r, r)
+
+
+def instrumental(rows: Rows, columns: Tensor) -> Sums:
+    """The same with the columns of partners as instruments; velocities, and so friction, are precise."""
+    X, r = _equations(rows, columns, paired=True)
+    p = columns.shape[-1]
+    return _by_stretch(rows, torch.cat([X[rows.partner][..., :p], X[..., p:]], dim=-1), X, r, r)
+
+
+def products(rows: Rows, columns: Tensor) -> Sums:
+    """Sums of products with the partners."""
+    X, r = _equations(rows, columns, paired=True)
+    return _by_stretch(rows, X[rows.partner], X, r[rows.partner], r)
+
+
+def _equations(rows: Rows, columns: Tensor, paired: bool = False) -> tuple[Tensor, Tensor]:
+    """X and r of the joints that move, at the partner too where samples are paired; zero for others."""
+    slides = rows.slides & rows.slides[rows.partner] if paired else rows.slides
+    X = torch.cat([columns, rows.friction], dim=-1)
+    return X * slides[..., None], rows.residual * slides
+
+
+def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> Sums:
+    """Σ ZᵀX, Σ Zᵀr and Σ s r; X holds a column of ones, which is zero for what does not count."""
+    found = []
+    for g in range(int(rows.group.max()) + 1):
+        own = rows.group == g
+        z, x = Z[own].transpose(0, 1), X[own].transpose(0, 1)
+        count = (X[own] != 0.0).any(-1).sum(0).to(r.dtype).clamp(min=1.0)
+        found.append((z.mT @ x, (z.mT @ r[own].mT[..., None])[..., 0], (s[own] * r[own]).sum(0), count))
+    gram, right, square, count = (torch.stack(parts) for parts in zip(*found, strict=True))
+    return Sums(gram, right, square, count, X.shape[-1] - rows.friction.shape[-1])
+
+
+def held_out(by_stretch: Sums, estimate: Estimate) -> Tensor:
+    """Mean squares of torque errors on stretches that neither δ nor friction have seen, `(groups, nq)`."""
+    errors = []
+    for g in range(len(by_stretch.gram)):
+        rest = by_stretch.without(g)
+        delta = estimate(rest)
+        errors.append(by_stretch.of(g).error(delta, rest.friction(delta)))
+    return torch.stack(errors)
