@@ -51,7 +51,8 @@ class Bound:
         """Cells of a table."""
         limits = [f"≥ {self.least:g}"] if math.isfinite(self.least) else []
         limits += [f"≤ {self.most:g}"] if math.isfinite(self.most) else []
-        return [self.what, f"{self.measured:.3g}", ", ".join(limits), self.unit, "yes" if self.met else "no"]
+        met = ("yes" if self.met else "no") if limits else ""
+        return [self.what, f"{self.measured:.3g}", ", ".join(limits), self.unit, met]
 
 
 def _call(function: Callable[..., dict], arguments: tuple, results: Any) -> None:
@@ -151,10 +152,14 @@ def rollout(options: argparse.Namespace) -> tuple[object, list[Bound]]:
 
 
 def update(options: argparse.Namespace) -> tuple[object, list[Bound]]:
-    """Updates of a whole model."""
+    """Updates of a whole model; the bound is on one sample, ten and the posterior alone stand beside it."""
     found = alone(sparse_logs.updates, (options.logs,))[0]
-    what = f"model.update with one sample, {found['basis_functions']} basis functions"
-    return found, [Bound(what, found["update_ms"]["wall"], "ms", most=2.0)]
+    size = f"{found['basis_functions']} basis functions"
+    return found, [
+        Bound(f"model.update with one sample, {size}", found["update_1_ms"]["wall"], "ms", most=2.0),
+        Bound(f"model.update with ten samples, {size}", found["update_10_ms"]["wall"], "ms"),
+        Bound(f"posterior.updated with one sample, {size}", found["posterior_ms"]["wall"], "ms"),
+    ]
 
 
 def real(options: argparse.Namespace) -> tuple[object, list[Bound]]:

@@ -26,6 +26,8 @@ TESTED, EXACT = 2000, 1000
 """Test samples, evenly spaced over all that are held out; training samples of the exact fit."""
 UPDATE_POINTS = 90
 """Inducing points of one prior with which a model on the plane has about 500 basis functions."""
+UPDATE_SIZES = (1, 10)
+"""Samples that a model is updated with at a time."""
 
 
 def simulated(folder: Path, seed: int) -> Path:
@@ -124,15 +126,19 @@ def trajectories(folder: Path) -> dict:
 
 
 def updates(folder: Path) -> dict:
-    """Milliseconds of `model.update` with one sample, equations of motion and whitening included."""
+    """Milliseconds of `model.update` with one sample and with ten, equations of motion and whitening
+    included, and of what of it is the posterior."""
     train, _ = parts(folder, 0)
     model = _sparse(train, UPDATE_POINTS)
-    rows = iter(range(len(train)))
-    samples = [train[row : row + 1] for row, _ in zip(rows, range(100), strict=False)]
-    return {
-        "basis_functions": model.fitted.result.basis_functions,
-        "update_ms": median_ms(lambda: model.update(samples.pop()), 60),
-    }
+    found: dict = {"basis_functions": model.fitted.result.basis_functions}
+    for size in UPDATE_SIZES:
+        samples = [train[first : first + size] for first in range(0, 100 * size, size)]
+        found[f"update_{size}_ms"] = median_ms(lambda: model.update(samples.pop()), 60)  # noqa: B023
+    fit = model.fitted
+    one = dataclasses.replace(fit.problem, training=fit.problem.training.evenly(1))
+    rows = one.rows(fit.hyperparameters).blocks
+    found["posterior_ms"] = median_ms(lambda: fit.posterior.latent.updated(rows), 60)
+    return found
 
 
 def real(logs: Path) -> dict:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     )
     from forcegp.data import Dataset, SavitzkyGolay, StreamedDataset
     from forcegp.evaluation import Evaluation, evaluate
-    from forcegp.forces.measurements import Observation
+    from forcegp.forces.observations import Observation
     from forcegp.forces.priors.base import AnalyticalMean
     from forcegp.forces.priors.contact import ContactForcePrior
     from forcegp.forces.priors.coregional import CoregionalPrior
@@ -65,7 +65,7 @@ _HOME = {
     "LearningOptions": "gp.optimise",
     "NeuralNetwork": "models.neural",
     "NormalForcePrior": "forces.priors.normal_force",
-    "Observation": "forces.measurements",
+    "Observation": "forces.observations",
     "OperatorForcePrior": "forces.priors.operator",
     "PayloadPrior": "forces.priors.payload",
     "Plane": "constraints",

@@ -12,7 +12,7 @@ from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import correlation_times
 from forcegp.forces.inertia import Inertia, difference, inertia_of, is_harmless
 from forcegp.forces.inverse_dynamics import APART, Rows, instrumental, partners, products, sums
-from forcegp.forces.measurements import training_of
+from forcegp.forces.observations import training_of
 from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior

@@ -75,4 +75,4 @@ def test_each_sample_at_its_own_states(count: int, runs: int) -> None:
     q, qd, tau = draw(count * runs, seed=7)
     at = states(system, q, qd, tau, mixed_contacts(count * runs))
     Q, Q_z = samples.forces(system, at, torch.arange(count).repeat_interleave(runs))
-    assert torch.allclose(samples.total_force(system, at), Q + Q_z, rtol=1e-10, atol=1e-10)
+    assert torch.allclose(samples(system, at), Q + Q_z, rtol=1e-10, atol=1e-10)

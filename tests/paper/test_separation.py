@@ -8,7 +8,7 @@ import pytest
 
 import forcegp
 from forcegp.data.header import DataHeader
-from forcegp.forces.measurements import Observation
+from forcegp.forces.observations import Observation
 from forcegp.paper.separation import judge, separate, unfitted
 from random_data import NOISE_STD, random_data, table_system
 

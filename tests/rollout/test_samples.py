@@ -60,7 +60,7 @@ def test_each_sample_obeys_the_constraint_and_newtons_equation() -> None:
     for k in (0, 20, 36):
         active = torch.ones(5, 1, dtype=torch.bool)
         at = states(found.system, found.q[:, k], found.qd[:, k], found.tau[:, k], active)
-        assert float((drawn.total_force(found.system, at) - force[:, k]).abs().max()) < NEWTON
+        assert float((drawn(found.system, at) - force[:, k]).abs().max()) < NEWTON
 
 
 def test_a_seed_fixes_the_samples_and_a_sample_is_a_model_of_its_own() -> None:

@@ -80,22 +80,11 @@ def fit(
 
     forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model/
     """
-    from forcegp.destination import check_destination, write_or_keep
-    from forcegp.errors import DestinationError
+    from forcegp.destination import write_or_keep
     from forcegp.models.configured import configured
-    from forcegp.storage.folder import check_model_destination
     from forcegp.storage.sums import beside
 
-    check_model_destination(out)
-    if checkpoint is not None:
-        check_destination(checkpoint)
-        check_apart(checkpoint, *data)
-        if out.resolve() in checkpoint.resolve().parents:
-            raise DestinationError(
-                "the checkpoint would lie in the folder of the model, which is written as a whole",
-                got=checkpoint,
-                hint="name a file outside of it",
-            )
+    _check_places(out, checkpoint, data)
     system = system_of(scene, robot)
     regression = configured(model_table(config, scene), system, name=model, noise_std=noise_std, seed=seed)
     training = _training(regression.model, data, differentiate, system.robot)
@@ -117,6 +106,29 @@ def fit(
     if not as_json:
         del figures["warnings"]  # printed above
     show({"model": regression.name, "training_points": len(training), **figures, "folder": str(out)}, as_json)
+
+
+def _check_places(out: Path, checkpoint: Path | None, data: list[Path]) -> None:
+    """Check that the model and the checkpoint can be written, apart from the data and from each other.
+
+    Raises:
+        DestinationError: they cannot.
+    """
+    from forcegp.destination import check_destination
+    from forcegp.errors import DestinationError
+    from forcegp.storage.folder import check_model_destination
+
+    check_model_destination(out)
+    if checkpoint is None:
+        return
+    check_destination(checkpoint)
+    check_apart(checkpoint, *data)
+    if out.resolve() in checkpoint.resolve().parents:
+        raise DestinationError(
+            "the checkpoint would lie in the folder of the model, which is written as a whole",
+            got=checkpoint,
+            hint="name a file outside of it",
+        )
 
 
 def _training(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -15,6 +15,10 @@ from forcegp.cli.common import (
     read_data,
     show,
 )
+
+if TYPE_CHECKING:
+    from forcegp.data import Dataset
+    from forcegp.data.split import Split
 
 
 def select(
@@ -51,35 +55,35 @@ def select(
     forcegp select run.csv -n 400 --split stretches --differentiate 11 -o train.parquet --rest test.parquet
     """
     from forcegp.data import split_by_selection, split_by_stretches, without_marked_impacts
-    from forcegp.destination import write_or_keep
 
     check_data_destination(out, log)
     if rest is not None:
         check_data_destination(rest, log, out)
     whole = read_data(log, differentiate)
     data = whole if keep_impacts else without_marked_impacts(whole)
+    held_out = {"stretch": stretch, "fraction": fraction, "margin": margin}
     with progress_bar("selecting points", count) as progress:
         if split == "selection":
             parts = split_by_selection(data, count, method=method, seed=seed, progress=progress)
         else:
-            parts = split_by_stretches(
-                data,
-                count,
-                stretch=stretch,
-                fraction=fraction,
-                margin=margin,
-                method=method,
-                seed=seed,
-                progress=progress,
-            )
+            parts = split_by_stretches(data, count, **held_out, method=method, seed=seed, progress=progress)
     how = f"of {len(data)} rows by {method} points, split by {split}, seed {seed}"
-    write_or_keep(data[parts.train].with_step(f"selected {count} training points {how}").write, out)
-    result: dict[str, object] = {"training_points": count, "training_file": str(out)}
+    result = _written(data, parts, how, out, rest)
     if len(data) < len(whole):
         result["rows_at_impacts_left_out"] = len(whole) - len(data)
+    show(result, as_json)
+
+
+def _written(data: Dataset, parts: Split, how: str, out: Path, rest: Path | None) -> dict[str, object]:
+    """Write training and test points, and say what was written."""
+    from forcegp.destination import write_or_keep
+
+    count = len(parts.train)
+    write_or_keep(data[parts.train].with_step(f"selected {count} training points {how}").write, out)
+    result: dict[str, object] = {"training_points": count, "training_file": str(out)}
     if rest is not None:
         write_or_keep(data[parts.test].with_step(f"kept {len(parts.test)} test points {how}").write, rest)
         result |= {"test_points": len(parts.test), "test_file": str(rest)}
     if parts.stretches:
         result["held_out_rows"] = [list(rows) for rows in parts.stretches]
-    show(result, as_json)
+    return result

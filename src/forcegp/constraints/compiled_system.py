@@ -83,9 +83,7 @@ def compiled_system(system: ConstrainedSystem) -> ConstrainedSystem:
         >>> float(compiled_system(system).equations(q, qd).c - system.equations(q, qd).c)
         0.0
     """
-    if isinstance(system, CompiledSystem) or not _can_compile(system.robot):
-        return system
-    if _kernel(system.robot, anchors_of(system)) is None:
+    if isinstance(system, CompiledSystem) or _kernel(system.robot, anchors_of(system)) is None:
         return system
     return CompiledSystem(system.robot, system.contacts, system.baumgarte)
 
@@ -108,11 +106,11 @@ def _can_compile(robot: RobotModel) -> bool:
 
 
 def _kernel(robot: RobotModel, anchors: tuple[Anchor, ...]) -> CompiledMechanics | None:
-    """The kernel of a robot, `None` where the machine cannot build it; kept as long as the robot."""
+    """The kernel of a robot, `None` where there can be none; kept as long as the robot."""
     kept = _KERNELS.setdefault(robot, {})
     if anchors not in kept:
         try:
-            kept[anchors] = CompiledMechanics(robot, anchors)
+            kept[anchors] = CompiledMechanics(robot, anchors) if _can_compile(robot) else None
         except MissingDependencyError:
             kept[anchors] = None
     return kept[anchors]

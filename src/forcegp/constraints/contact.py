@@ -8,10 +8,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from forcegp import kinematics
 from forcegp.constraints.surface import Surface, check_point
@@ -49,7 +51,8 @@ class MovingPoint(NamedTuple):
         )
 
 
-class ContactPoint(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ContactPoint:
     """The point of the robot that touches a surface; of a rounded tip, the material point that touches now.
 
     Attributes:
@@ -62,6 +65,19 @@ class ContactPoint(NamedTuple):
     velocity: Tensor
     jacobian: Tensor
     normal: Tensor
+
+    @cached_property
+    def unit_normal(self) -> Tensor:
+        """n `(*batch, 3)`, the direction of ∇c."""
+        return normalize(self.normal, dim=-1)
+
+    @cached_property
+    def sliding(self) -> tuple[Tensor, Tensor]:
+        """Jacobian (1 − n nᵀ) J_E `(*batch, 3, nq)` and velocity (1 − n nᵀ) ṗ `(*batch, 3)` along the
+        surface."""
+        n = self.unit_normal[..., None]
+        along = self.velocity - (n @ (n.mT @ self.velocity[..., None]))[..., 0]
+        return self.jacobian - n @ (n.mT @ self.jacobian), along
 
 
 class ConstraintTerms(NamedTuple):

@@ -114,8 +114,8 @@ class Equations:
     def rank(self) -> Tensor:
         """`(*batch,)` number of independent active constraint rows."""
         W = self.scaled_jacobian
-        if W.shape[-2] == 0:
-            return torch.zeros(W.shape[:-2], dtype=torch.int64, device=W.device)
+        if W.shape[-2] <= 1:
+            return W.any(-1).sum(-1)
         return torch.linalg.matrix_rank(W, rtol=rank_tolerance(W.dtype))
 
     @cached_property
@@ -155,6 +155,14 @@ class Equations:
         """
         free = self.free_acceleration(Q_bar)
         return free + (self.L @ (self.b - (self.A @ free[..., None])[..., 0])[..., None])[..., 0]
+
+    def motion_under(self, Q_bar: JointVector) -> tuple[JointVector, ConstraintVector]:
+        """q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, as a step of a rollout needs them."""
+        free = self.free_acceleration(Q_bar)
+        multiplier = (self.constraint_inertia @ (self.b - (self.A @ free[..., None])[..., 0])[..., None])[
+            ..., 0
+        ]
+        return free + (self.M_inv_At @ multiplier[..., None])[..., 0], multiplier
 
     def multiplier(self, Q_bar: JointVector) -> ConstraintVector:
         """λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) (eq. 16, with all impressed forces), `(*batch, m)`."""

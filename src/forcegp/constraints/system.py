@@ -189,8 +189,7 @@ class ConstrainedSystem:
                 expected=f"bool of shape {(*batch, n)}",
                 got=f"{str(active.dtype).removeprefix('torch.')} of shape {tuple(active.shape)}",
             )
-        repeats = torch.tensor([contact.rows for contact in self.contacts], dtype=torch.int64, device=device)
-        return active.repeat_interleave(repeats, dim=-1).expand(*batch, self.m)
+        return active[..., self._contact_of_row].expand(*batch, self.m)
 
     def equations(self, q: JointVector, qd: JointVector, active: Tensor | None = None) -> Equations:
         """The equations of motion at states (q, q̇).
@@ -270,6 +269,12 @@ class ConstrainedSystem:
             return self._rows(q, qd, self._terms(q, qd)[2], active)[2:]
 
         return linearize(self.robot, eom, rows, q, qd, force)
+
+    @cached_property
+    def _contact_of_row(self) -> Tensor:
+        """The contact that each constraint row belongs to, `(m,)`."""
+        rows = [i for i, contact in enumerate(self.contacts) for _ in range(contact.rows)]
+        return torch.tensor(rows, dtype=torch.int64, device=self.robot.device)
 
     @cached_property
     def _places(self) -> list[list[tuple[int, Tensor]]]:

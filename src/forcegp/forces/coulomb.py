@@ -20,7 +20,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import COULOMB, ForcePrior
-from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior, sliding
+from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.quantities import AffineMap, States
 
 SHARP = 1e-6
@@ -80,7 +80,7 @@ def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
 
 def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tensor:
     """u = −J_Eᵀ s(v), the generalized force of a unit friction force, `(n, nq)`."""
-    J, v = sliding(at, contact)
+    J, v = at.eom.contact_points[contact].sliding
     return -(J.mT @ (v / (v.square().sum(-1, keepdim=True) + smoothing**2).sqrt())[..., None])[..., 0]
 
 

@@ -10,9 +10,8 @@ Q(s) the force where each joint's dry friction has the direction s in place of t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -23,6 +22,9 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import AnalyticalMean, ForceMean, ForcePrior
 from forcegp.forces.quantities import States
 from forcegp.forces.samples import ForceSamples
+
+ForceField = Callable[[ConstrainedSystem, States], Tensor]
+"""The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""
 
 SMOOTH = 0.02
 """Speed over which friction that would drive a joint changes sign; it is no friction and cannot stick
@@ -48,42 +50,6 @@ class DryFriction:
     damping: Tensor
 
 
-@runtime_checkable
-class _Unknown(Protocol):
-    """Unknown forces of some priors."""
-
-    def unknown_force(
-        self, system: ConstrainedSystem, at: States, priors: Iterable[int]
-    ) -> Tensor | float: ...
-
-
-@dataclass(frozen=True, eq=False)
-class TotalForce:
-    """A force field Q̄(x) with dry friction that can be told apart.
-
-    Args:
-        forces: posterior mean, or samples.
-
-    Example:
-        >>> import forcegp
-        >>> from forcegp.forces.priors.base import AnalyticalMean
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("franka_panda"))
-        >>> has_dry_friction(system, AnalyticalMean(), ())
-        True
-    """
-
-    forces: ForcePosterior | ForceSamples
-
-    def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Q̄ with smooth dry friction, `(n, nq)`."""
-        return self.forces.total_force(system, at)
-
-    def split(self, system: ConstrainedSystem, at: States) -> DryFriction | None:
-        """Q̄ with dry friction apart; `None` where there is none."""
-        posterior = self.forces if isinstance(self.forces, ForcePosterior) else self.forces.posterior
-        return split(system, at, posterior.mean, posterior.priors, self.forces, posterior.coulomb)
-
-
 def has_dry_friction(system: ConstrainedSystem, mean: ForceMean, priors: Sequence[ForcePrior]) -> bool:
     """Whether the robot file, where the mean includes it, or a prior declares dry friction."""
     known = isinstance(mean, AnalyticalMean) and "friction" in mean.terms
@@ -91,24 +57,38 @@ def has_dry_friction(system: ConstrainedSystem, mean: ForceMean, priors: Sequenc
     return declared or any(prior.sticks for prior in priors)
 
 
-def split(
-    system: ConstrainedSystem,
-    at: States,
-    mean: ForceMean,
-    priors: Sequence[ForcePrior] = (),
-    unknown: _Unknown | None = None,
-    coulomb: Sequence[CoulombFriction] = (),
-) -> DryFriction | None:
-    """Forces at states with the dry friction of joints apart; `None` where there is none.
+def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFriction | None:
+    """A force field at states with the dry friction of joints apart; `None` where there is none.
 
     Args:
         system: robot and contacts.
         at: n states.
-        mean: prior mean of Q.
-        priors: on unknown forces.
-        unknown: their forces.
-        coulomb: friction of contacts that is proportional to the multiplier.
+        force: posterior mean, samples, or a prior mean alone, Q̄.
+
+    Example:
+        >>> import torch, forcegp
+        >>> from forcegp.forces.priors.base import AnalyticalMean
+        >>> from forcegp.forces.quantities import states_at
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("franka_panda"))
+        >>> at, _ = states_at(system, *torch.zeros(3, 1, 7, dtype=torch.float64), None)
+        >>> split(system, at, AnalyticalMean()).limit.shape
+        torch.Size([1, 7])
     """
+    if isinstance(force, ForcePosterior | ForceSamples):
+        posterior = force if isinstance(force, ForcePosterior) else force.posterior
+        return _split(system, at, posterior.mean, posterior.priors, force, posterior.coulomb)
+    return _split(system, at, force)
+
+
+def _split(
+    system: ConstrainedSystem,
+    at: States,
+    mean: ForceMean,
+    priors: Sequence[ForcePrior] = (),
+    unknown: ForcePosterior | ForceSamples | None = None,
+    coulomb: Sequence[CoulombFriction] = (),
+) -> DryFriction | None:
+    """Of a mean, and of unknown forces beside it."""
     if not has_dry_friction(system, mean, priors):
         return None
     sticking = [p for p, prior in enumerate(priors) if prior.sticks]

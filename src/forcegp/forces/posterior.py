@@ -50,9 +50,9 @@ class ForcePosterior:
         """Standardized kernel inputs of prior p at states."""
         return self.scales[p].apply(self.priors[p].features(system, at))
 
-    def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Posterior mean of Q̄ = m + Σ E f, `(n, nq)`: the force field of a rollout."""
-        force = self.mean(system, at) + self.unknown_force(system, at, range(len(self.priors)))
+    def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
+        """Posterior mean of Q̄ = Σ E f + m, `(n, nq)`: the force field of a rollout."""
+        force = self.unknown_force(system, at, range(len(self.priors))) + self.mean(system, at)
         return with_coulomb(system, at, force, self.coulomb) if self.coulomb else force
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:

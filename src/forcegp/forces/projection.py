@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -33,17 +34,22 @@ ForceNoise = Callable[[States], Tensor]
 """Variance of the white noise on the joint force at states, `(n, nq)`."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WhitenedRows:
     """The rows of all measurements, and the part of the likelihood that no latent force changes.
 
     Attributes:
         blocks: rows that the latent forces explain.
-        constant: negative log likelihood of the rest, with the normalisation of the noise.
+        rest: computes the negative log likelihood of everything else, which an update does not ask for.
     """
 
     blocks: list[Block]
-    constant: Tensor
+    rest: Callable[[], Tensor]
+
+    @cached_property
+    def constant(self) -> Tensor:
+        """Negative log likelihood of the rest, with the normalisation of the noise `()`."""
+        return self.rest()
 
     def tempered(self, power: float) -> WhitenedRows:
         """The rows of the likelihood to a power κ: noise variances over κ, normalisations times κ.
@@ -56,23 +62,23 @@ class WhitenedRows:
         blocks = [
             Block(b.features, tuple(root * W for W in b.operators), root * b.target) for b in self.blocks
         ]
-        return WhitenedRows(blocks, power * self.constant)
+        return WhitenedRows(blocks, lambda: power * self.constant)
 
 
 class _NullSpaceBasis(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, A: Tensor, rank: int) -> Tensor:
         left, values, Vh = torch.linalg.svd(A, full_matrices=True)
-        U = Vh.mT[..., :, rank:].contiguous()
-        # The rank is given, so the pseudo-inverse needs no tolerance of its own.
-        pinv = (Vh.mT[..., :, :rank] / values[..., None, :rank]) @ left[..., :, :rank].mT
-        ctx.save_for_backward(pinv, U)
-        return U
+        ctx.save_for_backward(left[..., :rank], values[..., :rank], Vh)
+        return Vh[..., rank:, :].mT
 
     @staticmethod
     def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None]:
-        pinv, U = ctx.saved_tensors
-        return -(pinv.mT @ grad[0]) @ U.mT, None
+        left, values, Vh = ctx.saved_tensors
+        rank = values.shape[-1]
+        # The rank is given, so the pseudo-inverse needs no tolerance of its own.
+        pinv = (Vh[..., :rank, :].mT / values[..., None, :]) @ left.mT
+        return -(pinv.mT @ grad[0]) @ Vh[..., rank:, :], None
 
 
 def null_space_basis(A: Tensor, rank: int) -> Tensor:
@@ -94,51 +100,66 @@ def null_space_basis(A: Tensor, rank: int) -> Tensor:
     return _NullSpaceBasis.apply(A, rank)  # pyright: ignore[reportReturnType]
 
 
-def _split(A: Tensor, rank: int) -> tuple[Tensor, Tensor]:
-    """Null-space basis of A, and A⁺, both with the rank that the equations of motion count.
+def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
+    """As many rows as the rank that the equations of motion count, and the combinations C that they are of
+    those of A; `None` for all of them.
 
-    With another rank, A⁺ would magnify the contradictions of nearly redundant rows.
+    With another rank, A⁺ would magnify the contradictions of nearly redundant rows. Fixed combinations of
+    rows have the solutions, and so the derivative, of all rows that are consistent.
     """
     if rank == A.shape[-2]:
-        return null_space_basis(A, rank), torch.linalg.pinv(A)
-    # Fixed combinations of rows have the solutions, and so the derivative, of all rows that are consistent.
-    W = torch.linalg.svd(A.detach(), full_matrices=False).U[..., :rank]
-    rows = W.mT @ A
-    return null_space_basis(rows, rank), torch.linalg.pinv(rows) @ W.mT
+        return A, None
+    C = torch.linalg.svd(A.detach(), full_matrices=False).U[..., :rank].mT
+    return C @ A, C
+
+
+def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
+    """The samples of each rank; where all share one, no copy is made of them."""
+    values = rank.unique().tolist()
+    if len(values) == 1:
+        return [(values[0], slice(None))]
+    return [(value, (rank == value).nonzero()[:, 0]) for value in values]
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """Samples with a common number of rows: residual `(n, r)`, operators `(n, r, ·)`, and the factor N of
-    the noise `(n, r, k)`, whose covariance is 1 + N Nᵀ; `None` for white noise alone."""
+    """Samples with a common number of rows.
+
+    Attributes:
+        features: kernel inputs of each prior.
+        widths: number of columns of each operator.
+        rows: the operators, the residual, and the factor N of the noise, side by side `(n, r, ·)`; the noise
+            of the rows has the covariance 1 + N Nᵀ.
+    """
 
     features: tuple[Features, ...]
-    operators: tuple[Tensor, ...]
-    residual: Tensor
-    noise: Tensor | None
+    widths: tuple[int, ...]
+    rows: Tensor
 
-    def of(self, own: Tensor, U: Tensor) -> _Rows:
+    def of(self, own: Tensor | slice, U: Tensor) -> _Rows:
         """Uᵀ times the rows of some samples."""
-        return _Rows(
-            tuple({name: x[own] for name, x in f.items()} for f in self.features),
-            tuple(U.mT @ W[own] for W in self.operators),
-            (U.mT @ self.residual[own][..., None])[..., 0],
-            None if self.noise is None else U.mT @ self.noise[own],
-        )
+        features = tuple({name: x[own] for name, x in f.items()} for f in self.features)
+        return _Rows(features, self.widths, U.mT @ self.rows[own])
 
-    def whitened(self) -> tuple[Block, Tensor]:
-        """The rows divided by the factor of I + N Nᵀ, and the log determinant of the factors."""
-        if self.noise is None:
-            return Block(self.features, self.operators, self.residual), self.residual.new_zeros(())
-        # QR of (1, N)ᵀ instead of Cholesky of 1 + N Nᵀ: noise of 0.05 N m at a wrist of 10⁻³ kg m² is
-        # 50 rad/s², and squares of such ratios lose all digits.
-        N = self.noise
-        eye = torch.eye(N.shape[1], dtype=N.dtype, device=N.device).expand(len(N), -1, -1)
-        C = torch.linalg.qr(torch.cat([eye, N.mT], dim=1)).R.mT
-        operators = tuple(torch.linalg.solve_triangular(C, W, upper=False) for W in self.operators)
-        residual = torch.linalg.solve_triangular(C, self.residual[..., None], upper=False)[..., 0]
-        log_determinant = C.diagonal(dim1=-2, dim2=-1).abs().log().sum()
-        return Block(self.features, operators, residual), log_determinant
+    def whitened(self, weight: Tensor | None) -> tuple[Block, Tensor]:
+        """The rows divided by the factor of I + N Nᵀ, and the log determinant of the factors.
+
+        Samples with a weight have noise of less or more than unit variance.
+        """
+        signal = sum(self.widths) + 1
+        rows, N = self.rows.tensor_split([signal], dim=-1)
+        log_determinant = rows.new_zeros(())
+        if N.shape[-1]:
+            # QR of (1, N)ᵀ instead of Cholesky of 1 + N Nᵀ: noise of 0.05 N m at a wrist of 10⁻³ kg m² is
+            # 50 rad/s², and squares of such ratios lose all digits.
+            eye = torch.eye(N.shape[1], dtype=N.dtype, device=N.device).expand(len(N), -1, -1)
+            C = torch.linalg.qr(torch.cat([eye, N.mT], dim=1)).R.mT
+            rows = torch.linalg.solve_triangular(C, rows, upper=False)
+            log_determinant = C.diagonal(dim1=-2, dim2=-1).abs().log().sum()
+        if weight is not None:
+            rows = weight.sqrt()[:, None, None] * rows
+        *operators, residual = rows.split([*self.widths, 1], dim=-1)
+        return Block(self.features, tuple(operators), residual[..., 0]), log_determinant
 
 
 def whiten(
@@ -174,67 +195,71 @@ def whiten(
         z = coupled(system, at, z, coulomb)
     # Noise of the state reaches the directions that the constraint fixes too, so their rows tell of it.
     has_fixed = measurement.quantity == "qdd" and system.m > 0 and state_std is None
-    rank = at.eom.rank if has_fixed else None
     std = noise_std.expand_as(measurement.values)
     rows = prior_rows(priors, scales, mean, system, at, z)
     expected = rows.target
     for prior, W in zip(priors, rows.operators, strict=True):
         if offsets and prior.name in offsets:
             expected = expected + W @ offsets[prior.name]
+    noise = _noise_factors(system, at, measurement, z, force_noise, state_std)
     everything = _Rows(
         rows.features,
-        tuple(W / std[..., None] for W in rows.operators),
-        (measurement.values - expected) / std,
-        _noise_factor(system, at, measurement, z, force_noise, state_std, std),
+        tuple(W.shape[-1] for W in rows.operators),
+        torch.cat([*rows.operators, (measurement.values - expected)[..., None], *noise], -1) / std[..., None],
     )
-    constant = std.log().sum()
-    if weight is not None:
-        constant = constant - 0.5 * std.shape[-1] * weight.log().sum()
-    if rank is None:
-        block, log_det = everything.whitened()
-        return WhitenedRows([_weighted(block, weight)], constant + log_det)
-    A = at.eom.A * std[:, None, :]
-    violated = (at.eom.A @ measurement.values[..., None])[..., 0] - at.eom.b
-    blocks = []
-    for value in rank.unique().tolist():
-        own = (rank == value).nonzero()[:, 0]
-        U, pinv = _split(A[own], value)
-        block, log_det = everything.of(own, U).whitened()
-        squares = ((pinv @ violated[own][..., None]) ** 2)[..., 0].sum(-1)
-        fixed = 0.5 * (squares if weight is None else weight[own] * squares).sum()
-        constant = constant + fixed + log_det + 0.5 * value * len(own) * math.log(2 * math.pi)
-        blocks.append(_weighted(block, None if weight is None else weight[own]))
+    if not has_fixed:
+        block, log_determinant = everything.whitened(weight)
+        return WhitenedRows([block], lambda: log_determinant + _log_scale(std, weight))
+    A, b, values = at.eom.A, at.eom.b, measurement.values
+    scaled, groups, blocks, log_determinants = A * std[:, None, :], _by_rank(at.eom.rank), [], []
+    for rank, own in groups:
+        U = null_space_basis(_independent(scaled[own], rank)[0], rank)
+        block, log_determinant = everything.of(own, U).whitened(None if weight is None else weight[own])
+        blocks.append(block)
+        log_determinants.append(log_determinant)
+
+    def constant() -> Tensor:
+        # What this function keeps alive is small beside the equations of motion.
+        violated = (A @ values[..., None])[..., 0] - b
+        weights = torch.ones_like(violated[:, 0]) if weight is None else weight
+        fixed = [_fixed(scaled[own], rank, violated[own], weights[own]) for rank, own in groups]
+        return sum([*log_determinants, *fixed], start=_log_scale(std, weight))
+
     return WhitenedRows(blocks, constant)
 
 
-def _weighted(block: Block, weight: Tensor | None) -> Block:
-    """The rows of samples with noise of less or more than unit variance, in units of it."""
-    if weight is None:
-        return block
-    root = weight.sqrt()
-    operators = tuple(root[:, None, None] * W for W in block.operators)
-    return Block(block.features, operators, root[:, None] * block.target)
+def _log_scale(std: Tensor, weight: Tensor | None) -> Tensor:
+    """Logarithm of all standard deviations together, of weighted samples `()`."""
+    total = std.log().sum()
+    return total if weight is None else total - 0.5 * std.shape[-1] * weight.log().sum()
 
 
-def _noise_factor(
+def _fixed(A: Tensor, rank: int, violated: Tensor, weight: Tensor) -> Tensor:
+    """Negative log likelihood of the directions that the constraint fixes `()`, where A q̈ − b is violated."""
+    rows, C = _independent(A, rank)
+    pinv = torch.linalg.pinv(rows) if C is None else torch.linalg.pinv(rows) @ C
+    squares = ((pinv @ violated[..., None]) ** 2)[..., 0].sum(-1)
+    return 0.5 * (weight * squares).sum() + 0.5 * rank * len(A) * math.log(2 * math.pi)
+
+
+def _noise_factors(
     system: ConstrainedSystem,
     at: States,
     measurement: Measurement,
     z: AffineMap,
     force_noise: ForceNoise | None,
     state_std: Tensor | None,
-    std: Tensor,
-) -> Tensor | None:
-    """N `(n, d, k)` of noise beside that of the sensor, in units of the latter; `None` for none."""
+) -> list[Tensor]:
+    """Factors `(n, d, k)` of the covariance of the noise beside that of the sensor."""
     parts = []
     if force_noise is not None:
         parts.append(z.B_Q * force_noise(at).sqrt()[:, None, :])
     if state_std is not None and (G := state_jacobian(system, measurement)) is not None:
         parts.append(G * state_std)
-    return torch.cat(parts, dim=-1) / std[..., None] if parts else None
+    return parts
 
 
 def combine(rows: Sequence[WhitenedRows]) -> WhitenedRows:
     """The rows of several measurements together."""
-    constant = torch.stack([r.constant for r in rows]).sum()
-    return WhitenedRows([block for r in rows for block in r.blocks], constant)
+    blocks = [block for r in rows for block in r.blocks]
+    return WhitenedRows(blocks, lambda: torch.stack([r.constant for r in rows]).sum())

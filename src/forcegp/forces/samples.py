@@ -59,7 +59,7 @@ class ForceSamples:
             Q, Q_z = (Q, Q_z + force) if prior.target == CONTACT else (Q + force, Q_z)
         return Q, with_coulomb(system, at, Q + Q_z, self.posterior.coulomb) - Q
 
-    def total_force(self, system: ConstrainedSystem, at: States) -> Tensor:
+    def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Q̄ = Q + Q_z of one sample per trajectory, the force field of a rollout.
 
         Args:
@@ -74,7 +74,7 @@ class ForceSamples:
         return with_coulomb(system, at, Q_bar, self.posterior.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
-        """Σ E f over some priors, as in `total_force`, without Coulomb friction of contacts."""
+        """Σ E f over some priors, without Coulomb friction of contacts."""
         unknown: Tensor | float = 0.0
         runs = len(at.q) // self.count
         step = max(1, CHUNK_STATES // max(runs, 1))

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.measurements import Measurement, NoiseStd
+from forcegp.forces.measurements import Measurement
+from forcegp.forces.observations import NoiseStd
 from forcegp.robot.model import RobotModel
 
 

@@ -54,7 +54,7 @@ class ProcessBasis:
         rest = self.split.rest
         if rest is None or not points(self.inducing):
             return None
-        return rest.kernel.towards(rest.parameters(self.params), self.inducing)
+        return rest.kernel.towards(self._rest_params, self.inducing)
 
     @cached_property
     def finite(self) -> FunctionDraw | None:
@@ -86,18 +86,21 @@ class ProcessBasis:
         device = next(iter(self.inducing.values())).device
         return self.used.reshape(-1).nonzero()[:, 0].to(device)
 
+    @cached_property
+    def owner(self) -> Tensor:
+        """The component of each basis function `(Σ sizes,)`."""
+        return self.used.nonzero()[:, 0].to(self.columns.device)
+
     def values(self, features: Features) -> tuple[Tensor, Tensor]:
         """V(x) filled up with zeros `(components, n, width)`; |V|² of inducing points `(components, n)`."""
-        parts = []
-        explained = next(iter(features.values())).new_zeros(self.components, points(features))
-        if self.to_inducing is not None:
-            parts.append(self.to_inducing(features) @ self.roots)
-            explained = torch.linalg.vecdot(parts[0], parts[0])
-        if self.finite is not None:
-            parts.append(self.finite.basis(features))
-        if len(parts) == 1:
-            return parts[0], explained
-        return torch.cat([explained[..., None][..., :0], *parts], dim=-1), explained
+        if self.to_inducing is None:
+            none = next(iter(features.values())).new_zeros(self.components, points(features), 0)
+            return none if self.finite is None else self.finite.basis(features), none.sum(-1)
+        whitened = self.to_inducing(features) @ self.roots
+        explained = torch.linalg.vecdot(whitened, whitened)
+        if self.finite is None:
+            return whitened, explained
+        return torch.cat([whitened, self.finite.basis(features)], dim=-1), explained
 
     def fold(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Weights of basis functions as those of k(x, Z) and of the exact features.
@@ -117,10 +120,21 @@ class ProcessBasis:
 
     def rest_variance(self, features: Features) -> Tensor:
         """Prior variance of the part that inducing points approximate, `(components, n)`."""
-        rest = self.split.rest
-        if rest is None:
+        if self.split.rest is None:
             return next(iter(features.values())).new_zeros(self.components, points(features))
-        return rest.kernel.diagonal(rest.parameters(self.params), features)
+        return self.split.rest.kernel.diagonal(self._rest_params, features)
+
+    @cached_property
+    def _rest_params(self) -> dict[str, Tensor]:
+        assert self.split.rest is not None
+        return self.split.rest.parameters(self.params)
+
+    def evaluate(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
+        """The basis functions at n samples `(n, Σ sizes)`, and their share in `LatentBasis.evaluate`."""
+        values, explained = self.values(features)
+        V = values.transpose(0, 1).reshape(points(features), -1).index_select(1, self.columns)
+        prior = self.rest_variance(features)
+        return V, prior.mT, (prior - explained).mT
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,10 +171,9 @@ class LatentBasis:
 
     @cached_property
     def owner(self) -> Tensor:
-        """The component of each basis function `(size,)`."""
-        sizes = torch.tensor([own.stop - own.start for own in self.columns])
-        device = next(iter(self.parts[0].inducing.values())).device
-        return torch.arange(len(sizes)).repeat_interleave(sizes).to(device)
+        """The component of each basis function `(size,)`, of the components of all processes in order."""
+        own = zip(self.parts, self.components, strict=True)
+        return torch.cat([part.owner + among.start for part, among in own])
 
     def of_process(self, p: int) -> slice:
         """The basis functions of process p."""
@@ -177,13 +190,9 @@ class LatentBasis:
             V `(n, size)`; by component `(n, components)` the prior variance of the kernels' rest, and
             what is missed of it, k(x, x) − |V(x)|².
         """
-        n, V, prior, missed = points(features[0]), [], [], []
-        for part, x in zip(self.parts, features, strict=True):
-            values, explained = part.values(x)
-            V.append(values.transpose(0, 1).reshape(n, -1).index_select(1, part.columns))
-            prior.append(part.rest_variance(x))
-            missed.append(prior[-1] - explained)
-        return torch.cat(V, dim=-1), torch.cat(prior).mT, torch.cat(missed).mT
+        parts = [part.evaluate(x) for part, x in zip(self.parts, features, strict=True)]
+        V, prior, missed = (torch.cat(own, dim=-1) for own in zip(*parts, strict=True))
+        return V, prior, missed
 
 
 def latent_basis(

@@ -145,9 +145,12 @@ class Linear(Kernel):
         return torch.exp(params["log_offset"]) * self.slope_std(params).square().mean(-1).sqrt()
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        return self.towards(params, x2)(x1)
+
+    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         slope = self.slope_std(params)[:, None, :]
-        product = (stacked(x1, self.inputs) * slope) @ (stacked(x2, self.inputs) * slope).mT
-        return product + self.bias_std(params).square()[:, None, None]
+        b, bias = (stacked(x2, self.inputs) * slope).mT, self.bias_std(params).square()[:, None, None]
+        return lambda x1: (stacked(x1, self.inputs) * slope) @ b + bias
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         scaled = stacked(x, self.inputs) * self.slope_std(params)[:, None, :]

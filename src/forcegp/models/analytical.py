@@ -16,7 +16,8 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
-from forcegp.forces.measurements import Measurement, Observation, measurement_of
+from forcegp.forces.measurements import Measurement
+from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.quantities import affine_maps, flat_states, states
 from forcegp.gp.optimise import Learned, LearningOptions, minimise

@@ -10,7 +10,7 @@ from typing import Any
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import SceneError, UnknownNameError, near_names
-from forcegp.forces.measurements import NoiseStd
+from forcegp.forces.observations import NoiseStd
 from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window

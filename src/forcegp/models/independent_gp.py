@@ -17,7 +17,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
-from forcegp.forces.measurements import NoiseStd, Observation, measurement_of, plain
+from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import flat_states
 from forcegp.forces.start import bounds_of, initial_hyperparameters, negative_log_prior

@@ -11,7 +11,7 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.data.fields import AXES
 from forcegp.errors import DataError, ForceGPError, UnknownNameError
-from forcegp.forces.measurements import COLUMNS
+from forcegp.forces.observations import COLUMNS
 
 CHUNK = 2000
 """States that are predicted at once, to bound the memory."""

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
-from forcegp.forces.measurements import Observation, measurement_of
+from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.quantities import flat_states
 from forcegp.gp.features import Standardization
 from forcegp.models.base import (

@@ -8,7 +8,7 @@ from typing import Any
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
-from forcegp.forces.measurements import NoiseStd
+from forcegp.forces.observations import NoiseStd
 from forcegp.forces.priors.default import PAPER, contact_priors, default_priors, measured_priors
 from forcegp.gp.kernels import Kernel
 from forcegp.models.analytical import AnalyticalModel

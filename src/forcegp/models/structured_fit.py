@@ -13,7 +13,6 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.coulomb import coupled
-from forcegp.forces.dry_friction import TotalForce
 from forcegp.forces.identifiability import doubts_of
 from forcegp.forces.inference import forces_and_constant, log_likelihood, lost_by_inducing
 from forcegp.forces.learn import Problem, typical
@@ -128,11 +127,11 @@ class StructuredFit(FittedModel):
 
     def force_field(self) -> ForceField:
         """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states."""
-        return TotalForce(self.posterior)
+        return self.posterior
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         """Force functions drawn from the posterior."""
-        return TotalForce(draw_samples(self.posterior, samples, generator))
+        return draw_samples(self.posterior, samples, generator)
 
     def updated(self, measurements: Training) -> StructuredFit:
         """The fit with more samples.

@@ -17,7 +17,8 @@ from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.inference import check_method
 from forcegp.forces.learn import Problem
-from forcegp.forces.measurements import NoiseStd, Observation, Training, training_of
+from forcegp.forces.measurements import Training
+from forcegp.forces.observations import NoiseStd, Observation, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import (
     ANALYTICAL,
@@ -34,15 +35,14 @@ from forcegp.forces.start import Search, initial
 from forcegp.forces.state_noise import state_std_of
 from forcegp.forces.student_t import check_degrees
 from forcegp.gp.inducing import LIMIT, check_limit
-from forcegp.gp.optimise import LearningOptions, Progress
+from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model, require_double
+from forcegp.models.structured_checkpoint import learned
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_learning import Lesson, in_motion, prepared, solve
+from forcegp.models.structured_learning import in_motion, prepared
 from forcegp.models.structured_spec import Specification, check_inertia, torque_noise_of
 from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
 from forcegp.robot.model import RobotModel
-from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.system import pack_system
 
 FIT_COPIES = 3.0
 """Memory of a fit besides the matrices of its inference, in that of the equations of motion."""
@@ -216,19 +216,18 @@ class StructuredGP(Model[StructuredFit]):
             ModelError, DataError, UnknownNameError: the data, or the checkpoint, do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
-        sample, neighbours, known = None, None, data
-        if isinstance(known, StreamedDataset):
-            sample = sample_of(self.specification, known)
+        if isinstance(data, StreamedDataset):
+            sample = sample_of(self.specification, data)
             known = sample.data
+        else:
+            sample, known = None, data
         if self._fitted is None:
             self.specification = self.specification.for_data(known)
-        spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
-        options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
         chosen = None if learn is None else self._chosen(learn)
         training, robot, pinned, doubts = self._with_inertia(known, chosen)
-        spec = self.specification
+        spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
         spec.system.announce_states(training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
-        log = None
+        log, neighbours, forces = None, None, None
         if sample is not None:
             training = dataclasses.replace(training, part_of=sample.count)
             log = Pass(spec, sample, file, progress, distributed)
@@ -236,29 +235,17 @@ class StructuredGP(Model[StructuredFit]):
         problem = spec.problem(training)
         if robot is not spec.system.robot:
             problem = dataclasses.replace(problem, system=spec.system.with_robot(robot), pinned=pinned)
-        search, saved = self._search(problem, chosen, options), None
-        if search.start:
-            if file is not None:
-                saved = Checkpoint(file, _key(spec, problem, search, begin))
-                saved.read(search.start)
-                search = dataclasses.replace(search, recorded=saved.recorded)
-            report = None if progress is None else _reported(progress, options)
-            lesson = solve(spec, problem, search, report, begin, neighbours)
-            if saved is not None:
-                saved.write()
-        else:
-            lesson = Lesson(prepared(spec, problem, search.held), search.held)
-        values, forces = lesson.hyperparameters, None
+        search = self._search(problem, chosen, options)
+        lesson, saved = learned(spec, problem, search, file, progress, begin, neighbours)
+        values, doubts = lesson.hyperparameters, (*doubts, *lesson.warnings)
         if log is not None and lesson.problem.inducing is not None:
             forces = log.forces(lesson.problem, values)
-        doubts = (*doubts, *lesson.warnings)
         fitted = self.adopt(
             conditioned(spec, lesson.problem, values, lesson.learned, doubts, lesson.learned_on, forces)
         )
-        if not keep_checkpoint:
-            for kept in (saved, log):
-                if kept is not None:
-                    kept.remove()
+        for kept in () if keep_checkpoint else (saved, log):
+            if kept is not None:
+                kept.remove()
         return fitted
 
     def _with_inertia(
@@ -283,9 +270,12 @@ class StructuredGP(Model[StructuredFit]):
         training, _ = self._training(data, chosen)
         return training, found.robot, (left.name,), doubts
 
-    def _search(self, problem: Problem, chosen: Sequence[str] | None, options: LearningOptions) -> Search:
+    def _search(
+        self, problem: Problem, chosen: Sequence[str] | None, options: LearningOptions | None
+    ) -> Search:
         """What is learned of a problem, from where, and what keeps its values."""
         spec = self.specification
+        options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
         start = initial(problem, spec.learn_noise, spec.learns_torque_noise)
         if chosen is None:
             return Search(start, {}, options)
@@ -422,21 +412,3 @@ class StructuredGP(Model[StructuredFit]):
     def training(self) -> Training:
         """What the posterior is conditioned on."""
         return self.fitted.training
-
-
-def _reported(progress: FitProgress, options: LearningOptions) -> Progress:
-    return lambda evaluations, value, _: progress(evaluations, options.max_evaluations, value)
-
-
-def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:
-    """Identifies the learning of some tensors, on these data and this system, with these options."""
-    training = problem.training
-    data = [value for m in training.measurements for value in m.tensors]
-    priors = [(type(prior).__name__, prior) for prior in problem.priors]
-    record, robot = pack_system(problem.system)
-    named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
-    state = () if problem.state_std is None else (problem.state_std,)
-    return Checkpoint.key_of(
-        problem.mean, priors, spec.inference, search.options, training.quantities, *data, *training.noise_std,
-        record, *robot.values(), *(part for pair in named for part in pair), *state,
-    )  # fmt: skip

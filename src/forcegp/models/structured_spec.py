@@ -16,10 +16,10 @@ from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.inertia import Inertia, inertia_of
 from forcegp.forces.learn import Problem, analytical_parameters
-from forcegp.forces.measurements import (
+from forcegp.forces.measurements import Training
+from forcegp.forces.observations import (
     NoiseStd,
     Observation,
-    Training,
     is_simulated,
     observations_of,
     plain,

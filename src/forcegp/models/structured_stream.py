@@ -20,7 +20,8 @@ from forcegp.data.stream import StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
 from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
 from forcegp.forces.learn import Problem
-from forcegp.forces.measurements import Training, training_of
+from forcegp.forces.measurements import Training
+from forcegp.forces.observations import training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.totals import Totals, basis_of, posterior_of, total_over

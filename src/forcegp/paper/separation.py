@@ -16,7 +16,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, split_by_stretches
 from forcegp.forces.identifiability import force_correlation
-from forcegp.forces.measurements import Observation
+from forcegp.forces.observations import Observation
 from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior

@@ -224,20 +224,15 @@ def _run(
     steps = max(1, round(duration / dt))
     if noise is not None:
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
+    system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
     problem = Problem(mechanics, law, inputs, unilateral, options.sticking)
-    system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
-    q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
-    closed = torch.ones(n, len(system.contacts), dtype=torch.bool, device=q.device)
-    if active is not None:
-        closed = active.expand(*whole, -1).reshape(n, -1)
-    elif unilateral:
-        closed = _touching(system, q, qd)
+    initial = _initial(problem, start, whole, active)
     with one_thread() if n <= FEW else nullcontext():
         found = integrate(
             problem,
             METHODS[options.method],
-            State(q.new_zeros(n, 1), q, qd, closed),
+            initial,
             dt,
             steps,
             project=options.stabilization == "projection",
@@ -249,6 +244,21 @@ def _run(
         for name in FIELDS
     }
     return dataclasses.replace(found, system=system, **shaped)
+
+
+def _initial(
+    problem: Problem, start: tuple[Tensor, Tensor], whole: torch.Size, active: Tensor | None
+) -> State:
+    """The initial states of all trajectories, and the contacts that are closed there."""
+    n, contacts = whole.numel(), len(problem.system.contacts)
+    q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
+    if active is not None:
+        closed = active.expand(*whole, -1).reshape(n, -1)
+    elif problem.unilateral:
+        closed = _touching(problem.system, q, qd)
+    else:
+        closed = torch.ones(n, contacts, dtype=torch.bool, device=q.device)
+    return State(q.new_zeros(n, 1), q, qd, closed)
 
 
 def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:

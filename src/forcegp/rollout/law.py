@@ -14,15 +14,12 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from forcegp.constraints import ConstrainedSystem, Equations
+from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.dry_friction import DryFriction, TotalForce, split
+from forcegp.forces.dry_friction import DryFriction, ForceField, split
 from forcegp.forces.quantities import States
 from forcegp.rollout.inputs import Inputs, Reached
 from forcegp.rollout.sticking import at_the_end, dry_friction_force, overshooting
-
-ForceField = Callable[[ConstrainedSystem, States], Tensor]
-"""The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""
 
 
 @runtime_checkable
@@ -112,14 +109,6 @@ class Law(ABC):
         return None
 
 
-def under(eom: Equations, Q_bar: Tensor) -> Motion:
-    """The constrained motion under an impressed force `(n, nq)`."""
-    free = eom.free_acceleration(Q_bar)
-    missing = eom.b - (eom.A @ free[..., None])[..., 0]
-    multiplier = (eom.constraint_inertia @ missing[..., None])[..., 0]
-    return Motion(free + (eom.M_inv_At @ multiplier[..., None])[..., 0], multiplier)
-
-
 @dataclass(frozen=True)
 class ForceLaw(Law):
     """q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) of a force field (eqs. 4 and 16)."""
@@ -128,11 +117,9 @@ class ForceLaw(Law):
     has_multiplier: bool = True
 
     def motion(self, system: ConstrainedSystem, at: States) -> Motion:
-        return under(at.eom, self.force(system, at))
+        return Motion(*at.eom.motion_under(self.force(system, at)))
 
     def dry_friction(self, system: ConstrainedSystem, at: States) -> DryFriction | None:
-        if isinstance(self.force, TotalForce):
-            return self.force.split(system, at)
         return split(system, at, self.force)
 
 
@@ -236,7 +223,7 @@ class Problem:
         if dry is None:
             qdd, multiplier = self.law.motion(self.system, at)
             return Evaluation(tau, qdd, multiplier, eom.c, eom.cd)
-        free, h = under(eom, dry.Q_bar).qdd, end - state.t
+        free, h = eom.acceleration(dry.Q_bar), end - state.t
         G = eom.H if dry.response is None else eom.H @ dry.response
         damping = overshooting(G, dry.damping, h)
         if damping is not None:
@@ -245,7 +232,7 @@ class Problem:
         if damping is not None:
             force = force - h * damping * (free + (G @ force[..., None])[..., 0])
         impressed = force if dry.response is None else (dry.response @ force[..., None])[..., 0]
-        qdd, multiplier = under(eom, dry.Q_bar + impressed)
+        qdd, multiplier = eom.motion_under(dry.Q_bar + impressed)
         qdd = torch.where(held, stopping, qdd)  # the same but for rounding
         return Evaluation(tau, qdd, multiplier, eom.c, eom.cd, held)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from forcegp import dynamics
 from forcegp.compiled.mechanics import CompiledMechanics
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.contact import Anchor, Constraint, ContactPoint, MovingPoint
+from forcegp.constraints.contact import Anchor, Constraint, MovingPoint
 from forcegp.constraints.gauss import RANK_TOLERANCE
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import POTRF, POTRS, ToolMotion, tool_motion
@@ -28,6 +29,21 @@ Vector = NDArray[np.floating]
 Blocks = Callable[[Vector, Vector], Sequence[Vector]]
 """M, Q_C and Q_G at a state, then rotation, position, Jacobian and bias acceleration of each point."""
 POINT = 4
+
+
+class TouchingPoint(NamedTuple):
+    """A `ContactPoint` at one state, in arrays.
+
+    Attributes:
+        position, velocity: `(3,)` in the world [m], [m/s].
+        jacobian: J_E `(3, nq)`, world axes.
+        normal: ∇c `(3,)` at the point.
+    """
+
+    position: Vector
+    velocity: Vector
+    jacobian: Vector
+    normal: Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +64,7 @@ class StateEquations:
     Q_C: Vector
     Q_D: Vector
     Q_K: Vector
-    contact_points: dict[str, ContactPoint]
+    contact_points: dict[str, TouchingPoint]
     tool: ToolMotion
 
     @cached_property
@@ -135,9 +151,13 @@ def _moving_point(position: Vector, jacobian: Vector, bias: Vector, qd: Vector) 
     return MovingPoint.of(*(torch.from_numpy(x) for x in (position, jacobian, bias, qd)))
 
 
-def _contact_points(contacts: Sequence[Constraint], found: Sequence) -> dict[str, ContactPoint]:
+def _contact_points(contacts: Sequence[Constraint], found: Sequence) -> dict[str, TouchingPoint]:
     named = ((contact.name, terms.point) for contact, terms in zip(contacts, found, strict=True))
-    return {name: ContactPoint(*(x.numpy() for x in at)) for name, at in named if at is not None}
+    return {
+        name: TouchingPoint(*(x.numpy() for x in (at.position, at.velocity, at.jacobian, at.normal)))
+        for name, at in named
+        if at is not None
+    }
 
 
 def _blocks(system: ConstrainedSystem, anchors: Sequence[Anchor]) -> tuple[Blocks, bool]:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import ContactPoint, SurfaceContact
@@ -71,11 +70,7 @@ class SurfaceForcePrior(ForcePrior):
         if not system.contacts:
             return {name: at.q.new_zeros(len(at.q), WIDTHS[name]) for name in self.inputs}
         point = self._touching(system, at)
-        frame = tangent_frame(self.normal(at))
-        along = {name: (frame.mT @ getattr(point, name)[..., None])[..., 0] for name in self.vectors}
-        # The floor keeps the derivative of the root finite at rest.
-        along["speed"] = along["velocity"].square().sum(-1, keepdim=True).clamp(min=1e-30).sqrt()
-        return {name: along[name] for name in self.inputs}
+        return {name: _along(point, name) for name in self.inputs}
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         if not system.contacts:
@@ -94,9 +89,13 @@ class SurfaceForcePrior(ForcePrior):
             self.check(system)
         return at.eom.contact_points[self.contact]
 
-    def normal(self, at: States) -> Tensor:
-        """Unit normal of the surface `(n, 3)`."""
-        return normalize(at.eom.contact_points[self.contact].normal, dim=-1)
+
+def _along(point: ContactPoint, name: str) -> Tensor:
+    """An input along the surface: `position` or `velocity` in the tangent frame, or the sliding `speed`."""
+    if name == "speed":
+        # The floor keeps the derivative of the root finite at rest.
+        return point.sliding[1].square().sum(-1, keepdim=True).clamp(min=1e-30).sqrt()
+    return (tangent_frame(point.unit_normal).mT @ getattr(point, name)[..., None])[..., 0]
 
 
 @dataclass(frozen=True)
@@ -125,4 +124,5 @@ class ContactForcePrior(SurfaceForcePrior):
         return 2
 
     def directions(self, system: ConstrainedSystem, at: States) -> Tensor:
-        return at.eom.contact_points[self.contact].jacobian.mT @ tangent_frame(self.normal(at))
+        point = at.eom.contact_points[self.contact]
+        return point.jacobian.mT @ tangent_frame(point.unit_normal)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
@@ -28,17 +27,6 @@ TERMS = ("viscous", "dry", "coulomb", "stribeck", "torsion")
 """Kinds of friction, in the order of the components of the latent function."""
 LOADED = ("coulomb", "stribeck", "torsion")
 """Kinds that are proportional to the multiplier."""
-
-
-def sliding(at: States, contact: str) -> tuple[Tensor, Tensor]:
-    """Jacobian `(n, 3, nq)` and velocity `(n, 3)` of the touching point along the surface.
-
-    J and v = J q̇ are those of the point, with the part along the normal left out.
-    """
-    point = at.eom.contact_points[contact]
-    normal = normalize(point.normal, dim=-1)[..., None]
-    J = point.jacobian - normal @ (normal.mT @ point.jacobian)
-    return J, (J @ at.qd[..., None])[..., 0]
 
 
 @dataclass(frozen=True)
@@ -115,7 +103,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return len(self.terms)
 
     def directions(self, system: ConstrainedSystem, at: States) -> Tensor:
-        J, v = sliding(at, self.contact)
+        J, v = at.eom.contact_points[self.contact].sliding
         square = v.square().sum(-1, keepdim=True)
         against = -(J.mT @ v[..., None])[..., 0]
         dry = against / (square + self.smoothing**2).sqrt()
@@ -154,6 +142,6 @@ class SlidingFrictionPrior(SurfaceForcePrior):
             kinematics.as_point(system.robot, contact.point),
         )
         angular = kinematics.jacobian_of_poses(system.robot, at.eom.poses, index, origin)[..., :3, :]
-        about = (self.normal(at)[..., None, :] @ angular)[..., 0, :]
+        about = (at.eom.contact_points[self.contact].unit_normal[..., None, :] @ angular)[..., 0, :]
         rate = (about * at.qd).sum(-1, keepdim=True)
         return -about * rate / (rate.square() + self.torsion_smoothing**2).sqrt()
