@@ -104,7 +104,8 @@ def fit(
     _warn(fitted.result)
     figures = {name: value for name, value in asdict(fitted.result).items() if name != "history"}
     if not as_json:
-        del figures["warnings"]  # printed above
+        # Warnings are printed above; only some models have a choice of inference.
+        figures = {name: value for name, value in figures.items() if name != "warnings" and value != ""}
     show({"model": regression.name, "training_points": len(training), **figures, "folder": str(out)}, as_json)
 
 
