@@ -116,6 +116,7 @@ def test_the_coefficient_is_learned_and_the_multiplier_found(tmp_path: Path) -> 
     prior = SlidingFrictionPrior("table", coupled=True)
     model = forcegp.StructuredGP(table_system(), "analytical", [prior], noise_std=0.01, torque_noise=None)
     fit = model.fit(train)
+    assert fit.result.objective < -660.0, "not the optimum where a function of the state is the friction"
     mu, eps = (float(fit.hyperparameters[key].exp()) for key in coulomb_keys("table"))
     assert mu == pytest.approx(0.12, rel=0.02) and 0.5 * EPS < eps < 2.0 * EPS
     read = fit.predict(test.q, test.qd, test.tau, "multiplier")

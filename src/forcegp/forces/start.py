@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import scipy
 import torch
 from torch import Tensor
 
@@ -21,6 +22,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.coulomb import below_jamming, initial_coulomb
 from forcegp.forces.learn import OWN, Problem, Tensors, kernel_parameters, noise_key, typical
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, ForcePrior
+from forcegp.forces.projection import WhitenedRows
 from forcegp.forces.torque_noise import initial_torque_noise
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
@@ -46,6 +48,10 @@ WIDTH = {
 """Standard deviations of the log-normal priors below and above the start, in e-folds; 3 where not named."""
 START_SAMPLES = 5000
 """Evenly spaced samples that the start of learning is computed from, where there are more."""
+FRICTION_SAMPLES = 200
+"""Evenly spaced samples that the start of Coulomb friction is chosen on."""
+COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+"""Friction coefficients that are tried."""
 PARALLEL = 1e-9
 """One minus the mean cosine below which two directions are the same."""
 
@@ -55,21 +61,51 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     few = problem
     if problem.training.samples > START_SAMPLES:
         few = dataclasses.replace(problem, training=problem.training.evenly(START_SAMPLES))
-    start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks)
+    noise = initial_torque_noise(few.torque_residual()) if learn_torque_noise else {}
+    if problem.has_coulomb:
+        start = _with_friction(few, noise)
+    else:
+        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks)
     for prior in problem.priors:
         own = prior.initial_parameters(problem.system.robot)
         start |= {f"{prior.name}.{name}": value for name, value in own.items()}
-    if problem.has_coulomb:
-        start |= initial_coulomb(problem.priors, problem.system.robot.mass)
-    if learn_torque_noise:
-        start |= initial_torque_noise(few.torque_residual())
+    start |= noise
     if learn_noise:
-        noise = problem.training.noise_std
-        start |= {noise_key(i): typical(std).double().log() for i, std in enumerate(noise)}
+        stds = problem.training.noise_std
+        start |= {noise_key(i): typical(std).double().log() for i, std in enumerate(stds)}
     if problem.parameters is not None:
         named = problem.parameters.named_parameters()
         start |= {f"{ANALYTICAL}.{name}": value.detach().clone() for name, value in named}
     return start
+
+
+@torch.no_grad()
+def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
+    """The likeliest coefficient of Coulomb friction, and hyperparameters of the forces that it leaves.
+
+    From a coefficient that is far off, learning may give all friction to a function of the state, and end so.
+    """
+    few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
+    like = problem.system.robot.mass
+    known = initial_coulomb(problem.priors, like)
+    limits = below_jamming(problem.system, problem.training.measurements, problem.priors, bounds_of(known))
+
+    def start_at(x: float) -> tuple[Tensors, WhitenedRows]:
+        own = {
+            key: like.new_tensor(min(x, limits[key][1])) if key.endswith("log_coefficient") else value
+            for key, value in known.items()
+        }
+        rows = few.rows({**own, **noise})
+        return {**initial_hyperparameters(few.priors, rows.blocks), **own}, rows
+
+    def value(x: float) -> float:
+        start, rows = start_at(x)
+        return float(few.negative_log_likelihood(kernel_parameters({**start, **noise}), rows))
+
+    best = min(range(1, len(COEFFICIENTS) - 1), key=lambda k: value(math.log(COEFFICIENTS[k])))
+    around = (math.log(COEFFICIENTS[best - 1]), math.log(COEFFICIENTS[best + 1]))
+    found = scipy.optimize.minimize_scalar(value, bounds=around, method="bounded", options={"xatol": 1e-3})
+    return start_at(float(found.x))[0]
 
 
 def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block]) -> dict[str, Tensor]:

@@ -34,6 +34,8 @@ DURATION = 60.0
 """Simulated time of each scene [s]."""
 SHOWN = 1500
 """Rows of the force that the page shows."""
+GAP = 0.5
+"""Time between two stretches at least [s]."""
 NAMES = {"file": "robot file", "torques": MODEL, "sensor": f"{MODEL} with wrist sensor"}
 ROWS_RIGHT, OFFSET_MM, TILT_DEGREES = 0.99, 0.2, 0.2
 """What contact detection and the surface fit are asked for."""
@@ -181,11 +183,11 @@ def _force_finding(topic: str, score: dict[str, Any]) -> Finding:
 
 @torch.no_grad()
 def _block(scene: str, run: Stage, log: Stage, fits: dict[str, Stage]) -> Block:
-    """λ over the first held-out rows, by the fitted models."""
+    """λ over the first held-out stretch, by the fitted models."""
     system = load_scene(scene).system()
     data, truth = Dataset.read(log / "log.parquet"), Dataset.read(run / "run.parquet")
     _, test = selected(data, truth, system)
-    test = test[:SHOWN]
+    test = test[: min(SHOWN, _first_stretch(test.t))]
     contact = system.contact_names[0]
     force, closed = test.contact_extras["multiplier"][contact], test.contact[contact]
     bands = []
@@ -197,9 +199,15 @@ def _block(scene: str, run: Stage, log: Stage, fits: dict[str, Stage]) -> Block:
     zero = series(torch.zeros_like(force))
     drawn = MultiplierData(t=series(t), c=zero, simulated=series(force), held_out=open_spans, bands=bands)
     caption = (
-        f"Normal force in {scene} on the first held-out stretches; the contact is open where it is grey."
+        f"Normal force in {scene} on the first held-out stretch; the contact is open where it is shaded."
     )
     return Block(scene, caption, tuple(draw_multiplier(drawn, b) for b in bands), "results.json")
+
+
+def _first_stretch(t: torch.Tensor) -> int:
+    """Number of samples up to the first gap; impacts are left out, which makes shorter ones."""
+    gaps = (t.diff() > GAP).nonzero()[:, 0]
+    return int(gaps[0]) + 1 if len(gaps) else len(t)
 
 
 def _band(
