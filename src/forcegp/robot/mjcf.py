@@ -112,7 +112,8 @@ def _names(model: Any, kind: str, count: int) -> list[str]:
 
 
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    return transform(Rotation.from_quat(quaternion, scalar_first=True).as_matrix(), position)
+    # MuJoCo puts the real part first, SciPy last.
+    return transform(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix(), position)
 
 
 def _inertial(model: Any, b: int) -> Inertial | None:

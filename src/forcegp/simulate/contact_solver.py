@@ -13,7 +13,7 @@ from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, Surf
 from forcegp.errors import ForceGPError, UnsupportedRobotError
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.simulate.config import ContactSolver
-from forcegp.simulate.mujoco import import_mujoco
+from forcegp.simulate.mujoco import full_mass_matrix, import_mujoco
 from forcegp.simulate.urdf import link_name, write_urdf
 from forcegp.types import JointVector
 
@@ -133,9 +133,7 @@ class ContactSolverEngine:
     def _of_the_step(self) -> tuple[np.ndarray, np.ndarray]:
         """q̈ with which the next step changes the velocity, and −h D q̈, by which friction differs then."""
         model, data = self._model, self._data
-        M = np.zeros((model.nv, model.nv))
-        for column, unit in zip(M, np.eye(model.nv), strict=True):
-            self._mujoco.mj_mulM(model, data, column, unit)
+        M = full_mass_matrix(model, data)
         hD = model.opt.timestep * model.dof_damping
         qdd = np.linalg.solve(M + np.diag(hD), M @ data.qacc)
         return qdd, -hD * qdd

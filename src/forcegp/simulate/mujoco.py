@@ -66,9 +66,7 @@ class MuJoCoEngine:
         data = self._scratch
         self._set(data, q, torch.zeros_like(q))
         self._mujoco.mj_forward(self._model, data)
-        M = np.zeros((self._model.nv, self._model.nv))
-        self._mujoco.mj_fullM(self._model, data, M)
-        return self._tensor(M[np.ix_(self._dof, self._dof)])
+        return self._tensor(full_mass_matrix(self._model, data)[np.ix_(self._dof, self._dof)])
 
     def inverse_dynamics(self, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
         """MuJoCo's own `mj_inverse`, `(nq,)`."""
@@ -87,6 +85,14 @@ class MuJoCoEngine:
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.tensor(values, dtype=self._robot.dtype)
+
+
+def full_mass_matrix(model: Any, data: Any) -> np.ndarray:
+    """M `(nv, nv)` of a state whose positions are up to date; `mj_fullM` differs between versions."""
+    M = np.zeros((model.nv, model.nv))
+    for column, unit in zip(M, np.eye(model.nv), strict=True):
+        import_mujoco().mj_mulM(model, data, column, unit)
+    return M
 
 
 def import_mujoco() -> Any:
