@@ -114,8 +114,8 @@ class Arm:
         )
         self.scale = self.scale.max(0)
         n = robot.nq
-        state = [torch.from_numpy(x[::200]) for x in (q,)]
-        inertia = forcegp.dynamics.mass_matrix(robot, *state).diagonal(dim1=-2, dim2=-1).mean(0).numpy()
+        M = forcegp.dynamics.mass_matrix(robot, torch.from_numpy(q[::200]))
+        inertia = M.diagonal(dim1=-2, dim2=-1).mean(0).numpy()
         true.dof_armature[:] = wrong.drive * random.uniform(0.0, 1.0, n) * inertia
         true.dof_frictionloss[:] = wrong.dry * random.uniform(0.2, 1.0, n) * self.scale
         true.dof_damping[:] += wrong.viscous * random.uniform(0.2, 1.0, n) * self.scale

@@ -12,7 +12,6 @@ mean, as long as the error of no joint's torque on held-out stretches grows by m
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,18 +21,17 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
-from forcegp.forces.inverse_dynamics import Rows, Sums, free_rows, held_out, sums
+from forcegp.forces.inverse_dynamics import Rows, Sums, free_rows, held_out, is_less, sums
 from forcegp.forces.links import rigid_robot
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import ForceMean
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.robot.model import RobotModel
 
-LEAST_SQUARE = 1e-300
 VOLUME_STATES = 60
 """States that log |M| is averaged over."""
-SIGNIFICANT = 2.0
-"""Standard errors, over stretches, beyond which a difference counts."""
+LEAST_SQUARE = 1e-300
+"""Mean square of a joint that does not move in a stretch, which has no error."""
 TOLERATED = 0.02
 """Relative increase of the held-out torque error of a joint that is worth better accelerations."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
@@ -82,7 +80,7 @@ def inertia_of(
     noise = every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
     M = mass_matrix(robot, rows.q)
     alone = held_out(drives, lambda given: _drives(given, noise, M, 0.0))
-    armature = inertia_of_drives(rows, drives, noise, M, alone, is_better(alone, before))
+    armature = inertia_of_drives(rows, drives, noise, M, alone, is_less(log_ratio(alone, before).mean(-1)))
     if not bool(armature.any()):
         return Inertia(robot)
     return Inertia(robot.replace(armature=robot.armature + armature), doubts=_told(robot, armature))
@@ -96,26 +94,14 @@ def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
     return (f"{lacks}: {found}",) if found else ()
 
 
-def difference(after: Tensor, before: Tensor) -> tuple[float, float]:
-    """Mean log ratio of root mean squares `(groups, nq)`, and its standard error over the stretches."""
-    ratio = _log_ratio(after, before).mean(-1)
-    return float(ratio.mean()), float(ratio.std() / math.sqrt(len(ratio)))
-
-
-def _log_ratio(after: Tensor, before: Tensor) -> Tensor:
-    """Of root mean squares; a joint that does not move in a stretch has none."""
+def log_ratio(after: Tensor, before: Tensor) -> Tensor:
+    """Of the roots of mean squares; zero for a joint that does not move in a stretch."""
     return 0.5 * (after.clamp(min=LEAST_SQUARE) / before.clamp(min=LEAST_SQUARE)).log()
-
-
-def is_better(after: Tensor, before: Tensor) -> bool:
-    """Whether errors are significantly smaller."""
-    mean, error = difference(after, before)
-    return mean < -SIGNIFICANT * error
 
 
 def is_harmless(after: Tensor, before: Tensor) -> bool:
     """Whether the errors of no joint are larger by more than is tolerated."""
-    return bool((_log_ratio(after, before).mean(0) <= TOLERATED).all())
+    return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
 
 
 def inertia_of_drives(
@@ -156,8 +142,8 @@ def _drives(given: Sums, noise: Tensor, M: Tensor, weight: float) -> Tensor:
     H, h = given.quadratic(noise)
     n, M = float(given.count.max()), M[:: max(1, len(M) // VOLUME_STATES)]
     scale = M.diagonal(dim1=-2, dim2=-1).mean(0)
-    H, h = (H * scale[:, None] * scale / n).numpy(), (h * scale / n).numpy()
-    relative = (M / (scale[:, None] * scale).sqrt()).numpy()
+    H, h = (H * scale[:, None] * scale / n).cpu().numpy(), (h * scale / n).cpu().numpy()
+    relative = (M / (scale[:, None] * scale).sqrt()).cpu().numpy()
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
         moved = relative + np.diag(x)

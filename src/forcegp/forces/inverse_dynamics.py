@@ -11,6 +11,7 @@ C′ᵀ(C δ + Φ w − r) = 0, and errors are judged by the product ε ε′, i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -31,6 +32,8 @@ MOVES = 0.1
 """Share of the samples in which a joint moves at least, for its sticking to count."""
 RIDGE = 1e-8
 """Of the scaled friction columns, relative to the number of samples."""
+SIGNIFICANT = 2.0
+"""Standard errors, over stretches, beyond which a difference counts."""
 APART = 0.05
 """Time between a sample and its partner [s], longer than filters of accelerations reach."""
 COHERENT = 0.9
@@ -61,6 +64,12 @@ class Rows:
     group: Tensor
     segment: Tensor
     partner: Tensor
+
+    @property
+    def leading(self) -> int:
+        """Number of samples before their partners, in the order of the log."""
+        paired = int(self.partner[0]) > 0
+        return len(self.partner) // 2 if paired else len(self.partner)
 
 
 @dataclass(frozen=True)
@@ -251,3 +260,8 @@ def held_out(by_stretch: Sums, estimate: Estimate) -> Tensor:
         delta = estimate(rest)
         errors.append(by_stretch.of(g).error(delta, rest.friction(delta)))
     return torch.stack(errors)
+
+
+def is_less(difference: Tensor) -> bool:
+    """Whether differences `(groups,)` are significantly below zero."""
+    return float(difference.mean()) < -SIGNIFICANT * float(difference.std()) / math.sqrt(len(difference))

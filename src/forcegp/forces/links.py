@@ -16,13 +16,11 @@ from torch import Tensor
 
 from forcegp.dynamics import mass_matrix
 from forcegp.forces.calibration import autocorrelation_time
-from forcegp.forces.inverse_dynamics import Rows, Sums, instrumental, products
+from forcegp.forces.inverse_dynamics import Rows, Sums, instrumental, is_less, products
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
 
-SIGNIFICANT = 2.0
-"""Standard errors, over stretches, beyond which a difference counts."""
 PASSES = 3
 """Estimates of the unknowns, each with the noise that the one before left."""
 
@@ -71,8 +69,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
 
 def _power(rows: Rows, left: Tensor) -> float:
     """κ = 1/τ̄ of what nothing explains, as in `likelihood_power`."""
-    first = len(left) // 2 if bool((rows.partner != torch.arange(len(left))).any()) else len(left)
-    times = autocorrelation_time(left[:first], rows.segment[:first])
+    times = autocorrelation_time(left[: rows.leading], rows.segment[: rows.leading])
     return min(1.0, math.exp(-float(times.log().mean())))
 
 
@@ -102,5 +99,4 @@ def _drives_alone(every: Sums, noise: Tensor, n: int) -> Tensor:
 
 def _is_better(after: Tensor, before: Tensor) -> bool:
     """Whether errors `(groups, nq)` are significantly smaller, in the mean of the joints."""
-    less = (after - before).mean(-1)
-    return float(less.mean()) < -SIGNIFICANT * float(less.std()) / math.sqrt(len(less))
+    return is_less((after - before).mean(-1))

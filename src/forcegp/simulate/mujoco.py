@@ -89,9 +89,9 @@ class MuJoCoEngine:
 
 def full_mass_matrix(model: Any, data: Any) -> np.ndarray:
     """M `(nv, nv)` of a state whose positions are up to date; `mj_fullM` differs between versions."""
-    M = np.zeros((model.nv, model.nv))
+    mujoco, M = import_mujoco(), np.zeros((model.nv, model.nv))
     for column, unit in zip(M, np.eye(model.nv), strict=True):
-        import_mujoco().mj_mulM(model, data, column, unit)
+        mujoco.mj_mulM(model, data, column, unit)
     return M
 
 
