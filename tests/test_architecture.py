@@ -28,6 +28,7 @@ LAYERS = (
         "batchlast",
         "threads",
         "optional",
+        "native",
         "notebook",
     ),
     ("plots",),

@@ -11,8 +11,10 @@ import pytest
 import torch
 
 from forcegp import dynamics
-from forcegp.compiled import build, cache, compile_dynamics
+from forcegp.compiled import compile_dynamics
 from forcegp.errors import MissingDependencyError
+from forcegp.native import cache
+from forcegp.native import library as native
 from forcegp.temporary import NEW
 from random_robots import random_robot
 from robots import random_states
@@ -55,13 +57,13 @@ def folder(warm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def compilations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Grows by one entry with every run of the compiler."""
     runs: list[int] = []
-    original = build._run_compiler
+    original = native._run_compiler
 
     def counted(*args: object) -> None:
         runs.append(1)
         original(*args)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(build, "_run_compiler", counted)
+    monkeypatch.setattr(native, "_run_compiler", counted)
     return runs
 
 
@@ -115,7 +117,7 @@ def planted(folder: Path) -> bytes:
     """A library with the right symbol that tells of being run."""
     text = 'extern "C" void kernel(const double* const*, double* out, long n, long) { out[0] = 666; }'
     library = folder.parent / "planted.so"
-    command = [build.find_compiler(), "-shared", "-fPIC", "-x", "c++", "-", "-o", str(library)]
+    command = [native.find_compiler(), "-shared", "-fPIC", "-x", "c++", "-", "-o", str(library)]
     subprocess.run(command, input=text, text=True, check=True)
     return library.read_bytes()
 
@@ -170,7 +172,7 @@ def test_a_truncated_kernel_does_not_kill_the_process(folder: Path) -> None:
     [kernel] = folder.iterdir()
     kernel.write_bytes(kernel.read_bytes()[:4096])
     code = (
-        "from pathlib import Path\nfrom forcegp.compiled import cache\n"
+        "from pathlib import Path\nfrom forcegp.native import cache\n"
         f"print(cache.find(Path({str(folder)!r}), {kernel.name.partition('-')[0]!r}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -13,10 +13,11 @@ from torch.func import jacfwd, jacrev, vmap
 
 import forcegp
 from forcegp import derivatives, dynamics
-from forcegp.compiled import build, compile_dynamics
+from forcegp.compiled import compile_dynamics
 from forcegp.compiled.program import QUANTITIES, trace
 from forcegp.compiled.source import cuda_source
 from forcegp.errors import MissingDependencyError, ModelError, ShapeError, UnknownNameError
+from forcegp.native.library import find_compiler
 from forcegp.robot.model import RobotModel
 from random_robots import random_robot
 from robots import random_states
@@ -193,7 +194,7 @@ def test_the_cuda_source_computes_the_same(tmp_path: Path) -> None:
     arguments = ", ".join(f"in[{k}]" for k in range(len(source.arrays)))
     text = CUDA_ON_CPU % (source.text.replace('extern "C" ', ""), arguments)
     library = tmp_path / "emulated.so"
-    command = [build.find_compiler(), "-O1", "-shared", "-fPIC", "-x", "c++", "-", "-o", str(library)]
+    command = [find_compiler(), "-O1", "-shared", "-fPIC", "-x", "c++", "-", "-o", str(library)]
     subprocess.run(command, input=text, text=True, check=True)
     states = states_of(robot, "forward_dynamics", 7)
     given = dict(zip(("q", "qd", "force"), states, strict=True))

@@ -9,11 +9,11 @@ from pathlib import Path
 import torch
 
 import forcegp
-from forcegp.compiled import cache
 from forcegp.data import Dataset
 from forcegp.exchange import recover
 from forcegp.files import atomic_directory, write_text
 from forcegp.models.base import Predictor
+from forcegp.native import cache
 from forcegp.storage.checkpoint import Checkpoint
 from logs import random_log
 from random_data import table_system

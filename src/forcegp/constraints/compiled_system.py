@@ -28,6 +28,8 @@ POINT = 4
 _KERNELS: WeakKeyDictionary[RobotModel, dict[tuple[Anchor, ...], CompiledMechanics | None]] = (
     WeakKeyDictionary()
 )
+_SYSTEMS: WeakKeyDictionary[ConstrainedSystem, ConstrainedSystem] = WeakKeyDictionary()
+"""The compiled form of systems, kept as long as these."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,9 +85,11 @@ def compiled_system(system: ConstrainedSystem) -> ConstrainedSystem:
         >>> float(compiled_system(system).equations(q, qd).c - system.equations(q, qd).c)
         0.0
     """
-    if isinstance(system, CompiledSystem) or _kernel(system.robot, anchors_of(system)) is None:
-        return system
-    return CompiledSystem(system.robot, system.contacts, system.baumgarte)
+    if system not in _SYSTEMS:
+        if isinstance(system, CompiledSystem) or _kernel(system.robot, anchors_of(system)) is None:
+            return system
+        _SYSTEMS[system] = CompiledSystem(system.robot, system.contacts, system.baumgarte)
+    return _SYSTEMS[system]
 
 
 def anchors_of(system: ConstrainedSystem) -> tuple[Anchor, ...]:

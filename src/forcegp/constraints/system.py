@@ -307,5 +307,5 @@ class ConstrainedSystem:
         cd = (A @ qd[..., None])[..., 0]
         if self.baumgarte is not None:
             b = self.baumgarte.stabilized(b, c, cd)
-        rows = self.active_rows(active, q.shape[:-1])
-        return c, cd, torch.where(rows[..., None], A, 0.0), torch.where(rows, b, 0.0)
+        open_ = self.active_rows(active, q.shape[:-1]).logical_not()
+        return c, cd, A.masked_fill(open_[..., None], 0.0), b.masked_fill(open_, 0.0)

@@ -115,10 +115,11 @@ def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
 
 def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
     """The samples of each rank; where all share one, no copy is made of them."""
-    values = rank.unique().tolist()
-    if len(values) == 1:
-        return [(values[0], slice(None))]
-    return [(value, (rank == value).nonzero()[:, 0]) for value in values]
+    low, high = (int(value) for value in rank.aminmax())
+    if low == high:
+        return [(low, slice(None))]
+    groups = ((value, (rank == value).nonzero()[:, 0]) for value in range(low, high + 1))
+    return [(value, own) for value, own in groups if len(own)]
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+
 import numpy as np
 import scipy.linalg.lapack
 import torch
 from torch import Tensor
 
-from forcegp.errors import NumericalError
+from forcegp.errors import MissingDependencyError, NumericalError
+from forcegp.native.library import load_library
 from forcegp.threads import threads_of_pytorch
 
 JITTER_STEPS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)
@@ -49,15 +55,38 @@ def cholesky(K: Tensor) -> tuple[Tensor, float]:
 def extended(L: Tensor, rows: Tensor) -> Tensor:
     """Lower factor of L Lᵀ + ΦᵀΦ, from the QR factorisation of Lᵀ above the rows Φ, in O(r n²).
 
+    Compiled where there is a C++ compiler, three to four times as fast for a few rows; else by LAPACK.
     Its diagonal may be negative, which solves do not mind.
 
     Args:
-        L: lower factor on the CPU `(n, n)`.
+        L: lower factor on the CPU `(n, n)`, as fast as can be where its columns are contiguous.
         rows: Φ `(r, n)`.
 
     Raises:
         NumericalError: LAPACK refuses the arguments.
     """
+    kernel = _kernel() if L.dtype == torch.float64 and len(rows) else None
+    if kernel is None:
+        return _extended_by_lapack(L, rows)
+    upper, below = L.mT.contiguous(), rows.clone(memory_format=torch.contiguous_format)
+    result = torch.empty_like(upper)
+    kernel(upper.data_ptr(), result.data_ptr(), below.data_ptr(), len(upper), len(below))
+    return result.mT
+
+
+@cache
+def _kernel() -> Callable[[int, int, int, int, int], None] | None:
+    """`extend` of factor_rows.cpp; `None` without a compiler."""
+    source = files("forcegp.gp").joinpath("factor_rows.cpp").read_text(encoding="utf-8")
+    try:
+        function = load_library(source, level="-O3").extend
+    except MissingDependencyError:
+        return None
+    function.restype, function.argtypes = None, [ctypes.c_void_p] * 3 + [ctypes.c_int64] * 2
+    return function
+
+
+def _extended_by_lapack(L: Tensor, rows: Tensor) -> Tensor:
     upper, below = np.array(L.numpy().T, order="F"), np.array(rows.numpy(), order="F")
     (tpqrt,) = scipy.linalg.lapack.get_lapack_funcs(("tpqrt",), (upper,))
     with threads_of_pytorch():

@@ -56,8 +56,7 @@ class SparsePosterior:
         """
         A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
         L, jitter = cholesky(A)
-        # LAPACK leaves the factor column by column; `extended` copies it faster row by row.
-        result = cls(basis, Moments(*sums.moments), L.contiguous(), jitter)
+        result = cls(basis, Moments(*sums.moments), L, jitter)
         result.__dict__["sums"] = sums
         return result
 

@@ -71,7 +71,8 @@ def posterior_of_tensors(
             expected=f"{basis.size} basis functions of {len(processes)} processes",
             got=f"{len(moments.v)} of {len(moments.prior)}",
         )
-    return SparsePosterior(basis, moments, L, jitter)
+    # Files keep rows; a factor has its columns side by side, as LAPACK leaves it.
+    return SparsePosterior(basis, moments, L.mT.contiguous().mT, jitter)
 
 
 def basis_of_tensors(

@@ -76,8 +76,8 @@ class SurfaceForcePrior(ForcePrior):
         if not system.contacts:
             return at.q.new_zeros(*at.q.shape, self.outputs(system.robot))
         self._touching(system, at)
-        closed = at.active[:, system.contact_names.index(self.contact)]
-        return torch.where(closed[:, None, None], self.directions(system, at), 0.0)
+        open_ = at.active[:, system.contact_names.index(self.contact)].logical_not()
+        return self.directions(system, at).masked_fill(open_[:, None, None], 0.0)
 
     @abstractmethod
     def directions(self, system: ConstrainedSystem, at: States) -> Tensor:

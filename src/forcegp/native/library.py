@@ -1,0 +1,109 @@
+"""From C++ source text to a shared library: the system's compiler, and a cache on disk."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from forcegp.errors import MissingDependencyError
+from forcegp.native import cache
+from forcegp.temporary import Temporary, discard, sweep
+
+FLAGS = (
+    "-std=c++17",
+    "-march=native",
+    "-ffp-contract=fast",
+    "-fno-math-errno",
+    "-w",
+    "-shared",
+    "-fPIC",
+)
+
+
+def find_compiler() -> str:
+    """Path of the C++ compiler: `$CXX`, or the first of c++, g++ and clang++ on the PATH.
+
+    Raises:
+        MissingDependencyError: there is none.
+    """
+    wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
+    for name in wanted:
+        if found := shutil.which(name):
+            return found
+    raise MissingDependencyError(
+        "the compiled dynamics need a C++ compiler and none was found",
+        expected=" or ".join(wanted) + " on the PATH",
+        hint="install one (for example: apt install g++), set CXX, or use forcegp.dynamics, which needs none",
+    )
+
+
+def _machine() -> str:
+    """What `-march=native` depends on."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return platform.processor() + platform.machine()
+    keys = ("model name", "flags", "cpu family", "model\t", "Features", "CPU part")
+    return "\n".join(sorted({line for line in text.splitlines() if line.startswith(keys)}))
+
+
+def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
+    """The shared library of a C++ source text, compiled unless the cache has it.
+
+    Args:
+        source: the text, with functions declared `extern "C"`.
+        level: of optimisation.
+
+    Raises:
+        MissingDependencyError: no compiler, it failed, or the cache cannot be written or trusted.
+    """
+    compiler = find_compiler()
+    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    key = hashlib.sha256("\0".join([source, version, _machine(), level, *FLAGS]).encode()).hexdigest()[:32]
+    place = cache.cache_directory()
+    try:
+        folder = cache.private_folder(place)
+        kept = cache.find(folder, key)
+        if kept is not None:
+            try:
+                return ctypes.CDLL(str(kept))
+            except OSError:  # of another machine that shares the folder: build it anew
+                discard(kept)
+        return ctypes.CDLL(str(cache.store(folder, key, _compiled([compiler, level], source, folder))))
+    except OSError as cause:
+        raise MissingDependencyError(
+            f"the kernel cannot be written to {place}",
+            got=str(cause),
+            hint="set FORCEGP_CACHE to a folder that can be written",
+        ) from cause
+
+
+def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
+    """The content of the shared library; what a killed compiler left in the folder is removed."""
+    target = folder / "build"
+    sweep(target)
+    build = Temporary(target, folder=True, mode=0o700)
+    try:
+        build.path.chmod(0o700)
+        library = build.path / "kernel.so"
+        _run_compiler(compiler, source, library)
+        return library.read_bytes()
+    finally:
+        build.close()
+
+
+def _run_compiler(compiler: Sequence[str], source: str, library: Path) -> None:
+    command = [*compiler, *FLAGS, "-x", "c++", "-", "-o", str(library), "-pthread"]
+    done = subprocess.run(command, input=source, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise MissingDependencyError(
+            f"the C++ compiler {compiler[0]} could not build the kernel",
+            got=done.stderr.strip()[-2000:],
+            hint="set CXX to a recent GCC or Clang, or use forcegp.dynamics, which needs no compiler",
+        )
