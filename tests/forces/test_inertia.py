@@ -12,7 +12,7 @@ from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import correlation_times
 from forcegp.forces.inertia import Inertia, inertia_of, is_harmless, log_ratio
 from forcegp.forces.inverse_dynamics import APART, Rows, instrumental, partners, products, sums
-from forcegp.forces.observations import training_of
+from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
@@ -157,6 +157,23 @@ def test_accelerations_below_the_noise_of_the_torque_damp_the_drives_without_har
 
     before, after = errors(light), errors(result.robot)
     assert bool((after[1] < 0.5 * before[1]).all()) and bool((after[0] < 1.1 * before[0]).all())
+
+
+@pytest.mark.parametrize(("free", "warns"), [(20, True), (400, False)])
+def test_a_log_that_cannot_check_the_inertia_says_so(file: RobotModel, free: int, warns: bool) -> None:
+    """In contact the multiplier takes what the masses of the file are wrong by."""
+    wire = forcegp.SurfaceContact("wire", "tip", (0.0, 0.0, 0.0), forcegp.Plane(offset=-0.2))
+    system, prior, data = forcegp.ConstrainedSystem(file, [wire]), JointFrictionPrior(), log(file)
+    data = data.replace(contact={"wire": torch.arange(len(data)) >= free})
+    training = training_of(data, system, (prior,), None, {})
+    doubts = inertia_of(system, prior, AnalyticalMean(), training).doubts
+    assert any(f"{free} samples in free motion" in doubt for doubt in doubts) == warns
+    force = Observation(
+        data.replace(contact_extras={"multiplier": {"wire": data.t}}), "multiplier", noise_std=0.5
+    )
+    sensed = training_of([Observation(data), force], system, (prior,), None, {})
+    doubts = inertia_of(system, prior, AnalyticalMean(), sensed).doubts
+    assert not any("in free motion" in doubt for doubt in doubts), "a measured force tells"
 
 
 def test_sums_give_the_dense_least_squares() -> None:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
-from forcegp.forces.inverse_dynamics import Rows, Sums, free_rows, held_out, is_less, sums
+from forcegp.forces.inverse_dynamics import LEAST, Rows, Sums, free_rows, held_out, is_less, sums
 from forcegp.forces.links import rigid_robot
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import ForceMean
@@ -68,7 +68,7 @@ def inertia_of(
     robot = system.robot
     rows = free_rows(system, friction, mean, training)
     if rows is None:
-        return Inertia(robot)
+        return Inertia(robot, doubts=_unchecked(training))
     identified = rigid_robot(robot, rows)
     if identified is not None:
         text = "held-out torques ask for other inertial parameters than the robot file's, now identified"
@@ -84,6 +84,19 @@ def inertia_of(
     if not bool(armature.any()):
         return Inertia(robot)
     return Inertia(robot.replace(armature=robot.armature + armature), doubts=_told(robot, armature))
+
+
+def _unchecked(training: Training) -> tuple[str, ...]:
+    """What a user is told of a log in contact that no free motion and no measured force goes with."""
+    closed = sum(int(m.active.any(-1).sum()) for m in training.measurements)
+    if not closed or set(training.quantities) != {"qdd"}:
+        return ()
+    free = training.samples - closed
+    return (
+        f"with {free} samples in free motion, the inertia of the robot file cannot be checked (expected: "
+        f"{LEAST} or more): the multiplier is off by as much as the masses are; add some seconds of free "
+        "motion to the log, or measure the contact force",
+    )
 
 
 def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
