@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
-from forcegp.threads import threads_of_pytorch
+from forcegp.resources import threads_of_pytorch
 
 JITTER_STEPS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)
 """Fractions of the mean diagonal that are tried, in order, until the factorisation succeeds."""

@@ -11,7 +11,8 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import SceneError, UnknownNameError, near_names
 from forcegp.forces.observations import NoiseStd
-from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.base import FitProgress, FittedModel, Model

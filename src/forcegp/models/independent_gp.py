@@ -26,7 +26,6 @@ from forcegp.gp.features import Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
 from forcegp.gp.structured_covariance import Block
-from forcegp.memory import announce_memory
 from forcegp.models.base import (
     FitProgress,
     FitResult,
@@ -36,6 +35,7 @@ from forcegp.models.base import (
     check_acceleration_only,
     require_double,
 )
+from forcegp.resources import announce_memory
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.folder import ModelHeader, Settings, settings_of
 from forcegp.storage.system import take

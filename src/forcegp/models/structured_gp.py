@@ -20,17 +20,10 @@ from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training
 from forcegp.forces.observations import NoiseStd, Observation, training_of
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import (
-    ANALYTICAL,
-    COULOMB,
-    NOISE,
-    AnalyticalMean,
-    ForcePrior,
-    check_priors,
-    mean_of,
-)
+from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
 from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.joint import AnalyticalMean, mean_of
 from forcegp.forces.start import Search, initial
 from forcegp.forces.state_noise import state_std_of
 from forcegp.forces.student_t import check_degrees

@@ -14,7 +14,7 @@ from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import states
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization

@@ -26,17 +26,15 @@ from forcegp.forces.observations import (
     states_noise,
 )
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.coregional import CoregionalPrior
 from forcegp.forces.priors.default import measured_priors
 from forcegp.forces.priors.disturbance import DisturbancePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, NormalForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
-from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.payload import PayloadPrior
-from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.state_noise import state_std_of
 from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
