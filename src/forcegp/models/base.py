@@ -15,9 +15,8 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.linearization import ForceLinearization, linearize_field
-from forcegp.models.fit_result import FitResult
+from forcegp.models.fit_result import FitResult, fit_table, model_line
 from forcegp.models.prediction import Prediction
-from forcegp.models.show import fit_table, model_line
 from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Torque
 from forcegp.rollout.law import ForceField

@@ -30,9 +30,8 @@ from forcegp.forces.student_t import check_degrees
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model, require_double
-from forcegp.models.structured_checkpoint import learned
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_learning import in_motion, prepared
+from forcegp.models.structured_learning import in_motion, learned, prepared
 from forcegp.models.structured_spec import Specification, check_inertia, torque_noise_of
 from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
 from forcegp.robot.model import RobotModel
