@@ -26,7 +26,8 @@ from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import SHALLOW, NeuralNetwork
 from forcegp.models.registry import MODELS
-from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
 from forcegp.scene import load_model_table, load_scene
 from forcegp.scene.model_section import LearningSection, ModelSection

@@ -21,7 +21,8 @@ from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import DEEP, SHALLOW, NeuralNetwork
 from forcegp.models.registry import MODELS, create
 from forcegp.models.sensed import with_sensor
-from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.scene import ModelTable

@@ -75,6 +75,62 @@ class FitResult:
         )
 
 
+class HasResult:
+    """What has the result of a fit, whose fields are its own too."""
+
+    result: FitResult
+
+    @property
+    def converged(self) -> bool:
+        """Whether the optimiser reached its tolerance."""
+        return self.result.converged
+
+    @property
+    def evaluations(self) -> int:
+        """Number of evaluations of the objective."""
+        return self.result.evaluations
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the fit."""
+        return self.result.seconds
+
+    @property
+    def objective(self) -> float:
+        """Final value of the objective."""
+        return self.result.objective
+
+    @property
+    def log_marginal_likelihood(self) -> float | None:
+        """log p(y | X, θ) of the training data, `None` for models without one."""
+        return self.result.log_marginal_likelihood
+
+    @property
+    def jitter(self) -> float:
+        """Added to the diagonal of the covariance to factorise it, relative to unit noise."""
+        return self.result.jitter
+
+    @property
+    def constant_inputs(self) -> tuple[str, ...]:
+        """Inputs that do not vary in the training data."""
+        return self.result.constant_inputs
+
+    @property
+    def message(self) -> str:
+        """Why the optimiser stopped."""
+        return self.result.message
+
+    @property
+    def history(self) -> tuple[float, ...]:
+        """The objective at each evaluation."""
+        return self.result.history
+
+    @property
+    def force_correlation(self) -> float | None:
+        """Mean posterior correlation of Q and Q_z at training states."""
+        return self.result.force_correlation
+
+
 def model_line(kind: str, system: ConstrainedSystem, result: FitResult | None) -> str:
     """Robot, contacts, and how the fit went."""
     robot = system.robot

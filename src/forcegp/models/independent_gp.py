@@ -16,7 +16,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.forces.inference import require_double
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import flat_states
@@ -26,19 +26,11 @@ from forcegp.gp.features import Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
 from forcegp.gp.structured_covariance import Block
-from forcegp.models.base import (
-    FitProgress,
-    FitResult,
-    FittedModel,
-    Model,
-    Prediction,
-    check_acceleration_only,
-    require_double,
-)
+from forcegp.models.base import FitProgress, FittedModel, Model, Prediction, check_acceleration_only
+from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
 from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.folder import ModelHeader, Settings, settings_of
-from forcegp.storage.system import take
+from forcegp.storage.folder import Settings
 
 KIND = "independent_gp"
 LEARNING = 6
@@ -146,10 +138,10 @@ class IndependentGP(Model["IndependentFit"]):
         options = options or LearningOptions()
         measured, noise_std = measurement_of(Observation(data), self.specified, self.noise_std)
         features = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
-        scale = _scale(features, self.standardize)
+        scale = scale_of(features, self.standardize)
         training = IndependentTraining(features, measured.values, noise_std, scale)
         priors = joint_processes(self.specified.robot.nq)
-        _announce(training, LEARNING)
+        announce(training, LEARNING)
         saved = None if checkpoint is None else _record(Path(checkpoint), training, priors, options)
         parts: list[Learned] = []
         for joint, prior in enumerate(priors):
@@ -181,7 +173,8 @@ class IndependentGP(Model["IndependentFit"]):
         return value
 
 
-def _scale(features: Mapping[str, Tensor], standardize: bool) -> Standardization:
+def scale_of(features: Mapping[str, Tensor], standardize: bool) -> Standardization:
+    """Standardization of inputs, or none."""
     return Standardization.of(features) if standardize else Standardization.none(features)
 
 
@@ -221,7 +214,7 @@ def _record(
     return saved
 
 
-def _announce(training: IndependentTraining, copies: int) -> None:
+def announce(training: IndependentTraining, copies: int) -> None:
     """Announce the matrices of all joints, two each beside those that learning holds."""
     n, nq = training.qdd.shape
     announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
@@ -340,36 +333,3 @@ def _variance(posterior: ExactPosterior, features: dict[str, Tensor]) -> Tensor:
     n, like = len(features["q"]), posterior.alpha
     rows = Block((features,), (like.new_ones(n, 1, 1),), like.new_zeros(n, 1))
     return posterior.covariance(rows)[:, 0, 0].clamp(min=0.0)
-
-
-def load_independent(
-    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> IndependentGP:
-    """The model that `IndependentFit.save` wrote."""
-    settings = settings_of(header, IndependentSettings, source)
-    nq, dtype = system.robot.nq, system.robot.dtype
-    model = IndependentGP(system, settings.noise_std, settings.standardize)
-    n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
-    features = {
-        name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
-    }
-    noise = take(tensors, "training.noise_std", None, dtype, source)
-    if noise.shape not in ((nq,), (n, nq)) or not bool((noise > 0.0).all()):
-        raise ModelError(f"{source}: tensor 'training.noise_std' is not valid", expected="positive numbers")
-    qdd = take(tensors, "training.qdd", (n, nq), dtype, source)
-    training = IndependentTraining(features, qdd, noise, _scale(features, settings.standardize))
-    hyperparameters = {
-        f"{prior.name}.{name}": take(
-            tensors, f"hyperparameters.{prior.name}.{name}", tuple(value.shape), torch.float64, source
-        )
-        for prior in joint_processes(nq)
-        for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
-    }
-    _announce(training, 0)
-    try:
-        model._fitted = fitted(
-            system, settings.noise_std, training, hyperparameters, standardize=settings.standardize
-        )
-    except ForceGPError as cause:
-        raise ModelError.at(f"{source}: the training data", cause) from cause
-    return model

@@ -17,14 +17,8 @@ from forcegp.errors import ModelError
 from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.quantities import flat_states
 from forcegp.gp.features import Standardization
-from forcegp.models.base import (
-    FitProgress,
-    FitResult,
-    FittedModel,
-    Model,
-    Prediction,
-    check_acceleration_only,
-)
+from forcegp.models.base import FitProgress, FittedModel, Model, Prediction, check_acceleration_only
+from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.epochs import EpochCheckpoint

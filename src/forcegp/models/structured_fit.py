@@ -24,7 +24,8 @@ from forcegp.forces.samples import draw_samples
 from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
+from forcegp.models.base import FittedModel, ForceField, Prediction
+from forcegp.models.fit_result import FitResult
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
 

@@ -13,13 +13,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
+from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import held_out_torque_std, likelihood_power, residual_times
 from forcegp.forces.impacts import without_impacts
 from forcegp.forces.inference import (
@@ -30,17 +32,24 @@ from forcegp.forces.inference import (
 )
 from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training
+from forcegp.forces.observations import Observation, training_of
+from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
+from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.robot_update import with_updated_robot
-from forcegp.forces.start import Search
+from forcegp.forces.start import Search, initial
 from forcegp.forces.student_t import left_out, weighted
 from forcegp.forces.torque_noise import TORQUE_NOISE
 from forcegp.gp.likelihood import require_exact_fits
-from forcegp.gp.optimise import Learned, Progress
+from forcegp.gp.optimise import Learned, LearningOptions, Progress
 from forcegp.models.base import FitProgress
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_spec import Specification
+from forcegp.robot.model import RobotModel
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.system import pack_system
 
+OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
+"""Default options, also where θ_A is learned too: L-BFGS then stalls on its way for a step or two."""
 LEARN_SAMPLES = 800
 """Samples that hyperparameters are learned on where priors are finite features."""
 LEARN_SAMPLES_INDUCING = 400
@@ -72,6 +81,97 @@ class Lesson:
     learned: Learned | None = None
     learned_on: int | None = None
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a fit learns from.
+
+    Attributes:
+        specification: the model; a first fit that identifies the robot adds a prior on what it does not know.
+        training: the samples.
+        robot: to learn with.
+        pinned: priors whose force the robot contains.
+        doubts: about the samples and the robot.
+    """
+
+    specification: Specification
+    training: Training
+    robot: RobotModel
+    pinned: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+
+def given_to(
+    spec: Specification,
+    before: StructuredFit | None,
+    data: Dataset | Sequence[Observation],
+    chosen: Sequence[str] | None,
+) -> Given:
+    """What a fit to data learns from, after an earlier fit of the model or as its first."""
+    training, doubts = training_for(spec, before, data, chosen)
+    if before is not None and not before.problem.offsets:
+        return Given(spec, training, before.system.robot, before.problem.pinned, doubts)
+    if before is not None or chosen is not None:
+        return Given(spec, training, spec.system.robot, (), doubts)
+    found = spec.inertia_of(training)
+    doubts = (*doubts, *found.doubts)
+    if not found.identified:
+        return Given(spec, training, found.robot, (), doubts)
+    left = InertialPrior().around(spec.system.robot)
+    spec = dataclasses.replace(spec, priors=(*spec.priors, left))
+    training, _ = training_for(spec, before, data, chosen)
+    return Given(spec, training, found.robot, (left.name,), doubts)
+
+
+def training_for(
+    spec: Specification,
+    before: StructuredFit | None,
+    data: Dataset | Sequence[Observation],
+    learned: Sequence[str] | None,
+) -> tuple[Training, tuple[str, ...]]:
+    """What is learned from, with doubts about it.
+
+    Priors that are not learned (`None`: all are) keep the scales of their inputs.
+    """
+    kept = {}
+    if before is not None and learned is not None:
+        scales = zip(spec.priors, before.training.scales, strict=True)
+        kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
+    training = training_of(data, spec.system, spec.priors, spec.noise_std, kept, spec.standardize)
+    return in_motion(spec.system, training) if spec.learns_torque_noise else (training, ())
+
+
+def chosen_of(spec: Specification, learn: Iterable[str]) -> tuple[str, ...]:
+    """What is learned, by prefix of its tensors.
+
+    Raises:
+        UnknownNameError: it is neither a prior nor something else that can be learned.
+    """
+    names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
+    chosen = tuple(learn)
+    for name in chosen:
+        if name not in names:
+            raise UnknownNameError("force prior to learn", name, names)
+    return chosen
+
+
+def search_of(
+    spec: Specification,
+    problem: Problem,
+    before: StructuredFit | None,
+    chosen: Sequence[str] | None,
+    options: LearningOptions | None,
+) -> Search:
+    """What is learned of a problem, from where, and what keeps its values."""
+    options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
+    start = initial(problem, spec.learn_noise, spec.learns_torque_noise)
+    if chosen is None:
+        return Search(start, {}, options)
+    known = {} if before is None else before.hyperparameters
+    current = {key: known.get(key, value) for key, value in start.items()}
+    held = {key: value for key, value in current.items() if key.split(".")[0] not in chosen}
+    return Search({key: value for key, value in start.items() if key not in held}, held, options)
 
 
 def in_motion(system: ConstrainedSystem, training: Training) -> tuple[Training, tuple[str, ...]]:

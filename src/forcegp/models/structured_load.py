@@ -19,7 +19,7 @@ from forcegp.forces.quantities import states
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.sparse_tensors import posterior_of_tensors
-from forcegp.models.base import FitResult
+from forcegp.models.fit_result import FitResult
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_spec import CLASSES, COLUMNS, IN_TIME, Specification, StructuredSettings

@@ -42,7 +42,7 @@ from forcegp.gp.inducing import LIMIT
 from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sparse_tensors import tensors_of_posterior
-from forcegp.models.base import FitResult
+from forcegp.models.fit_result import FitResult
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import encode
 from forcegp.storage.folder import Settings
