@@ -249,10 +249,27 @@ def pack(
     Raises:
         ModelError: a prior or kernel is Python code.
     """
-    training, latent = problem.training, posterior.latent
     own = spec.parameters if isinstance(spec.parameters, AnalyticalParameters) else None
-    exact = isinstance(latent, ExactPosterior)
-    settings = StructuredSettings(
+    tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
+    tensors |= {f"offset.{name}": value for name, value in problem.offsets.items()}
+    if problem.torque_std is not None:
+        tensors["torque_std"] = problem.torque_std
+    if problem.correlation is not None:
+        tensors["torque_correlation"] = problem.correlation
+    tensors |= _conditioned_on(spec, problem.training, posterior)
+    start = own.start if own is not None else spec.system.robot
+    tensors |= {f"start.{name}": getattr(start, name) for name in robot_tensors(start)}
+    for prior, scale in zip(spec.priors, problem.training.scales, strict=True):
+        tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
+        tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
+    return _settings_of(spec, problem, isinstance(posterior.latent, ExactPosterior), own, result), tensors
+
+
+def _settings_of(
+    spec: Specification, problem: Problem, exact: bool, own: AnalyticalParameters | None, result: FitResult
+) -> StructuredSettings:
+    """What is kept of a fit besides tensors."""
+    return StructuredSettings(
         mean=spec.mean.terms,
         noise_std=plain(spec.noise_std),
         learn_noise=spec.learn_noise,
@@ -265,31 +282,22 @@ def pack(
         power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
-        measured=training.quantities if exact else (),
-        constant=tuple(scale.constant for scale in training.scales),
+        measured=problem.training.quantities if exact else (),
+        constant=tuple(scale.constant for scale in problem.training.scales),
         analytical=None if own is None else own.joints,
         result=ResultSettings(**{name: getattr(result, name) for name in ResultSettings.model_fields}),
     )
-    tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
-    tensors |= {f"offset.{name}": value for name, value in problem.offsets.items()}
-    if problem.torque_std is not None:
-        tensors["torque_std"] = problem.torque_std
-    if problem.correlation is not None:
-        tensors["torque_correlation"] = problem.correlation
+
+
+def _conditioned_on(spec: Specification, training: Training, posterior: ForcePosterior) -> dict[str, Tensor]:
+    """The data of an exact posterior, or the sums over them of a sparse one."""
+    latent, central = posterior.latent, posterior.central
     if isinstance(latent, ExactPosterior):
-        tensors |= {"alpha": latent.alpha, **_tensors_of(training, any(p.in_time for p in spec.priors))}
-    else:
-        assert isinstance(latent, SparsePosterior)
-        tensors |= {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
-        if isinstance(posterior.central, SparsePosterior):
-            own_means = tensors_of_posterior(posterior.central)
-            tensors |= {f"central.{name}": value for name, value in own_means.items()}
-    start = own.start if own is not None else spec.system.robot
-    tensors |= {f"start.{name}": getattr(start, name) for name in robot_tensors(start)}
-    for prior, scale in zip(spec.priors, training.scales, strict=True):
-        tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
-        tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
-    return settings, tensors
+        return {"alpha": latent.alpha, **_tensors_of(training, any(p.in_time for p in spec.priors))}
+    tensors = {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
+    if isinstance(central, SparsePosterior):
+        tensors |= {f"central.{name}": value for name, value in tensors_of_posterior(central).items()}
+    return tensors
 
 
 def _tensors_of(training: Training, in_time: bool) -> dict[str, Tensor]:
