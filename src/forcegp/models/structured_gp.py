@@ -164,6 +164,8 @@ class StructuredGP(Model[StructuredFit]):
             "analytical_parameters": spec.parameters,
             "torque_noise": "auto" if spec.automatic else spec.torque_noise,
             "inference": spec.inference,
+            "inducing_points": spec.inducing_points,
+            "state_noise": spec.state_noise,
             "inertia": spec.inertia,
             "standardize": spec.standardize,
             "degrees_of_freedom": spec.degrees_of_freedom,
