@@ -325,23 +325,3 @@ class Model(Predictor, Generic[F]):
 
     def save(self, path: str | Path) -> None:
         self.fitted.save(path)
-
-
-def check_acceleration_only(predictor: Predictor, quantity: object, system: ConstrainedSystem | None) -> None:
-    """Refuse what a model of accelerations alone cannot give.
-
-    Raises:
-        ModelError: the quantity is not `qdd`, or another system is given.
-    """
-    if quantity != "qdd":
-        raise ModelError(
-            f"a {predictor.kind!r} model predicts accelerations only",
-            expected="qdd",
-            got=quantity,
-            hint="use StructuredGP for forces and multipliers",
-        )
-    if system is not None and system is not predictor.system:
-        raise ModelError(
-            f"a {predictor.kind!r} model knows no forces, so it cannot predict on another system",
-            hint="use StructuredGP, or leave out `system`",
-        )

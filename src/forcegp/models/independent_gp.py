@@ -19,14 +19,15 @@ from forcegp.data import Dataset
 from forcegp.forces.inference import require_double
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.quantities import flat_states
+from forcegp.forces.quantities import FlatStates
 from forcegp.forces.start import bounds_of, initial_hyperparameters, negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
 from forcegp.gp.structured_covariance import Block
-from forcegp.models.base import FitProgress, FittedModel, Model, Prediction, check_acceleration_only
+from forcegp.models.acceleration import AccelerationFit
+from forcegp.models.base import FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
 from forcegp.storage.checkpoint import Checkpoint
@@ -254,7 +255,7 @@ def fitted(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class IndependentFit(FittedModel):
+class IndependentFit(AccelerationFit):
     """Conditioned processes.
 
     Attributes:
@@ -277,48 +278,15 @@ class IndependentFit(FittedModel):
 
     kind = KIND
 
-    @torch.no_grad()
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: str = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-        system: ConstrainedSystem | None = None,
-    ) -> Prediction:
-        """Posterior mean and covariance of the accelerations; the covariance is diagonal.
-
-        Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: `qdd`, the only one that this model knows.
-            active: without effect, since the model does not know of contacts.
-            covariance: whether to compute the covariance.
-            system: none but its own, since the model knows no forces.
-
-        Returns:
-            Mean `(*batch, nq)` and covariance `(*batch, nq, nq)`, without measurement noise.
-
-        Raises:
-            ModelError: another quantity, or another system, is asked for.
-            ShapeError: a state does not fit the robot.
-        """
-        check_acceleration_only(self, quantity, system)
-        flat = flat_states(self.system, q, qd, tau, active)
-        features = self.training.scale.apply({"q": flat.q, "qd": flat.qd, "tau": flat.tau})
+    def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:
+        features = self.training.scale.apply({"q": at.q, "qd": at.qd, "tau": at.tau})
         means, variances = [], []
-        for first in range(0, max(len(flat.q), 1), CHUNK_STATES):
+        for first in range(0, max(len(at.q), 1), CHUNK_STATES):
             part = {name: x[first : first + CHUNK_STATES] for name, x in features.items()}
             means.append(torch.cat([p.latent_mean(0, part) for p in self.posteriors], dim=-1))
-            if covariance:
+            if variance:
                 variances.append(torch.stack([_variance(p, part) for p in self.posteriors], dim=-1))
-        mean = torch.cat(means).reshape(*flat.batch, self.system.robot.nq)
-        parts = {"qdd": slice(0, mean.shape[-1])}
-        if not covariance:
-            return Prediction(mean, None, parts)
-        return Prediction(mean, torch.diag_embed(torch.cat(variances).reshape(mean.shape)), parts)
+        return torch.cat(means), torch.cat(variances) if variance else None
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         settings = IndependentSettings(noise_std=plain(self.noise_std), standardize=self.standardize)
