@@ -27,11 +27,12 @@ from torch import Tensor
 
 import forcegp
 from forcegp.data import split_by_stretches
-from forcegp.forces.learn import kernel_parameters
+from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.priors.default import PAPER, default_priors
 from forcegp.forces.quantities import states
 from forcegp.forces.start import initial
 from forcegp.gp.likelihood import negative_log_likelihood
+from forcegp.models.structured_learning import training_for
 from forcegp.simulate import simulate
 
 REPEATS = 3
@@ -54,11 +55,12 @@ def unfitted(mean: str = "zero") -> forcegp.StructuredGP:
     return forcegp.StructuredGP(forcegp.load_scene("kuka_plane").system(), mean=mean)
 
 
-def start_of(data: forcegp.Dataset) -> tuple[forcegp.StructuredGP, object, dict[str, Tensor]]:
-    model = unfitted()
+def start_of(data: forcegp.Dataset) -> tuple[forcegp.StructuredGP, Problem, dict[str, Tensor]]:
+    system = forcegp.load_scene("kuka_plane").system()
     # The dense formula is the paper's, kernel included.
-    model.force_priors = default_priors(model.system, "zero", PAPER)
-    problem = model._problem(model._training(data, ("joint",)))
+    model = forcegp.StructuredGP(system, force_priors=default_priors(system, "zero", PAPER))
+    training, _ = training_for(model.specification, None, data, None)
+    problem = model.specification.problem(training)
     return model, problem, initial(problem, learn_noise=False)
 
 

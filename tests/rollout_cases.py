@@ -14,7 +14,7 @@ from forcegp.constraints import Baumgarte, ConstrainedSystem, Plane, SurfaceCont
 from forcegp.constraints.projection import project_state
 from forcegp.control.plan import make_plan
 from forcegp.data import Dataset
-from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.rollout import ForceLaw
 from forcegp.simulate import SimulationConfig, SimulationResult, make_engine, simulate
 from forcegp.simulate.result import make_result

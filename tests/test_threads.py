@@ -13,12 +13,12 @@ import pytest
 import torch
 
 import forcegp
-from forcegp.threads import one_thread
+from forcegp.resources import one_thread
 from random_data import random_data, table_system
 
 SCRIPT = """
 import threading, torch
-from forcegp.threads import one_thread
+from forcegp.resources import one_thread
 torch.set_num_threads(3)
 seen, entered, left = {}, threading.Event(), threading.Event()
 
@@ -152,7 +152,7 @@ INVERSES = """
 import torch
 from threadpoolctl import ThreadpoolController
 from forcegp.gp.likelihood import cholesky_inverse_
-from forcegp.threads import threads_of_pytorch
+from forcegp.resources import threads_of_pytorch
 torch.set_num_threads(1)
 libraries = ThreadpoolController().select(internal_api="openblas").lib_controllers
 before = [x.num_threads for x in libraries]

@@ -23,17 +23,14 @@ if TYPE_CHECKING:
     from forcegp.data import Dataset, SavitzkyGolay, StreamedDataset
     from forcegp.evaluation import Evaluation, evaluate
     from forcegp.forces.observations import Observation
-    from forcegp.forces.priors.base import AnalyticalMean
-    from forcegp.forces.priors.contact import ContactForcePrior
+    from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
     from forcegp.forces.priors.coregional import CoregionalPrior
     from forcegp.forces.priors.disturbance import DisturbancePrior
     from forcegp.forces.priors.inertial import InertialPrior
-    from forcegp.forces.priors.joint import JointForcePrior
+    from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, NormalForcePrior
     from forcegp.forces.priors.joint_friction import JointFrictionPrior
-    from forcegp.forces.priors.normal_force import NormalForcePrior
     from forcegp.forces.priors.operator import OperatorForcePrior
     from forcegp.forces.priors.payload import PayloadPrior
-    from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
     from forcegp.gp.optimise import LearningOptions
     from forcegp.logs import read_log
     from forcegp.models.analytical import AnalyticalModel
@@ -46,7 +43,7 @@ if TYPE_CHECKING:
     from forcegp.scene import Scene, load_scene
 
 _HOME = {
-    "AnalyticalMean": "forces.priors.base",
+    "AnalyticalMean": "forces.priors.joint",
     "AnalyticalModel": "models.analytical",
     "AnalyticalParameters": "robot",
     "Baumgarte": "constraints",
@@ -64,7 +61,7 @@ _HOME = {
     "DisturbancePrior": "forces.priors.disturbance",
     "LearningOptions": "gp.optimise",
     "NeuralNetwork": "models.neural",
-    "NormalForcePrior": "forces.priors.normal_force",
+    "NormalForcePrior": "forces.priors.joint",
     "Observation": "forces.observations",
     "OperatorForcePrior": "forces.priors.operator",
     "PayloadPrior": "forces.priors.payload",
@@ -78,7 +75,7 @@ _HOME = {
     "Sphere": "constraints",
     "StreamedDataset": "data",
     "StructuredGP": "models.structured_gp",
-    "SlidingFrictionPrior": "forces.priors.sliding_friction",
+    "SlidingFrictionPrior": "forces.priors.contact",
     "SurfaceContact": "constraints",
     "TaskSpaceControl": "rollout",
     "check": "checks",

@@ -13,12 +13,12 @@ import pytest
 from typer.testing import CliRunner
 
 from faults.commands import prepare
-from forcegp import memory
+from forcegp import resources
 from forcegp.cli import app
 from forcegp.data import Dataset
 from forcegp.errors import DataError, DestinationError, ForceGPError, MemoryLimitError
 from forcegp.gp import likelihood
-from forcegp.memory import MemoryNeedWarning
+from forcegp.resources import MemoryNeedWarning
 
 PLENTY = 1 << 60
 
@@ -168,8 +168,8 @@ def said(command: str, made: Path, tmp_path: Path) -> list[str]:
 def test_work_that_takes_most_of_the_memory_is_announced(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(memory, "LARGE", 0.0)
-    for module in (memory, likelihood):
+    monkeypatch.setattr(resources, "LARGE", 0.0)
+    for module in (resources, likelihood):
         monkeypatch.setattr(module, "free_memory", lambda: PLENTY)
     sentences = " ".join(said(command, made, tmp_path))
     for sentence in WORK[command].split("|"):
@@ -180,7 +180,7 @@ def test_work_that_takes_most_of_the_memory_is_announced(
 def test_work_that_cannot_fit_is_refused(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (memory, likelihood):
+    for module in (resources, likelihood):
         monkeypatch.setattr(module, "free_memory", lambda: 1)
     if command != "select":
         monkeypatch.setattr("forcegp.data.table.announce_memory", lambda *_, **__: None)

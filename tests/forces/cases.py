@@ -10,10 +10,9 @@ from torch import Tensor
 import forcegp
 from forcegp.data.header import DataHeader
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.default import REMAINING
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.gp.kernels import Linear, SquaredExponential
 
 CONTACTS = ("table", "ball")

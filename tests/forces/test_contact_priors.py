@@ -6,8 +6,7 @@ import pytest
 import torch
 
 import forcegp
-from forcegp.forces.priors.contact import ContactForcePrior
-from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.quantities import states
 from forces.cases import draw, mixed_contacts, two_contacts
 from random_data import NOISE_STD, random_data, table_system

@@ -14,8 +14,8 @@ import forcegp
 from forcegp.forces.coulomb import CoulombFriction, below_jamming, coulomb_keys, coupled, with_coulomb
 from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.measurements import Measurement
+from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
-from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.quantities import States, affine_map, states
 from forces.cases import CONTACTS, draw, logged, mixed_contacts, two_contacts
 from random_data import table_system

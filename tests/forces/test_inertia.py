@@ -13,8 +13,8 @@ from forcegp.forces.calibration import correlation_times
 from forcegp.forces.inertia import Inertia, inertia_of, is_harmless, log_ratio
 from forcegp.forces.inverse_dynamics import APART, Rows, instrumental, partners, products, sums
 from forcegp.forces.observations import Observation, training_of
-from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.robot.model import RobotModel
 

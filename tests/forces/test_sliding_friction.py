@@ -8,8 +8,7 @@ import torch
 
 import forcegp
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.priors.contact import ContactForcePrior, tangent_frame
-from forcegp.forces.priors.sliding_friction import TERMS, SlidingFrictionPrior
+from forcegp.forces.priors.contact import TERMS, ContactForcePrior, SlidingFrictionPrior, tangent_frame
 from forcegp.forces.quantities import States, states
 from random_data import random_data, table_system
 

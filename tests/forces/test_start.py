@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.start import initial_hyperparameters
 from forcegp.gp.structured_covariance import Block
 

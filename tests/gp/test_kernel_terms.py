@@ -58,3 +58,13 @@ def test_terms_of_random_features_are_the_same_functions(kernel: Kernel) -> None
     if kernel is KERNELS[1]:
         # Nine products of three features are six different ones.
         assert sum(own.shape[1] for _, own in draw.terms(w)) < draw.size
+
+
+def test_inputs_of_each_component_give_the_same_functions() -> None:
+    kernel, generator = Linear(shared=True, offset=0.3), torch.Generator().manual_seed(0)
+    params = kernel.initial(K, {"qd": 2})
+    x = {"qd": torch.randn(N, K, 2, dtype=torch.float64, generator=generator)}
+    draw = kernel.draw(params, 64, generator)
+    w = torch.randn(K, draw.size, S, dtype=torch.float64, generator=generator)
+    terms = sum(basis(x) @ own for basis, own in draw.terms(w))
+    torch.testing.assert_close(terms, draw.basis(x) @ w, rtol=SAME, atol=SAME)

@@ -14,10 +14,9 @@ import pytest
 from forcegp import CoregionalPrior, DisturbancePrior, LearningOptions
 from forcegp.errors import SceneError, UnknownNameError
 from forcegp.forces import priors
-from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior
-from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.gp import kernels
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
 from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
@@ -27,7 +26,8 @@ from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import SHALLOW, NeuralNetwork
 from forcegp.models.registry import MODELS
-from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
 from forcegp.scene import load_model_table, load_scene
 from forcegp.scene.model_section import LearningSection, ModelSection

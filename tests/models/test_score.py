@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 import pytest
 import torch
@@ -26,6 +28,7 @@ def models() -> list[Model]:
 @pytest.mark.parametrize("model", models(), ids=lambda model: model.kind)
 def test_parameters_make_a_copy(model: Model) -> None:
     given = model.get_params()
+    assert given.keys() == inspect.signature(type(model)).parameters.keys()
     copy = type(model)(**given)
     again = copy.get_params()
     assert given.keys() == again.keys()

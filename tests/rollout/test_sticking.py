@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import forcegp
-from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.rollout import DivergedError, ForceLaw, RolloutOptions, rollout
 from forcegp.rollout.sticking import dry_friction_force
 

@@ -28,7 +28,7 @@ from forcegp.checks.kinds import KINDS
 from forcegp.checks.log import Log, log_of, of_robot
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.dataset import Dataset
-from forcegp.memory import announce_memory
+from forcegp.resources import announce_memory
 
 NUMBERS = 24
 """Upper bound on the numbers of one joint in one row that are held at a time; twenty were measured."""

@@ -19,6 +19,8 @@ from forcegp.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from forcegp.data import Dataset
+    from forcegp.evaluation import Evaluation
     from forcegp.models.base import Predictor
 
 WINDOW_SECONDS = 3.0
@@ -60,9 +62,8 @@ def evaluate(
 
     forcegp evaluate --scene my_scene.toml --config model.toml --train train.parquet --data test.parquet
     """
-    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.destination import check_destination
     from forcegp.evaluation import evaluate as run
-    from forcegp.files import atomic_directory, write_json
 
     if out is not None:
         check_destination(out, folder=True, own_files=["*.json", "*.html", "*.svg", "*.png"])
@@ -74,22 +75,29 @@ def evaluate(
         found = run(regression, test, train=known, progress=progress)
     result: dict[str, object] = {"verdict": found.verdict or "too few samples", **found.summary()}
     if out is not None:
-        from forcegp.report.evaluation import PAGE, write_evaluation
-        from forcegp.report.window import opening, predicted_window
-
-        window = predicted_window(regression, opening(test, WINDOW_SECONDS), regression.kind)
-        fitted_to = None if train is None else str(train)
-
-        def write(folder: Path) -> None:
-            with atomic_directory(folder) as temporary:
-                write_json(temporary / "evaluation.json", found.to_dict())
-                write_evaluation(
-                    temporary, str(model or config or scene), str(data), found, window, fitted_to
-                )
-
-        write_or_keep(write, out)
-        result |= {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}
+        names = str(model or config or scene), str(data), None if train is None else str(train)
+        result |= _written(out, found, regression, test, *names)
     show(result, as_json)
+
+
+def _written(
+    out: Path, found: Evaluation, fitted: Predictor, test: Dataset, model: str, data: str, train: str | None
+) -> dict[str, object]:
+    """Write the page and its data, and say where they are."""
+    from forcegp.destination import write_or_keep
+    from forcegp.files import atomic_directory, write_json
+    from forcegp.report.evaluation import PAGE, write_evaluation
+    from forcegp.report.window import opening, predicted_window
+
+    window = predicted_window(fitted, opening(test, WINDOW_SECONDS), fitted.kind)
+
+    def write(folder: Path) -> None:
+        with atomic_directory(folder) as temporary:
+            write_json(temporary / "evaluation.json", found.to_dict())
+            write_evaluation(temporary, model, data, found, window, train)
+
+    write_or_keep(write, out)
+    return {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}
 
 
 def _model(model: Path | None, scene: str | None, config: Path | None, train: Path | None) -> Predictor:

@@ -27,7 +27,8 @@ from forcegp.cli.common import (
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset, StreamedDataset
-    from forcegp.models.base import FitResult, Model
+    from forcegp.models.base import Model
+    from forcegp.models.fit_result import FitResult
     from forcegp.robot import RobotModel
 
 STREAM_ROWS = 100_000

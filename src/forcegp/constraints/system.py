@@ -16,8 +16,8 @@ from forcegp.constraints.gauss import Equations
 from forcegp.constraints.linearization import Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
 from forcegp.kinematics import LinkMotion, LinkPoses
-from forcegp.memory import announce_memory
 from forcegp.notebook import html_table
+from forcegp.resources import announce_memory
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintVector, JointVector
 

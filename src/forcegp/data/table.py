@@ -19,7 +19,7 @@ from forcegp import limits
 from forcegp.data.header import DataHeader
 from forcegp.errors import DataError, near_names
 from forcegp.files import atomic_file
-from forcegp.memory import announce_memory
+from forcegp.resources import announce_memory
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -20,7 +20,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import COULOMB, ForcePrior
-from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
+from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.quantities import AffineMap, States
 
 SHARP = 1e-6

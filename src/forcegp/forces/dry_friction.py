@@ -19,7 +19,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombFriction, coulomb_response, with_coulomb
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import AnalyticalMean, ForceMean, ForcePrior
+from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.quantities import States
 from forcegp.forces.samples import ForceSamples
 
@@ -50,15 +50,8 @@ class DryFriction:
     damping: Tensor
 
 
-def has_dry_friction(system: ConstrainedSystem, mean: ForceMean, priors: Sequence[ForcePrior]) -> bool:
-    """Whether the robot file, where the mean includes it, or a prior declares dry friction."""
-    known = isinstance(mean, AnalyticalMean) and "friction" in mean.terms
-    declared = known and bool(((system.robot.friction != 0.0) | (system.robot.stribeck != 0.0)).any())
-    return declared or any(prior.sticks for prior in priors)
-
-
-def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFriction | None:
-    """A force field at states with the dry friction of joints apart; `None` where there is none.
+def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFriction:
+    """A force field at states with the dry friction of joints apart.
 
     Args:
         system: robot and contacts.
@@ -67,30 +60,19 @@ def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFricti
 
     Example:
         >>> import torch, forcegp
-        >>> from forcegp.forces.priors.base import AnalyticalMean
+        >>> from forcegp.forces.priors.joint import AnalyticalMean
         >>> from forcegp.forces.quantities import states_at
         >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("franka_panda"))
         >>> at, _ = states_at(system, *torch.zeros(3, 1, 7, dtype=torch.float64), None)
         >>> split(system, at, AnalyticalMean()).limit.shape
         torch.Size([1, 7])
     """
+    mean, unknown = force, None
+    priors: Sequence[ForcePrior] = ()
+    coulomb: Sequence[CoulombFriction] = ()
     if isinstance(force, ForcePosterior | ForceSamples):
         posterior = force if isinstance(force, ForcePosterior) else force.posterior
-        return _split(system, at, posterior.mean, posterior.priors, force, posterior.coulomb)
-    return _split(system, at, force)
-
-
-def _split(
-    system: ConstrainedSystem,
-    at: States,
-    mean: ForceMean,
-    priors: Sequence[ForcePrior] = (),
-    unknown: ForcePosterior | ForceSamples | None = None,
-    coulomb: Sequence[CoulombFriction] = (),
-) -> DryFriction | None:
-    """Of a mean, and of unknown forces beside it."""
-    if not has_dry_friction(system, mean, priors):
-        return None
+        mean, unknown, priors, coulomb = posterior.mean, force, posterior.priors, posterior.coulomb
     sticking = [p for p, prior in enumerate(priors) if prior.sticks]
     others = [p for p, prior in enumerate(priors) if not prior.sticks]
 

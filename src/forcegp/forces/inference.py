@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.posterior import ForcePosterior
@@ -35,6 +36,21 @@ def check_method(inference: str) -> str:
     if inference not in METHODS:
         raise UnknownNameError("inference", inference, METHODS)
     return inference
+
+
+def require_double(system: ConstrainedSystem) -> None:
+    """Refuse a robot in single precision, whose covariance matrices are not positive definite after rounding.
+
+    Raises:
+        ModelError: the robot is not float64.
+    """
+    if system.robot.dtype != torch.float64:
+        raise ModelError(
+            f"Gaussian processes of {system.robot.name!r} need double precision",
+            expected=torch.float64,
+            got=system.robot.dtype,
+            hint="convert the robot and the data, robot.to(dtype=torch.float64)",
+        )
 
 
 def is_finite(priors: Sequence[ForcePrior]) -> bool:

@@ -194,18 +194,19 @@ def training_of(
     """
     observations = observations_of(data)
     pairs = [measurement_of(o, system, noise_std) for o in observations]
-    at = [m.at(system) for m, _ in pairs] if any(prior.name not in kept for prior in priors) else []
-    scales = []
-    for prior in priors:
-        if prior.name in kept:
-            scales.append(kept[prior.name])
-            continue
-        features = [prior.features(system, a) for a in at]
+    new = [prior for prior in priors if prior.name not in kept]
+    at = [m.at(system) for m, _ in pairs] if new else []
+    scales = dict(kept)
+    for prior, features in [(prior, [prior.features(system, a) for a in at]) for prior in new]:
         together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
         own = Standardization.of(together, prior.vectors, prior.centred)
-        scales.append(own if standardize and prior.scaled else Standardization.none(together))
-    period = _period(observations[0].data)
-    return Training(tuple(m for m, _ in pairs), tuple(std for _, std in pairs), tuple(scales), period=period)
+        scales[prior.name] = own if standardize and prior.scaled else Standardization.none(together)
+    return Training(
+        measurements=tuple(m for m, _ in pairs),
+        noise_std=tuple(std for _, std in pairs),
+        scales=tuple(scales[prior.name] for prior in priors),
+        period=_period(observations[0].data),
+    )
 
 
 def _period(data: Dataset) -> float:

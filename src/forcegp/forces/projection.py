@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.forces.coulomb import CoulombFriction, coupled
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import ForceMean, ForcePrior, prior_rows
@@ -211,8 +211,15 @@ def whiten(
     if not has_fixed:
         block, log_determinant = everything.whitened(weight)
         return WhitenedRows([block], lambda: log_determinant + _log_scale(std, weight))
-    A, b, values = at.eom.A, at.eom.b, measurement.values
-    scaled, groups, blocks, log_determinants = A * std[:, None, :], _by_rank(at.eom.rank), [], []
+    return _without_fixed(everything, at.eom, measurement.values, std, weight)
+
+
+def _without_fixed(
+    everything: _Rows, eom: Equations, values: Tensor, std: Tensor, weight: Tensor | None
+) -> WhitenedRows:
+    """The rows of q̈ along the null space of A; the directions that A q̈ = b fixes go into the constant."""
+    A, b = eom.A, eom.b
+    scaled, groups, blocks, log_determinants = A * std[:, None, :], _by_rank(eom.rank), [], []
     for rank, own in groups:
         U = null_space_basis(_independent(scaled[own], rank)[0], rank)
         block, log_determinant = everything.of(own, U).whitened(None if weight is None else weight[own])

@@ -283,12 +283,12 @@ class Search:
         return min((one, two), key=lambda tensors: float(self.objective(problem, tensors)))
 
     def _minimise(self, problem: Problem, begin: Tensors, progress: Progress | None) -> Learned:
-        # The tolerance is relative to the objective, so the part that no hyperparameter changes is left out.
-        constant = float(problem.fixed_rows.constant)
         analytical = frozenset(key for key in begin if key.startswith(ANALYTICAL + "."))
         bounds = bounds_of({key: value for key, value in begin.items() if key not in analytical})
         if problem.has_coulomb:
             bounds = below_jamming(problem.system, problem.training.measurements, problem.priors, bounds)
+        # The tolerance is relative to the objective, so the part that no hyperparameter changes is left out.
+        constant = float(problem.fixed_rows.constant)
 
         def objective(tensors: Tensors) -> Tensor:
             return self.objective(problem, tensors) - constant

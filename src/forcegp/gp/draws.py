@@ -86,7 +86,8 @@ class LinearDraw(FunctionDraw):
 
     def basis(self, x: Features) -> Tensor:
         scaled = stacked(x, self.inputs) * self.slope[:, None, :]
-        return torch.cat([scaled, self.bias[:, None, None].expand(-1, scaled.shape[1], 1)], dim=-1)
+        bias = self.bias[:, None, None].expand(*scaled.shape[:2], 1)
+        return torch.cat([scaled, bias], dim=-1)
 
     def common(self) -> tuple[FunctionDraw, Tensor]:
         unit = LinearDraw(self.inputs, torch.ones_like(self.slope[:1]), torch.ones_like(self.bias[:1]))

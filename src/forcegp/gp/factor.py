@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.errors import MissingDependencyError, NumericalError
 from forcegp.native.library import load_library
-from forcegp.threads import threads_of_pytorch
+from forcegp.resources import threads_of_pytorch
 
 JITTER_STEPS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)
 """Fractions of the mean diagonal that are tried, in order, until the factorisation succeeds."""

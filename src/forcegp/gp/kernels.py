@@ -16,15 +16,8 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.draws import (
-    ConstantDraw,
-    FourierDraw,
-    FunctionDraw,
-    LinearDraw,
-    OuterDraw,
-    ProductDraw,
-    SumDraw,
-)
+from forcegp.gp import draws
+from forcegp.gp.draws import FunctionDraw
 from forcegp.gp.features import Features, stacked
 
 Parameters = Mapping[str, Tensor]
@@ -58,12 +51,12 @@ class Kernel(ABC):
         """
 
     @abstractmethod
-    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        """k(x, x′) `(k, n, n')`."""
-
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         """x ↦ k(x, x′) `(k, n, n')` for fixed x′, with what depends on x′ alone computed once."""
-        return lambda x1: self.covariance(params, x1, x2)
+
+    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
+        """k(x, x′) `(k, n, n')`."""
+        return self.towards(params, x2)(x1)
 
     @abstractmethod
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
@@ -125,13 +118,11 @@ class Linear(Kernel):
         bias = 1.0 if self.offset is None else self.offset**2
         share = torch.zeros(outputs, dtype=torch.float64) + log_std - 0.5 * math.log(width + bias)
         columns = width if self.ard else 1
-        if self.shared:
-            slopes = {"log_slope_std": share.new_zeros(1, columns), "log_std": share}
-        else:
-            slopes = {"log_slope_std": share[:, None].repeat(1, columns)}
+        slopes = share.new_zeros(1, columns) if self.shared else share[:, None].repeat(1, columns)
+        sizes = {"log_slope_std": slopes} | ({"log_std": share} if self.shared else {})
         if self.offset is None:
-            return slopes | {"log_bias_std": share}
-        return slopes | {"log_offset": share.new_tensor([math.log(self.offset)])}
+            return sizes | {"log_bias_std": share}
+        return sizes | {"log_offset": share.new_tensor([math.log(self.offset)])}
 
     def slope_std(self, params: Parameters) -> Tensor:
         """s σ_d `(k, w)`, or `(k, 1)` where all inputs have one."""
@@ -144,9 +135,6 @@ class Linear(Kernel):
             return torch.exp(params["log_bias_std"])
         return torch.exp(params["log_offset"]) * self.slope_std(params).square().mean(-1).sqrt()
 
-    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        return self.towards(params, x2)(x1)
-
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         slope = self.slope_std(params)[:, None, :]
         b, bias = (stacked(x2, self.inputs) * slope).mT, self.bias_std(params).square()[:, None, None]
@@ -157,7 +145,7 @@ class Linear(Kernel):
         return (scaled * scaled).sum(-1) + self.bias_std(params).square()[:, None]
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return LinearDraw(self.inputs, self.slope_std(params), self.bias_std(params))
+        return draws.LinearDraw(self.inputs, self.slope_std(params), self.bias_std(params))
 
 
 @dataclass(frozen=True)
@@ -174,15 +162,15 @@ class Constant(Kernel):
     def _std(self, params: Parameters) -> Tensor:
         return params["log_scale"].exp().repeat_interleave(self.group)
 
-    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        n1, n2 = (stacked(x, None).shape[-2] for x in (x1, x2))
-        return (self._std(params) ** 2)[:, None, None].expand(-1, n1, n2)
+    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
+        variance, n2 = (self._std(params) ** 2)[:, None, None], stacked(x2, None).shape[-2]
+        return lambda x1: variance.expand(-1, stacked(x1, None).shape[-2], n2)
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         return (self._std(params) ** 2)[:, None].expand(-1, stacked(x, None).shape[-2])
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return ConstantDraw(self._std(params))
+        return draws.ConstantDraw(self._std(params))
 
 
 @dataclass(frozen=True)
@@ -208,9 +196,6 @@ class Stationary(Kernel):
     def profile(self, r2: Tensor) -> Tensor:
         """g as a function of r²."""
 
-    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        return self.towards(params, x2)(x1)
-
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         inverse = torch.exp(-params["log_lengthscale"])[:, None, :]
         b = stacked(x2, self.inputs) * inverse
@@ -225,8 +210,7 @@ class Stationary(Kernel):
         return covariance
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        n = next(iter(x.values())).shape[0]
-        return torch.exp(2.0 * params["log_std"])[:, None].expand(-1, n)
+        return torch.exp(2.0 * params["log_std"])[:, None].expand(-1, len(next(iter(x.values()))))
 
     @abstractmethod
     def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
@@ -238,7 +222,7 @@ class Stationary(Kernel):
         k, width = lengthscale.shape
         omega = self.frequencies((k, features, width), generator).to(lengthscale) / lengthscale[:, None, :]
         phase = 2.0 * math.pi * torch.rand(k, features, dtype=torch.float64, generator=generator)
-        return FourierDraw(self.inputs, omega, phase.to(lengthscale), params["log_std"].exp())
+        return draws.FourierDraw(self.inputs, omega, phase.to(lengthscale), params["log_std"].exp())
 
 
 @dataclass(frozen=True)
@@ -307,10 +291,6 @@ class Sum(Kernel):
     def is_finite(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.left.is_finite and self.right.is_finite
 
-    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        left = self.left.covariance(sub(params, "left"), x1, x2)
-        return self.combined(left, self.right.covariance(sub(params, "right"), x1, x2))
-
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         left = self.left.towards(sub(params, "left"), x2)
         right = self.right.towards(sub(params, "right"), x2)
@@ -321,13 +301,11 @@ class Sum(Kernel):
         return self.combined(left, self.right.diagonal(sub(params, "right"), x))
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return SumDraw(*self._sides_drawn(params, features, generator))
+        return draws.SumDraw(*self._drawn(params, features, generator))
 
-    def _sides_drawn(
-        self, params: Parameters, features: int, generator: torch.Generator
-    ) -> tuple[FunctionDraw, FunctionDraw]:
-        left = self.left.draw(sub(params, "left"), features, generator)
-        return left, self.right.draw(sub(params, "right"), features, generator)
+    def _drawn(self, params: Parameters, features: int, generator: torch.Generator) -> list[FunctionDraw]:
+        sides = {"left": self.left, "right": self.right}
+        return [kernel.draw(sub(params, side), features, generator) for side, kernel in sides.items()]
 
 
 @dataclass(frozen=True)
@@ -347,21 +325,20 @@ class Product(Sum):
         for side, other in (("left", "right"), ("right", "left")):
             inner = getattr(self, side)
             if isinstance(inner, Sum) and not isinstance(inner, Product):
-                rest = {f"right.{key}": value for key, value in sub(params, other).items()}
-                terms = []
-                for part in ("left", "right"):
-                    own = {f"left.{k}": v for k, v in sub(params, f"{side}.{part}").items()}
-                    product = Product(getattr(inner, part), getattr(self, other))
-                    terms.append(product.draw(own | rest, features, generator))
-                return SumDraw(terms[0], terms[1])
+                terms = (
+                    Product(getattr(inner, part), getattr(self, other)).draw(
+                        _sides(sub(params, f"{side}.{part}"), sub(params, other)), features, generator
+                    )
+                    for part in ("left", "right")
+                )
+                return draws.SumDraw(*terms)
         linear = max(_linear_factors(self.left), _linear_factors(self.right))
         if linear:
             # A linear factor has few features and all of them matter, so the other one is given fewer.
             few = max(1, features // (LINEAR_PAIRS * linear))
-            return OuterDraw(*self._sides_drawn(params, few, generator))
-        # Features of the two factors are paired at random, so that their number does not multiply.
-        left, right = self._sides_drawn(params, features, generator)
-        return ProductDraw(left, right, features, int(torch.randint(2**31, (1,), generator=generator)))
+            return draws.OuterDraw(*self._drawn(params, few, generator))
+        left, right = self._drawn(params, features, generator)
+        return draws.ProductDraw(left, right, features, int(torch.randint(2**31, (1,), generator=generator)))
 
 
 def _linear_factors(kernel: Kernel) -> int:

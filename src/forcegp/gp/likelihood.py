@@ -19,8 +19,7 @@ from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.factor import cholesky
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.structured_covariance import Block, Gradient, Place, Process, gram, gram_gradient
-from forcegp.memory import announce_memory, free_memory
-from forcegp.threads import threads_of_pytorch
+from forcegp.resources import announce_memory, free_memory, threads_of_pytorch
 
 MATRICES_TO_LEARN = 3.0
 """Square matrices of all rows that learning holds at once: the covariance, its factor and a copy."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -51,12 +51,17 @@ class OrnsteinUhlenbeck(Kernel):
             "log_std": torch.zeros(outputs, dtype=torch.float64) + log_std,
         }
 
-    def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        apart = (x1[TIME] - x2[TIME].mT).abs()
-        together = x1[SEGMENT] == x2[SEGMENT].mT
+    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         rate = torch.exp(-params["log_time"])[:, None, None]
-        decay = torch.exp(-(apart * rate).clamp(max=LARGEST_EXPONENT))
-        return torch.exp(2.0 * params["log_std"])[:, None, None] * torch.where(together, decay, 0.0)
+        variance = torch.exp(2.0 * params["log_std"])[:, None, None]
+
+        def covariance(x1: Features) -> Tensor:
+            apart = (x1[TIME] - x2[TIME].mT).abs()
+            together = x1[SEGMENT] == x2[SEGMENT].mT
+            decay = torch.exp(-(apart * rate).clamp(max=LARGEST_EXPONENT))
+            return variance * torch.where(together, decay, 0.0)
+
+        return covariance
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         return torch.exp(2.0 * params["log_std"])[:, None].expand(-1, points(x))

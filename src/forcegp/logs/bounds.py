@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.memory import announce_memory
+from forcegp.resources import announce_memory
 
 COPIES = 2
 """A table is in memory as it is in the file, and as float64."""

@@ -19,7 +19,7 @@ from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, load_mapping
 from forcegp.logs.report import Report
 from forcegp.logs.signals import Signals
-from forcegp.memory import announce_memory
+from forcegp.resources import announce_memory
 from forcegp.robot import RobotModel
 from forcegp.scene import Scene, load_scene
 

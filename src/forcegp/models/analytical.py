@@ -18,10 +18,11 @@ from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.observations import Observation, measurement_of
-from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import affine_maps, flat_states, states
 from forcegp.gp.optimise import Learned, LearningOptions, minimise
-from forcegp.models.base import FitProgress, FitResult, FittedModel, ForceField, Model, Prediction
+from forcegp.models.base import FitProgress, FittedModel, ForceField, Model, Prediction
+from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, Loss, train
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.checkpoint import Checkpoint

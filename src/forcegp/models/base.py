@@ -15,9 +15,8 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.linearization import ForceLinearization, linearize_field
-from forcegp.models.fit_result import FitResult
+from forcegp.models.fit_result import HasResult, fit_table, model_line
 from forcegp.models.prediction import Prediction
-from forcegp.models.show import fit_table, model_line
 from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Torque
 from forcegp.rollout.law import ForceField
@@ -205,10 +204,8 @@ class Predictor(ABC):
         """
 
 
-class FittedModel(Predictor):
+class FittedModel(HasResult, Predictor):
     """A model with learned parameters; immutable."""
-
-    result: FitResult
 
     def __repr__(self) -> str:
         """One line: robot, contacts, and how the fit went."""
@@ -228,56 +225,6 @@ class FittedModel(Predictor):
 
     def save(self, path: str | Path) -> None:
         write_model(path, self.kind, self.system, *self.record())
-
-    @property
-    def converged(self) -> bool:
-        """Whether the optimiser reached its tolerance."""
-        return self.result.converged
-
-    @property
-    def evaluations(self) -> int:
-        """Number of evaluations of the objective."""
-        return self.result.evaluations
-
-    @property
-    def seconds(self) -> float:
-        """Duration of the fit."""
-        return self.result.seconds
-
-    @property
-    def objective(self) -> float:
-        """Final value of the objective."""
-        return self.result.objective
-
-    @property
-    def log_marginal_likelihood(self) -> float | None:
-        """log p(y | X, θ) of the training data, `None` for models without one."""
-        return self.result.log_marginal_likelihood
-
-    @property
-    def jitter(self) -> float:
-        """Added to the diagonal of the covariance to factorise it, relative to unit noise."""
-        return self.result.jitter
-
-    @property
-    def constant_inputs(self) -> tuple[str, ...]:
-        """Inputs that do not vary in the training data."""
-        return self.result.constant_inputs
-
-    @property
-    def message(self) -> str:
-        """Why the optimiser stopped."""
-        return self.result.message
-
-    @property
-    def history(self) -> tuple[float, ...]:
-        """The objective at each evaluation."""
-        return self.result.history
-
-    @property
-    def force_correlation(self) -> float | None:
-        """Mean posterior correlation of Q and Q_z at training states."""
-        return self.result.force_correlation
 
 
 F = TypeVar("F", bound=FittedModel)
@@ -378,38 +325,3 @@ class Model(Predictor, Generic[F]):
 
     def save(self, path: str | Path) -> None:
         self.fitted.save(path)
-
-
-def check_acceleration_only(predictor: Predictor, quantity: object, system: ConstrainedSystem | None) -> None:
-    """Refuse what a model of accelerations alone cannot give.
-
-    Raises:
-        ModelError: the quantity is not `qdd`, or another system is given.
-    """
-    if quantity != "qdd":
-        raise ModelError(
-            f"a {predictor.kind!r} model predicts accelerations only",
-            expected="qdd",
-            got=quantity,
-            hint="use StructuredGP for forces and multipliers",
-        )
-    if system is not None and system is not predictor.system:
-        raise ModelError(
-            f"a {predictor.kind!r} model knows no forces, so it cannot predict on another system",
-            hint="use StructuredGP, or leave out `system`",
-        )
-
-
-def require_double(system: ConstrainedSystem) -> None:
-    """Refuse a robot in single precision, whose covariance matrices are not positive definite after rounding.
-
-    Raises:
-        ModelError: the robot is not float64.
-    """
-    if system.robot.dtype != torch.float64:
-        raise ModelError(
-            f"Gaussian processes of {system.robot.name!r} need double precision",
-            expected=torch.float64,
-            got=system.robot.dtype,
-            hint="convert the robot and the data, robot.to(dtype=torch.float64)",
-        )

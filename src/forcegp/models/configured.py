@@ -11,7 +11,8 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import SceneError, UnknownNameError, near_names
 from forcegp.forces.observations import NoiseStd
-from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.base import FitProgress, FittedModel, Model
@@ -20,7 +21,8 @@ from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import DEEP, SHALLOW, NeuralNetwork
 from forcegp.models.registry import MODELS, create
 from forcegp.models.sensed import with_sensor
-from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.scene import ModelTable

@@ -1,11 +1,16 @@
-"""How a fit went."""
+"""How a fit went, and a model in one line and as a table for notebooks."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
 from forcegp.gp.optimise import Learned
+from forcegp.notebook import html_table
 
 
 @dataclass(frozen=True)
@@ -68,3 +73,99 @@ class FitResult:
             history=tuple(learned.history),
             **more,
         )
+
+
+class HasResult:
+    """What has the result of a fit, whose fields are its own too."""
+
+    result: FitResult
+
+    @property
+    def converged(self) -> bool:
+        """Whether the optimiser reached its tolerance."""
+        return self.result.converged
+
+    @property
+    def evaluations(self) -> int:
+        """Number of evaluations of the objective."""
+        return self.result.evaluations
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the fit."""
+        return self.result.seconds
+
+    @property
+    def objective(self) -> float:
+        """Final value of the objective."""
+        return self.result.objective
+
+    @property
+    def log_marginal_likelihood(self) -> float | None:
+        """log p(y | X, θ) of the training data, `None` for models without one."""
+        return self.result.log_marginal_likelihood
+
+    @property
+    def jitter(self) -> float:
+        """Added to the diagonal of the covariance to factorise it, relative to unit noise."""
+        return self.result.jitter
+
+    @property
+    def constant_inputs(self) -> tuple[str, ...]:
+        """Inputs that do not vary in the training data."""
+        return self.result.constant_inputs
+
+    @property
+    def message(self) -> str:
+        """Why the optimiser stopped."""
+        return self.result.message
+
+    @property
+    def history(self) -> tuple[float, ...]:
+        """The objective at each evaluation."""
+        return self.result.history
+
+    @property
+    def force_correlation(self) -> float | None:
+        """Mean posterior correlation of Q and Q_z at training states."""
+        return self.result.force_correlation
+
+
+def model_line(kind: str, system: ConstrainedSystem, result: FitResult | None) -> str:
+    """Robot, contacts, and how the fit went."""
+    robot = system.robot
+    contacts = f", contact {', '.join(system.contact_names)}" if system.contacts else ""
+    return f"<{kind} of {robot.name!r}: {robot.nq} joints{contacts}; {_outcome(result)}>"
+
+
+def _outcome(result: FitResult | None) -> str:
+    if result is None:
+        return "not fitted"
+    if not result.evaluations:
+        return "conditioned, nothing learned"
+    how = "converged" if result.converged else "NOT converged"
+    return f"{how} after {result.evaluations} evaluations in {result.seconds:.3g} s"
+
+
+def fit_table(title: str, result: FitResult | None, learned: Sequence[tuple[str, object]]) -> str:
+    """How a fit went and what it learned, as HTML."""
+    rows: list[tuple[object, ...]] = []
+    notes: Sequence[str] = ()
+    if result is not None:
+        rows += [
+            ("log marginal likelihood", _number(result.log_marginal_likelihood)),
+            ("jitter", result.jitter),
+        ]
+        notes = [f"Warning: {warning}" for warning in result.warnings]
+    rows += [(name, _number(value)) for name, value in learned]
+    return html_table(title.strip("<>"), (), rows, notes)
+
+
+def _number(value: object) -> object:
+    """Tensors and long sequences as a few numbers."""
+    if value is None:
+        return "–"
+    if isinstance(value, Tensor):
+        flat = value.detach().flatten().tolist()
+        return ", ".join(f"{x:.3g}" for x in flat[:8]) + (", …" if len(flat) > 8 else "")
+    return value

@@ -16,29 +16,22 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.forces.inference import require_double
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.quantities import flat_states
+from forcegp.forces.quantities import FlatStates
 from forcegp.forces.start import bounds_of, initial_hyperparameters, negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
 from forcegp.gp.structured_covariance import Block
-from forcegp.memory import announce_memory
-from forcegp.models.base import (
-    FitProgress,
-    FitResult,
-    FittedModel,
-    Model,
-    Prediction,
-    check_acceleration_only,
-    require_double,
-)
+from forcegp.models.acceleration import AccelerationFit
+from forcegp.models.base import FitProgress, Model
+from forcegp.models.fit_result import FitResult
+from forcegp.resources import announce_memory
 from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.folder import ModelHeader, Settings, settings_of
-from forcegp.storage.system import take
+from forcegp.storage.folder import Settings
 
 KIND = "independent_gp"
 LEARNING = 6
@@ -146,10 +139,10 @@ class IndependentGP(Model["IndependentFit"]):
         options = options or LearningOptions()
         measured, noise_std = measurement_of(Observation(data), self.specified, self.noise_std)
         features = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
-        scale = _scale(features, self.standardize)
+        scale = scale_of(features, self.standardize)
         training = IndependentTraining(features, measured.values, noise_std, scale)
         priors = joint_processes(self.specified.robot.nq)
-        _announce(training, LEARNING)
+        announce(training, LEARNING)
         saved = None if checkpoint is None else _record(Path(checkpoint), training, priors, options)
         parts: list[Learned] = []
         for joint, prior in enumerate(priors):
@@ -181,7 +174,8 @@ class IndependentGP(Model["IndependentFit"]):
         return value
 
 
-def _scale(features: Mapping[str, Tensor], standardize: bool) -> Standardization:
+def scale_of(features: Mapping[str, Tensor], standardize: bool) -> Standardization:
+    """Standardization of inputs, or none."""
     return Standardization.of(features) if standardize else Standardization.none(features)
 
 
@@ -221,7 +215,7 @@ def _record(
     return saved
 
 
-def _announce(training: IndependentTraining, copies: int) -> None:
+def announce(training: IndependentTraining, copies: int) -> None:
     """Announce the matrices of all joints, two each beside those that learning holds."""
     n, nq = training.qdd.shape
     announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
@@ -261,7 +255,7 @@ def fitted(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class IndependentFit(FittedModel):
+class IndependentFit(AccelerationFit):
     """Conditioned processes.
 
     Attributes:
@@ -284,48 +278,15 @@ class IndependentFit(FittedModel):
 
     kind = KIND
 
-    @torch.no_grad()
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: str = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-        system: ConstrainedSystem | None = None,
-    ) -> Prediction:
-        """Posterior mean and covariance of the accelerations; the covariance is diagonal.
-
-        Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: `qdd`, the only one that this model knows.
-            active: without effect, since the model does not know of contacts.
-            covariance: whether to compute the covariance.
-            system: none but its own, since the model knows no forces.
-
-        Returns:
-            Mean `(*batch, nq)` and covariance `(*batch, nq, nq)`, without measurement noise.
-
-        Raises:
-            ModelError: another quantity, or another system, is asked for.
-            ShapeError: a state does not fit the robot.
-        """
-        check_acceleration_only(self, quantity, system)
-        flat = flat_states(self.system, q, qd, tau, active)
-        features = self.training.scale.apply({"q": flat.q, "qd": flat.qd, "tau": flat.tau})
+    def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:
+        features = self.training.scale.apply({"q": at.q, "qd": at.qd, "tau": at.tau})
         means, variances = [], []
-        for first in range(0, max(len(flat.q), 1), CHUNK_STATES):
+        for first in range(0, max(len(at.q), 1), CHUNK_STATES):
             part = {name: x[first : first + CHUNK_STATES] for name, x in features.items()}
             means.append(torch.cat([p.latent_mean(0, part) for p in self.posteriors], dim=-1))
-            if covariance:
+            if variance:
                 variances.append(torch.stack([_variance(p, part) for p in self.posteriors], dim=-1))
-        mean = torch.cat(means).reshape(*flat.batch, self.system.robot.nq)
-        parts = {"qdd": slice(0, mean.shape[-1])}
-        if not covariance:
-            return Prediction(mean, None, parts)
-        return Prediction(mean, torch.diag_embed(torch.cat(variances).reshape(mean.shape)), parts)
+        return torch.cat(means), torch.cat(variances) if variance else None
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         settings = IndependentSettings(noise_std=plain(self.noise_std), standardize=self.standardize)
@@ -340,36 +301,3 @@ def _variance(posterior: ExactPosterior, features: dict[str, Tensor]) -> Tensor:
     n, like = len(features["q"]), posterior.alpha
     rows = Block((features,), (like.new_ones(n, 1, 1),), like.new_zeros(n, 1))
     return posterior.covariance(rows)[:, 0, 0].clamp(min=0.0)
-
-
-def load_independent(
-    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> IndependentGP:
-    """The model that `IndependentFit.save` wrote."""
-    settings = settings_of(header, IndependentSettings, source)
-    nq, dtype = system.robot.nq, system.robot.dtype
-    model = IndependentGP(system, settings.noise_std, settings.standardize)
-    n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
-    features = {
-        name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
-    }
-    noise = take(tensors, "training.noise_std", None, dtype, source)
-    if noise.shape not in ((nq,), (n, nq)) or not bool((noise > 0.0).all()):
-        raise ModelError(f"{source}: tensor 'training.noise_std' is not valid", expected="positive numbers")
-    qdd = take(tensors, "training.qdd", (n, nq), dtype, source)
-    training = IndependentTraining(features, qdd, noise, _scale(features, settings.standardize))
-    hyperparameters = {
-        f"{prior.name}.{name}": take(
-            tensors, f"hyperparameters.{prior.name}.{name}", tuple(value.shape), torch.float64, source
-        )
-        for prior in joint_processes(nq)
-        for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
-    }
-    _announce(training, 0)
-    try:
-        model._fitted = fitted(
-            system, settings.noise_std, training, hyperparameters, standardize=settings.standardize
-        )
-    except ForceGPError as cause:
-        raise ModelError.at(f"{source}: the training data", cause) from cause
-    return model

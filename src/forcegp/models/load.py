@@ -12,7 +12,8 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
 from forcegp.models.analytical import AnalyticalModel, load_analytical
 from forcegp.models.base import Model
-from forcegp.models.independent_gp import IndependentGP, load_independent
+from forcegp.models.independent_gp import IndependentGP
+from forcegp.models.independent_load import load_independent
 from forcegp.models.neural import NeuralNetwork, load_network
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_load import load_structured

@@ -15,16 +15,11 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.observations import Observation, measurement_of
-from forcegp.forces.quantities import flat_states
+from forcegp.forces.quantities import FlatStates
 from forcegp.gp.features import Standardization
-from forcegp.models.base import (
-    FitProgress,
-    FitResult,
-    FittedModel,
-    Model,
-    Prediction,
-    check_acceleration_only,
-)
+from forcegp.models.acceleration import AccelerationFit
+from forcegp.models.base import FitProgress, Model
+from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.epochs import EpochCheckpoint
@@ -139,7 +134,7 @@ class NeuralNetwork(Model["NetworkFit"]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class NetworkFit(FittedModel):
+class NetworkFit(AccelerationFit):
     """A trained network.
 
     Attributes:
@@ -160,39 +155,9 @@ class NetworkFit(FittedModel):
 
     kind = KIND
 
-    @torch.no_grad()
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: str = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-        system: ConstrainedSystem | None = None,
-    ) -> Prediction:
-        """Accelerations; there is no covariance.
-
-        Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: `qdd`, the only one that this model knows.
-            active: without effect, since the model does not know of contacts.
-            covariance: without effect, since the model has no uncertainty.
-            system: none but its own, since the model knows no forces.
-
-        Returns:
-            Mean `(*batch, nq)`.
-
-        Raises:
-            ModelError: another quantity, or another system, is asked for.
-            ShapeError: a state does not fit the robot.
-        """
-        check_acceleration_only(self, quantity, system)
-        flat = flat_states(self.system, q, qd, tau, active)
-        x = _stacked(self.inputs, {"q": flat.q, "qd": flat.qd, "tau": flat.tau})
-        mean = self.network(x) * self.outputs.std["qdd"] + self.outputs.mean["qdd"]
-        return Prediction(mean.reshape(*flat.batch, mean.shape[-1]), None, {"qdd": slice(0, mean.shape[-1])})
+    def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, None]:
+        x = _stacked(self.inputs, {"q": at.q, "qd": at.qd, "tau": at.tau})
+        return self.network(x) * self.outputs.std["qdd"] + self.outputs.mean["qdd"], None
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         settings = NetworkSettings(hidden=self.hidden, seed=self.seed, constant=self.inputs.constant)

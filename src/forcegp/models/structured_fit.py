@@ -24,7 +24,8 @@ from forcegp.forces.samples import draw_samples
 from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.models.base import FitResult, FittedModel, ForceField, Prediction
+from forcegp.models.base import FittedModel, ForceField, Prediction
+from forcegp.models.fit_result import FitResult
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
 
@@ -317,10 +318,10 @@ def conditioned(
     measured = enumerate(problem.training.measurements)
     noise = {m.quantity: typical(problem.noise_at(hyperparameters, i)) for i, m in measured}
     posterior, constant = forces or forces_and_constant(problem, hyperparameters)
+    lost, more_points = lost_by_inducing(posterior)
     likelihood, jitter = log_likelihood(posterior) - float(constant), posterior.latent.jitter
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     training, system = problem.training, problem.system_at(hyperparameters)
-    lost, more_points = lost_by_inducing(posterior)
     doubts = doubts_of(posterior, system, training)
     result = FitResult.of(
         learned,

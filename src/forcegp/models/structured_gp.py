@@ -14,40 +14,33 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
-from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.inference import check_method
-from forcegp.forces.learn import Problem
+from forcegp.errors import ModelError
+from forcegp.forces.inference import check_method, require_double
 from forcegp.forces.measurements import Training
-from forcegp.forces.observations import NoiseStd, Observation, training_of
+from forcegp.forces.observations import NoiseStd, Observation
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import (
-    ANALYTICAL,
-    COULOMB,
-    NOISE,
-    AnalyticalMean,
-    ForcePrior,
-    check_priors,
-    mean_of,
-)
+from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
-from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.start import Search, initial
+from forcegp.forces.priors.joint import AnalyticalMean, mean_of
 from forcegp.forces.state_noise import state_std_of
 from forcegp.forces.student_t import check_degrees
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.base import FitProgress, Model, require_double
-from forcegp.models.structured_checkpoint import learned
+from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_learning import in_motion, prepared
+from forcegp.models.structured_learning import (
+    chosen_of,
+    given_to,
+    learned,
+    prepared,
+    search_of,
+    training_for,
+)
 from forcegp.models.structured_spec import Specification, check_inertia, torque_noise_of
 from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
-from forcegp.robot.model import RobotModel
 
 FIT_COPIES = 3.0
 """Memory of a fit besides the matrices of its inference, in that of the equations of motion."""
-OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
-"""Default options, also where θ_A is learned too: L-BFGS then stalls on its way for a step or two."""
 
 
 class StructuredGP(Model[StructuredFit]):
@@ -171,12 +164,12 @@ class StructuredGP(Model[StructuredFit]):
             "analytical_parameters": spec.parameters,
             "torque_noise": "auto" if spec.automatic else spec.torque_noise,
             "inference": spec.inference,
+            "inducing_points": spec.inducing_points,
+            "state_noise": spec.state_noise,
             "inertia": spec.inertia,
             "standardize": spec.standardize,
             "degrees_of_freedom": spec.degrees_of_freedom,
         }
-
-    # -- learning ---------------------------------------------------------------------------------
 
     def fit(
         self,
@@ -223,8 +216,9 @@ class StructuredGP(Model[StructuredFit]):
             sample, known = None, data
         if self._fitted is None:
             self.specification = self.specification.for_data(known)
-        chosen = None if learn is None else self._chosen(learn)
-        training, robot, pinned, doubts = self._with_inertia(known, chosen)
+        chosen = None if learn is None else chosen_of(self.specification, learn)
+        given = given_to(self.specification, self._fitted, known, chosen)
+        self.specification, training = given.specification, given.training
         spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
         spec.system.announce_states(training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
         log, neighbours, forces = None, None, None
@@ -233,11 +227,12 @@ class StructuredGP(Model[StructuredFit]):
             log = Pass(spec, sample, file, progress, distributed)
             neighbours = neighbours_of(spec, sample, training)
         problem = spec.problem(training)
-        if robot is not spec.system.robot:
-            problem = dataclasses.replace(problem, system=spec.system.with_robot(robot), pinned=pinned)
-        search = self._search(problem, chosen, options)
+        if given.robot is not spec.system.robot:
+            system = spec.system.with_robot(given.robot)
+            problem = dataclasses.replace(problem, system=system, pinned=given.pinned)
+        search = search_of(spec, problem, self._fitted, chosen, options)
         lesson, saved = learned(spec, problem, search, file, progress, begin, neighbours)
-        values, doubts = lesson.hyperparameters, (*doubts, *lesson.warnings)
+        values, doubts = lesson.hyperparameters, (*given.doubts, *lesson.warnings)
         if log is not None and lesson.problem.inducing is not None:
             forces = log.forces(lesson.problem, values)
         fitted = self.adopt(
@@ -247,42 +242,6 @@ class StructuredGP(Model[StructuredFit]):
             if kept is not None:
                 kept.remove()
         return fitted
-
-    def _with_inertia(
-        self, data: Dataset | Sequence[Observation], chosen: Sequence[str] | None
-    ) -> tuple[Training, RobotModel, tuple[str, ...], tuple[str, ...]]:
-        """Training data, the robot to learn with, the priors whose force it contains, and doubts.
-
-        A first fit may identify the robot, and then adds a prior on what it does not know of it.
-        """
-        training, doubts = self._training(data, chosen)
-        spec = self.specification
-        if self._fitted is not None and not self._fitted.problem.offsets:
-            return training, self._fitted.system.robot, self._fitted.problem.pinned, doubts
-        if self._fitted is not None or chosen is not None:
-            return training, spec.system.robot, (), doubts
-        found = spec.inertia_of(training)
-        doubts = (*doubts, *found.doubts)
-        if not found.identified:
-            return training, found.robot, (), doubts
-        left = InertialPrior().around(spec.system.robot)
-        self.specification = dataclasses.replace(spec, priors=(*spec.priors, left))
-        training, _ = self._training(data, chosen)
-        return training, found.robot, (left.name,), doubts
-
-    def _search(
-        self, problem: Problem, chosen: Sequence[str] | None, options: LearningOptions | None
-    ) -> Search:
-        """What is learned of a problem, from where, and what keeps its values."""
-        spec = self.specification
-        options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
-        start = initial(problem, spec.learn_noise, spec.learns_torque_noise)
-        if chosen is None:
-            return Search(start, {}, options)
-        before = {} if self._fitted is None else self._fitted.hyperparameters
-        current = {key: before.get(key, value) for key, value in start.items()}
-        held = {key: value for key, value in current.items() if key.split(".")[0] not in chosen}
-        return Search({key: value for key, value in start.items() if key not in held}, held, options)
 
     def condition(
         self,
@@ -299,7 +258,7 @@ class StructuredGP(Model[StructuredFit]):
             ModelError: the model has not been fitted, or the data do not fit it.
         """
         fitted = self.fitted
-        training, doubts = self._training(data, learned=())
+        training, doubts = training_for(self.specification, fitted, data, learned=())
         if self.specification.learn_noise and training.quantities != fitted.training.quantities:
             raise ModelError(
                 "the learned noise belongs to other measurements",
@@ -326,7 +285,7 @@ class StructuredGP(Model[StructuredFit]):
             ModelError: the model has not been fitted, or the data measure something else.
         """
         fitted = self.fitted
-        training, _ = self._training(data, learned=())
+        training, _ = training_for(self.specification, fitted, data, learned=())
         if training.quantities != tuple(fitted.noise):
             raise ModelError(
                 "an update measures other quantities than the fit",
@@ -353,36 +312,13 @@ class StructuredGP(Model[StructuredFit]):
         """
         if isinstance(what, int | float):
             return self.adopt(self.fitted.forgetting(float(what), priors))
-        training, _ = self._training(what, learned=())
+        training, _ = training_for(self.specification, self.fitted, what, learned=())
         return self.adopt(self.fitted.without(training))
-
-    def _chosen(self, learn: Iterable[str]) -> tuple[str, ...]:
-        """What is learned, by prefix of its tensors."""
-        names = (*(prior.name for prior in self.force_priors), NOISE, ANALYTICAL, COULOMB)
-        chosen = tuple(learn)
-        for name in chosen:
-            if name not in names:
-                raise UnknownNameError("force prior to learn", name, names)
-        return chosen
-
-    def _training(
-        self, data: Dataset | Sequence[Observation], learned: Sequence[str] | None
-    ) -> tuple[Training, tuple[str, ...]]:
-        """What is learned from, with doubts about it; priors that are not learned (`None`: all are) keep the
-        scales of their inputs."""
-        spec, kept = self.specification, {}
-        if self._fitted is not None and learned is not None:
-            scales = zip(spec.priors, self._fitted.training.scales, strict=True)
-            kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
-        training = training_of(data, spec.system, spec.priors, spec.noise_std, kept, spec.standardize)
-        return in_motion(spec.system, training) if spec.learns_torque_noise else (training, ())
 
     def adopt(self, fitted: StructuredFit) -> StructuredFit:
         """Predict with this fit from now on."""
         self._fitted = fitted
         return fitted
-
-    # -- the most recent fit ----------------------------------------------------------------------
 
     def log_marginal_likelihood(self) -> float:
         """log p(y | X, θ) of the training data.

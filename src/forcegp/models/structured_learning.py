@@ -13,18 +13,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.dynamics import mass_matrix
+from forcegp.data import Dataset
+from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import held_out_torque_std, likelihood_power, residual_times
 from forcegp.forces.impacts import without_impacts
 from forcegp.forces.inference import (
-    force_posterior,
     is_finite,
     is_sparse,
     with_inducing,
@@ -32,17 +32,24 @@ from forcegp.forces.inference import (
 )
 from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training
-from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.observations import Observation, training_of
+from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.start import Search
+from forcegp.forces.robot_update import with_updated_robot
+from forcegp.forces.start import Search, initial
 from forcegp.forces.student_t import left_out, weighted
 from forcegp.forces.torque_noise import TORQUE_NOISE
 from forcegp.gp.likelihood import require_exact_fits
-from forcegp.gp.optimise import Learned, Progress
-from forcegp.gp.structured_covariance import Block
+from forcegp.gp.optimise import Learned, LearningOptions, Progress
+from forcegp.models.base import FitProgress
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_spec import Specification
 from forcegp.robot.model import RobotModel
+from forcegp.storage.checkpoint import Checkpoint
+from forcegp.storage.system import pack_system
 
+OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
+"""Default options, also where θ_A is learned too: L-BFGS then stalls on its way for a step or two."""
 LEARN_SAMPLES = 800
 """Samples that hyperparameters are learned on where priors are finite features."""
 LEARN_SAMPLES_INDUCING = 400
@@ -51,8 +58,6 @@ REST_SPEED = 0.01
 """A sample is at rest where no joint moves faster [rad/s, m/s]."""
 FEWEST_MOVING = 20
 """With fewer samples in motion, samples at rest are kept."""
-VOLUME_STATES = 100
-"""States that the volume of the noise is averaged over."""
 ROUNDS = 3
 """Rounds of the weights of samples under heavy-tailed noise and of the hyperparameters with them."""
 FIRST_POWER = 0.25
@@ -76,6 +81,97 @@ class Lesson:
     learned: Learned | None = None
     learned_on: int | None = None
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a fit learns from.
+
+    Attributes:
+        specification: the model; a first fit that identifies the robot adds a prior on what it does not know.
+        training: the samples.
+        robot: to learn with.
+        pinned: priors whose force the robot contains.
+        doubts: about the samples and the robot.
+    """
+
+    specification: Specification
+    training: Training
+    robot: RobotModel
+    pinned: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+
+def given_to(
+    spec: Specification,
+    before: StructuredFit | None,
+    data: Dataset | Sequence[Observation],
+    chosen: Sequence[str] | None,
+) -> Given:
+    """What a fit to data learns from, after an earlier fit of the model or as its first."""
+    training, doubts = training_for(spec, before, data, chosen)
+    if before is not None and not before.problem.offsets:
+        return Given(spec, training, before.system.robot, before.problem.pinned, doubts)
+    if before is not None or chosen is not None:
+        return Given(spec, training, spec.system.robot, (), doubts)
+    found = spec.inertia_of(training)
+    doubts = (*doubts, *found.doubts)
+    if not found.identified:
+        return Given(spec, training, found.robot, (), doubts)
+    left = InertialPrior().around(spec.system.robot)
+    spec = dataclasses.replace(spec, priors=(*spec.priors, left))
+    training, _ = training_for(spec, before, data, chosen)
+    return Given(spec, training, found.robot, (left.name,), doubts)
+
+
+def training_for(
+    spec: Specification,
+    before: StructuredFit | None,
+    data: Dataset | Sequence[Observation],
+    learned: Sequence[str] | None,
+) -> tuple[Training, tuple[str, ...]]:
+    """What is learned from, with doubts about it.
+
+    Priors that are not learned (`None`: all are) keep the scales of their inputs.
+    """
+    kept = {}
+    if before is not None and learned is not None:
+        scales = zip(spec.priors, before.training.scales, strict=True)
+        kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
+    training = training_of(data, spec.system, spec.priors, spec.noise_std, kept, spec.standardize)
+    return in_motion(spec.system, training) if spec.learns_torque_noise else (training, ())
+
+
+def chosen_of(spec: Specification, learn: Iterable[str]) -> tuple[str, ...]:
+    """What is learned, by prefix of its tensors.
+
+    Raises:
+        UnknownNameError: it is neither a prior nor something else that can be learned.
+    """
+    names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
+    chosen = tuple(learn)
+    for name in chosen:
+        if name not in names:
+            raise UnknownNameError("force prior to learn", name, names)
+    return chosen
+
+
+def search_of(
+    spec: Specification,
+    problem: Problem,
+    before: StructuredFit | None,
+    chosen: Sequence[str] | None,
+    options: LearningOptions | None,
+) -> Search:
+    """What is learned of a problem, from where, and what keeps its values."""
+    options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
+    start = initial(problem, spec.learn_noise, spec.learns_torque_noise)
+    if chosen is None:
+        return Search(start, {}, options)
+    known = {} if before is None else before.hyperparameters
+    current = {key: known.get(key, value) for key, value in start.items()}
+    held = {key: value for key, value in current.items() if key.split(".")[0] not in chosen}
+    return Search({key: value for key, value in start.items() if key not in held}, held, options)
 
 
 def in_motion(system: ConstrainedSystem, training: Training) -> tuple[Training, tuple[str, ...]]:
@@ -105,6 +201,64 @@ def subset(spec: Specification, problem: Problem) -> Problem:
         training = training.evenly(most) if spec.learns_torque_noise else training.thinned(most)
     problem = dataclasses.replace(problem, training=training)
     return without_inducing(problem) if finite else problem
+
+
+def learned(
+    spec: Specification,
+    problem: Problem,
+    search: Search,
+    file: Path | None,
+    progress: FitProgress | None,
+    begin: Mapping[str, Tensor] | None,
+    neighbours: Training | None,
+) -> tuple[Lesson, Checkpoint | None]:
+    """Learn what is free in a search, and record it; where nothing is free, prepare the problem alone.
+
+    Args:
+        spec: the model.
+        problem: all samples.
+        search: what is learned and what is held.
+        file: records the evaluations; learning that finds it goes on from there, to the same bits.
+        progress: called after each evaluation.
+        begin: where to begin.
+        neighbours: see `solve`.
+
+    Returns:
+        What was learned, and its record.
+
+    Raises:
+        ModelError: the file belongs to other learning.
+    """
+    if not search.start:
+        return Lesson(prepared(spec, problem, search.held), search.held), None
+    saved = None
+    if file is not None:
+        saved = Checkpoint(file, _key(spec, problem, search, begin))
+        saved.read(search.start)
+        search = dataclasses.replace(search, recorded=saved.recorded)
+
+    def report(evaluations: int, value: float, _: Mapping[str, Tensor]) -> None:
+        assert progress is not None
+        progress(evaluations, search.options.max_evaluations, value)
+
+    lesson = solve(spec, problem, search, report if progress else None, begin, neighbours)
+    if saved is not None:
+        saved.write()
+    return lesson, saved
+
+
+def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:
+    """Identifies the learning of some tensors, on these data and this system, with these options."""
+    training = problem.training
+    data = [value for m in training.measurements for value in m.tensors]
+    priors = [(type(prior).__name__, prior) for prior in problem.priors]
+    record, robot = pack_system(problem.system)
+    named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
+    state = () if problem.state_std is None else (problem.state_std,)
+    return Checkpoint.key_of(
+        problem.mean, priors, spec.inference, search.options, training.quantities, *data, *training.noise_std,
+        record, *robot.values(), *(part for pair in named for part in pair), *state,
+    )  # fmt: skip
 
 
 def solve(
@@ -151,7 +305,7 @@ def solve(
     whole = dataclasses.replace(part, training=problem.training, inducing=None)
     whole = prepared(spec, whole, values)
     warnings = ()
-    if count := left_out(whole):
+    if spec.degrees_of_freedom is not None and (count := left_out(whole)):
         samples = whole.training.samples
         warnings = (f"{count} of {samples} samples lie far outside the noise and hardly count",)
     return Lesson(whole, values, learned, learned_on, warnings)
@@ -180,77 +334,3 @@ def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]
     if spec.degrees_of_freedom is None:
         return problem
     return weighted(problem, values, spec.degrees_of_freedom)
-
-
-@torch.no_grad()
-def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """The problem with the robot at the posterior mean of its inertial parameters (a Gauss–Newton step)."""
-    for p, prior in enumerate(problem.priors):
-        contained = prior.name in problem.pinned
-        if isinstance(prior, InertialPrior) and problem.parameters is None and not contained:
-            posterior = force_posterior(problem, values)
-            features = _one_row(posterior, problem)
-            mean = posterior.latent.latent_mean(p, features[p])[0]
-            precision = _precision(posterior, features, p, problem.system.robot)
-            volume = _log_volume(problem, values)
-            robot, moved = prior.updated(problem.system.robot, mean, precision, volume)
-            # The prior keeps the scale of the file's parameters, not that of the updated ones.
-            return dataclasses.replace(
-                problem,
-                system=problem.system.with_robot(robot),
-                priors=tuple(prior.around(problem.system.robot) if q is prior else q for q in problem.priors),
-                offsets={**problem.offsets, prior.name: -moved},
-                pinned=(prior.name,),
-            )
-    return problem
-
-
-def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor]:
-    """κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| at the samples in free motion, as a function of the robot.
-
-    With it, the density of the torque's error is that of the acceleration's. Without it, a robot that has
-    next to no inertia explains small torques best, whatever it does to the accelerations.
-    """
-    terms = []
-    std = problem.system.robot.mass.new_zeros(problem.system.robot.nq)
-    if TORQUE_NOISE in values:
-        std = values[TORQUE_NOISE].exp()
-    elif problem.torque_std is not None:
-        std = problem.torque_std
-    for i in (i for i, quantity in enumerate(problem.training.quantities) if quantity == "qdd"):
-        m = problem.training.measurements[i]
-        free = (~m.active.any(-1)).nonzero()[:, 0]
-        if not len(free):
-            continue
-        q = m.q[free[torch.linspace(0, len(free) - 1, min(VOLUME_STATES, len(free))).round().long()]]
-        noise = problem.noise_at(values, i)
-        spread = (noise if noise.ndim == 1 else noise.square().mean(0).sqrt()).detach() ** 2
-        terms.append((q, problem.power * len(free) / len(q), spread))
-
-    def volume(robot: RobotModel) -> Tensor:
-        total = robot.mass.new_zeros(())
-        for q, weight, spread in terms:
-            M = mass_matrix(robot, q)
-            C = torch.diag(std**2) + (M * spread) @ M.mT
-            total = total + weight * (torch.logdet(M) - 0.5 * torch.logdet(C)).sum()
-        return total
-
-    return volume
-
-
-def _one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
-    """Kernel inputs of every prior at the first sample; constants have the same value everywhere."""
-    m = problem.training.measurements[0]
-    at = m[torch.zeros(1, dtype=torch.int64, device=m.q.device)].at(problem.system)
-    return [posterior.features_of(p, problem.system, at) for p in range(len(problem.priors))]
-
-
-def _precision(
-    posterior: ForcePosterior, features: list[dict[str, Tensor]], p: int, robot: RobotModel
-) -> Tensor:
-    """Inverse posterior covariance of the components of prior p, all others marginalised."""
-    widths = [prior.outputs(robot) for prior in posterior.priors]
-    eye = torch.eye(widths[p], dtype=robot.dtype, device=robot.device)
-    operators = [eye[None] if q == p else eye.new_zeros(1, widths[p], w) for q, w in enumerate(widths)]
-    block = Block(tuple(features), tuple(operators), eye[:1])
-    return torch.linalg.inv(posterior.latent.covariance(block)[0])

@@ -14,12 +14,12 @@ from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import AnalyticalMean
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import states
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.sparse_tensors import posterior_of_tensors
-from forcegp.models.base import FitResult
+from forcegp.models.fit_result import FitResult
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_spec import CLASSES, COLUMNS, IN_TIME, Specification, StructuredSettings

@@ -26,17 +26,15 @@ from forcegp.forces.observations import (
     states_noise,
 )
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import AnalyticalMean, ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.coregional import CoregionalPrior
 from forcegp.forces.priors.default import measured_priors
 from forcegp.forces.priors.disturbance import DisturbancePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, NormalForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
-from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.payload import PayloadPrior
-from forcegp.forces.priors.sliding_friction import SlidingFrictionPrior
 from forcegp.forces.state_noise import state_std_of
 from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
@@ -44,7 +42,7 @@ from forcegp.gp.inducing import LIMIT
 from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sparse_tensors import tensors_of_posterior
-from forcegp.models.base import FitResult
+from forcegp.models.fit_result import FitResult
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import encode
 from forcegp.storage.folder import Settings
@@ -251,10 +249,27 @@ def pack(
     Raises:
         ModelError: a prior or kernel is Python code.
     """
-    training, latent = problem.training, posterior.latent
     own = spec.parameters if isinstance(spec.parameters, AnalyticalParameters) else None
-    exact = isinstance(latent, ExactPosterior)
-    settings = StructuredSettings(
+    tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
+    tensors |= {f"offset.{name}": value for name, value in problem.offsets.items()}
+    if problem.torque_std is not None:
+        tensors["torque_std"] = problem.torque_std
+    if problem.correlation is not None:
+        tensors["torque_correlation"] = problem.correlation
+    tensors |= _conditioned_on(spec, problem.training, posterior)
+    start = own.start if own is not None else spec.system.robot
+    tensors |= {f"start.{name}": getattr(start, name) for name in robot_tensors(start)}
+    for prior, scale in zip(spec.priors, problem.training.scales, strict=True):
+        tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
+        tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
+    return _settings_of(spec, problem, isinstance(posterior.latent, ExactPosterior), own, result), tensors
+
+
+def _settings_of(
+    spec: Specification, problem: Problem, exact: bool, own: AnalyticalParameters | None, result: FitResult
+) -> StructuredSettings:
+    """What is kept of a fit besides tensors."""
+    return StructuredSettings(
         mean=spec.mean.terms,
         noise_std=plain(spec.noise_std),
         learn_noise=spec.learn_noise,
@@ -267,31 +282,22 @@ def pack(
         power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
-        measured=training.quantities if exact else (),
-        constant=tuple(scale.constant for scale in training.scales),
+        measured=problem.training.quantities if exact else (),
+        constant=tuple(scale.constant for scale in problem.training.scales),
         analytical=None if own is None else own.joints,
         result=ResultSettings(**{name: getattr(result, name) for name in ResultSettings.model_fields}),
     )
-    tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
-    tensors |= {f"offset.{name}": value for name, value in problem.offsets.items()}
-    if problem.torque_std is not None:
-        tensors["torque_std"] = problem.torque_std
-    if problem.correlation is not None:
-        tensors["torque_correlation"] = problem.correlation
+
+
+def _conditioned_on(spec: Specification, training: Training, posterior: ForcePosterior) -> dict[str, Tensor]:
+    """The data of an exact posterior, or the sums over them of a sparse one."""
+    latent, central = posterior.latent, posterior.central
     if isinstance(latent, ExactPosterior):
-        tensors |= {"alpha": latent.alpha, **_tensors_of(training, any(p.in_time for p in spec.priors))}
-    else:
-        assert isinstance(latent, SparsePosterior)
-        tensors |= {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
-        if isinstance(posterior.central, SparsePosterior):
-            own_means = tensors_of_posterior(posterior.central)
-            tensors |= {f"central.{name}": value for name, value in own_means.items()}
-    start = own.start if own is not None else spec.system.robot
-    tensors |= {f"start.{name}": getattr(start, name) for name in robot_tensors(start)}
-    for prior, scale in zip(spec.priors, training.scales, strict=True):
-        tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
-        tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
-    return settings, tensors
+        return {"alpha": latent.alpha, **_tensors_of(training, any(p.in_time for p in spec.priors))}
+    tensors = {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
+    if isinstance(central, SparsePosterior):
+        tensors |= {f"central.{name}": value for name, value in tensors_of_posterior(central).items()}
+    return tensors
 
 
 def _tensors_of(training: Training, in_time: bool) -> dict[str, Tensor]:

@@ -16,7 +16,8 @@ from forcegp.data import Dataset
 from forcegp.files import Header
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.gp.optimise import LearningOptions, minimise
-from forcegp.models.structured_gp import WITH_PARAMETERS, StructuredGP
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.paper.last_link import WRONG_MASS, WRONG_OFFSET, LastLink, wrong_parameters
 from forcegp.report.html import Block, Finding
 from forcegp.report.style import AXES, INK, Picture, colour, draw, label

@@ -13,7 +13,6 @@ import torch
 from forcegp.destination import check_destination
 from forcegp.files import write_text
 from forcegp.gp.likelihood import MATRICES_TO_LEARN
-from forcegp.memory import announce_memory
 from forcegp.paper.figures import all_figures
 from forcegp.paper.fits import Fit, noise_std_of, score_fit
 from forcegp.paper.jobs import fits_of, models_of, run_ahead, splits_of
@@ -23,6 +22,7 @@ from forcegp.paper.profiles import Profile, profile_of
 from forcegp.paper.results import Results, Score
 from forcegp.paper.stages import Progress, Stages, silent
 from forcegp.paper.task import SCENE, Task, make_task
+from forcegp.resources import announce_memory
 from forcegp.scene import load_scene
 
 PAGE, RESULTS, MARKDOWN = "report.html", "results.json", "results.md"

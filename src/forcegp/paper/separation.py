@@ -17,9 +17,8 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, split_by_stretches
 from forcegp.forces.identifiability import force_correlation
 from forcegp.forces.observations import Observation
-from forcegp.forces.priors.base import AnalyticalMean
 from forcegp.forces.priors.contact import ContactForcePrior
-from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.forces.quantities import States, states
 from forcegp.gp.kernels import Linear, SquaredExponential
 from forcegp.models.structured_gp import StructuredGP

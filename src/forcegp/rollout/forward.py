@@ -13,11 +13,11 @@ from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.constraints.unilateral import any_row, can_open
 from forcegp.errors import ForceGPError, ModelError, UnknownNameError
+from forcegp.resources import one_thread
 from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
 from forcegp.rollout.law import ForceLaw, ForwardModel, Law, Problem, State, law_of
 from forcegp.rollout.trajectory import FIELDS, DivergedError, Rollout
-from forcegp.threads import one_thread
 
 STEP = 1.0 / 240.0
 """Step of a rollout under a feedback law in continuous time [s]."""
@@ -227,12 +227,11 @@ def _run(
     system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
     problem = Problem(mechanics, law, inputs, unilateral, options.sticking)
-    initial = _initial(problem, start, whole, active)
     with one_thread() if n <= FEW else nullcontext():
         found = integrate(
             problem,
             METHODS[options.method],
-            initial,
+            _initial(problem, start, whole, active),
             dt,
             steps,
             project=options.stabilization == "projection",

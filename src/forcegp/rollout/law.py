@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -17,7 +18,10 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.dry_friction import DryFriction, ForceField, split
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import States
+from forcegp.forces.samples import ForceSamples
 from forcegp.rollout.inputs import Inputs, Reached
 from forcegp.rollout.sticking import at_the_end, dry_friction_force, overshooting
 
@@ -104,8 +108,8 @@ class Law(ABC):
     def motion(self, system: ConstrainedSystem, at: States) -> Motion:
         """Acceleration and multiplier at states."""
 
-    def dry_friction(self, system: ConstrainedSystem, at: States) -> DryFriction | None:
-        """Forces with the dry friction of joints apart; `None` where there is none."""
+    def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
+        """What tells the dry friction of joints apart at states; `None` where there is no such friction."""
         return None
 
 
@@ -119,8 +123,14 @@ class ForceLaw(Law):
     def motion(self, system: ConstrainedSystem, at: States) -> Motion:
         return Motion(*at.eom.motion_under(self.force(system, at)))
 
-    def dry_friction(self, system: ConstrainedSystem, at: States) -> DryFriction | None:
-        return split(system, at, self.force)
+    def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
+        force = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
+        mean, priors = (force.mean, force.priors) if isinstance(force, ForcePosterior) else (force, ())
+        known = isinstance(mean, AnalyticalMean) and "friction" in mean.terms
+        declared = known and bool(((system.robot.friction != 0.0) | (system.robot.stribeck != 0.0)).any())
+        if not declared and not any(prior.sticks for prior in priors):
+            return None
+        return lambda at: split(system, at, self.force)
 
 
 @dataclass(frozen=True)
@@ -214,15 +224,20 @@ class Problem:
     unilateral: bool
     sticking: bool = False
 
+    @cached_property
+    def dry_friction(self) -> Callable[[States], DryFriction] | None:
+        """Dry friction that can hold joints at rest, told apart from other forces; `None` without any."""
+        return self.law.dry_friction(self.system) if self.sticking else None
+
     def evaluate(self, state: State, end: Tensor) -> Evaluation:
         """The motion at a state, within a step that ends at `end` `(n, 1)`."""
         eom = self.system.equations(state.q, state.qd, state.active)
         tau = self.inputs.torque(state.t, end, Reached(self.system, eom, state.q, state.qd))
         at = States(state.q, state.qd, tau, state.active, eom)
-        dry = self.law.dry_friction(self.system, at) if self.sticking else None
-        if dry is None:
+        if self.dry_friction is None:
             qdd, multiplier = self.law.motion(self.system, at)
             return Evaluation(tau, qdd, multiplier, eom.c, eom.cd)
+        dry = self.dry_friction(at)
         free, h = eom.acceleration(dry.Q_bar), end - state.t
         G = eom.H if dry.response is None else eom.H @ dry.response
         damping = overshooting(G, dry.damping, h)

@@ -11,6 +11,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.unilateral import any_row, contact_forces, land
 from forcegp.control.plan import Plan, make_plan
 from forcegp.control.task_space import Target, control_torque
+from forcegp.resources import one_thread
 from forcegp.simulate.config import SimulationConfig
 from forcegp.simulate.contact_solver import ContactSolverEngine
 from forcegp.simulate.engine import Engine, make_engine
@@ -18,7 +19,6 @@ from forcegp.simulate.guard import Progress, check_speed, report, torque_limit
 from forcegp.simulate.mechanics import Mechanics
 from forcegp.simulate.result import Log, SimulationResult, make_result
 from forcegp.simulate.solver_run import follow_with_solver
-from forcegp.threads import one_thread
 
 ON_SURFACE = 1e-8
 """A contact is closed at the start where the error is below this [m]; placement leaves less."""

@@ -18,7 +18,7 @@ from forcegp.errors import ModelError
 from forcegp.exchange import recover
 from forcegp.files import Header, atomic_directory
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES
-from forcegp.memory import announce_memory
+from forcegp.resources import announce_memory
 from forcegp.storage.system import PREFIX, pack_system
 from forcegp.storage.validate import check_tensors
 

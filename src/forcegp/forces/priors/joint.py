@@ -1,4 +1,7 @@
-"""A prior on each joint's force (eq. 31)."""
+"""What is known of the joint force Q before data: its mean from the robot file, and a process for each joint.
+
+The part of Q along the constraint, which no acceleration in contact shows, has a process of its own.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,61 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.priors.base import JOINT, ForcePrior, check_inputs
+from forcegp.dynamics import damping_force
+from forcegp.errors import ModelError, UnknownNameError
+from forcegp.forces.priors.base import CONSTRAINT, JOINT, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
+
+TERMS = ("bias", "gravity", "friction", "actuation")
+"""Q_C, Q_G, Q_D and Q_u: the known parts of Q."""
+
+
+@dataclass(frozen=True)
+class AnalyticalMean:
+    """m(x; θ_A) = Q_K, the sum of some of Q_C, Q_G, Q_D and Q_u.
+
+    Args:
+        terms: which of `bias`, `gravity`, `friction`, `actuation` are known; none is the zero mean.
+
+    Example:
+        >>> AnalyticalMean(("gravity", "actuation")).terms
+        ('gravity', 'actuation')
+
+    Raises:
+        UnknownNameError: a term does not exist.
+        ModelError: a term is named twice.
+    """
+
+    terms: tuple[str, ...] = TERMS
+
+    def __post_init__(self) -> None:
+        for term in self.terms:
+            if term not in TERMS:
+                raise UnknownNameError("term of the analytical mean", term, TERMS)
+            if self.terms.count(term) > 1:
+                raise ModelError(f"term {term!r} of the analytical mean is named twice", got=self.terms)
+
+    def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
+        """The mean of Q at states, `(n, nq)` [N m, N]."""
+        Q_D = at.eom.Q_D if at.slip is None else damping_force(system.robot, at.qd, at.slip)
+        known = {"bias": at.eom.Q_C, "gravity": at.eom.Q_G, "friction": Q_D, "actuation": at.tau}
+        return sum((known[term] for term in self.terms), start=torch.zeros_like(at.q))
+
+
+def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
+    """`"zero"`, `"analytical"` or a mean of one's own.
+
+    Raises:
+        UnknownNameError: a name that is neither.
+    """
+    if isinstance(mean, AnalyticalMean):
+        return mean
+    named = {"zero": AnalyticalMean(()), "analytical": AnalyticalMean()}
+    if mean not in named:
+        raise UnknownNameError("mean", mean, named)
+    return named[mean]
 
 
 @dataclass(frozen=True)
@@ -55,3 +109,41 @@ class JointForcePrior(ForcePrior):
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
+
+
+@dataclass(frozen=True)
+class NormalForcePrior(ForcePrior):
+    """What accelerations in contact never show: a joint force along the constraint, E = Aᵀ Lᵀ = I − P.
+
+    H Aᵀ = 0, so a force Aᵀ g(x) changes the multiplier by −g(x) and no acceleration. A joint force prior
+    alone is overconfident along the normal. This independent process, with the hyperparameters of the joint
+    force prior, keeps the uncertainty of that part until a force sensor or the like reduces it.
+
+    Args:
+        like: the joint force prior whose kernel, inputs and hyperparameters it shares.
+
+    Example:
+        >>> from forcegp import JointForcePrior
+        >>> NormalForcePrior(JointForcePrior()).target
+        'constraint'
+    """
+
+    like: JointForcePrior = field(default_factory=JointForcePrior)
+    target: str = CONSTRAINT
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", f"{self.like.name}_normal")
+        object.__setattr__(self, "kernel", self.like.kernel)
+
+    @property
+    def prefix(self) -> str:
+        return self.like.name
+
+    def outputs(self, robot: RobotModel) -> int:
+        return self.like.outputs(robot)
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return self.like.features(system, at)
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        return at.eom.A.mT @ at.eom.L.mT

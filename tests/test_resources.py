@@ -6,9 +6,9 @@ import warnings
 
 import pytest
 
-from forcegp import memory
+from forcegp import resources
 from forcegp.errors import MemoryLimitError
-from forcegp.memory import MemoryNeedWarning, announce_memory, free_memory
+from forcegp.resources import MemoryNeedWarning, announce_memory, free_memory
 
 
 def test_free_memory_is_what_the_system_says() -> None:
@@ -19,7 +19,7 @@ def test_free_memory_is_what_the_system_says() -> None:
 def test_half_of_the_free_memory_is_announced_and_more_than_all_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(memory, "free_memory", lambda: 10 << 30)
+    monkeypatch.setattr(resources, "free_memory", lambda: 10 << 30)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         announce_memory(5 << 30, "the covariance")
@@ -35,7 +35,7 @@ def test_half_of_the_free_memory_is_announced_and_more_than_all_refused(
 def test_the_limit_of_a_container_counts(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     (tmp_path / "memory.max").write_text("1000\n")
     (tmp_path / "memory.current").write_text("400\n")
-    monkeypatch.setattr(memory, "_CGROUP", tmp_path)
+    monkeypatch.setattr(resources, "_CGROUP", tmp_path)
     assert free_memory() == 600
     (tmp_path / "memory.max").write_text("max\n")
     assert free_memory() != 600
