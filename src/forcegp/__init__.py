@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from forcegp.forces.priors.coregional import CoregionalPrior
     from forcegp.forces.priors.disturbance import DisturbancePrior
     from forcegp.forces.priors.inertial import InertialPrior
-    from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, NormalForcePrior
+    from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
     from forcegp.forces.priors.joint_friction import JointFrictionPrior
+    from forcegp.forces.priors.normal_force import NormalForcePrior
     from forcegp.forces.priors.operator import OperatorForcePrior
     from forcegp.forces.priors.payload import PayloadPrior
     from forcegp.gp.optimise import LearningOptions
@@ -61,7 +62,7 @@ _HOME = {
     "DisturbancePrior": "forces.priors.disturbance",
     "LearningOptions": "gp.optimise",
     "NeuralNetwork": "models.neural",
-    "NormalForcePrior": "forces.priors.joint",
+    "NormalForcePrior": "forces.priors.normal_force",
     "Observation": "forces.observations",
     "OperatorForcePrior": "forces.priors.operator",
     "PayloadPrior": "forces.priors.payload",

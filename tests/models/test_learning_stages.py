@@ -10,7 +10,8 @@ import torch
 import forcegp
 from forcegp import LearningOptions, Observation
 from forcegp.forces.priors.contact import ContactForcePrior
-from forcegp.forces.priors.joint import JointForcePrior, NormalForcePrior
+from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.normal_force import NormalForcePrior
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 
 SHORT = LearningOptions(max_evaluations=3)

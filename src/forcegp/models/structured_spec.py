@@ -32,8 +32,9 @@ from forcegp.forces.priors.coregional import CoregionalPrior
 from forcegp.forces.priors.default import measured_priors
 from forcegp.forces.priors.disturbance import DisturbancePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, NormalForcePrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.forces.priors.payload import PayloadPrior
 from forcegp.forces.state_noise import state_std_of
 from forcegp.gp import kernels

@@ -1,7 +1,4 @@
-"""What is known of the joint force Q before data: its mean from the robot file, and a process for each joint.
-
-The part of Q along the constraint, which no acceleration in contact shows, has a process of its own.
-"""
+"""What is known of the joint force Q before data: its mean from the robot file, and one process per joint."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import damping_force
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.priors.base import CONSTRAINT, JOINT, ForcePrior, check_inputs
+from forcegp.forces.priors.base import JOINT, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
@@ -109,41 +106,3 @@ class JointForcePrior(ForcePrior):
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
-
-
-@dataclass(frozen=True)
-class NormalForcePrior(ForcePrior):
-    """What accelerations in contact never show: a joint force along the constraint, E = Aᵀ Lᵀ = I − P.
-
-    H Aᵀ = 0, so a force Aᵀ g(x) changes the multiplier by −g(x) and no acceleration. A joint force prior
-    alone is overconfident along the normal. This independent process, with the hyperparameters of the joint
-    force prior, keeps the uncertainty of that part until a force sensor or the like reduces it.
-
-    Args:
-        like: the joint force prior whose kernel, inputs and hyperparameters it shares.
-
-    Example:
-        >>> from forcegp import JointForcePrior
-        >>> NormalForcePrior(JointForcePrior()).target
-        'constraint'
-    """
-
-    like: JointForcePrior = field(default_factory=JointForcePrior)
-    target: str = CONSTRAINT
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "name", f"{self.like.name}_normal")
-        object.__setattr__(self, "kernel", self.like.kernel)
-
-    @property
-    def prefix(self) -> str:
-        return self.like.name
-
-    def outputs(self, robot: RobotModel) -> int:
-        return self.like.outputs(robot)
-
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return self.like.features(system, at)
-
-    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        return at.eom.A.mT @ at.eom.L.mT
