@@ -171,6 +171,7 @@ class StructuredGP(Model[StructuredFit]):
             "analytical_parameters": spec.parameters,
             "torque_noise": "auto" if spec.automatic else spec.torque_noise,
             "inference": spec.inference,
+            "state_noise": spec.state_noise,
             "inertia": spec.inertia,
             "standardize": spec.standardize,
             "degrees_of_freedom": spec.degrees_of_freedom,
@@ -308,7 +309,7 @@ class StructuredGP(Model[StructuredFit]):
                 hint='call fit(data, learn=["noise"]), which learns the noise alone',
             )
         values = fitted.hyperparameters if hyperparameters is None else hyperparameters
-        spec = self.specification
+        spec, training = self.specification, fitted.with_slopes(training)
         problem = prepared(spec, dataclasses.replace(fitted.problem, training=training), values)
         return self.adopt(conditioned(spec, problem, values, warnings=doubts))
 
