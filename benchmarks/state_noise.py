@@ -57,7 +57,9 @@ def run(data: forcegp.Dataset, seed: int, mean: str, samples: int, way: str) -> 
     model = forcegp.StructuredGP(system, mean, state_noise=WAYS[way])
     fit = model.fit(train if way == "no noise" else with_noise(train, seed))
     found = fit.predict(test.q, test.qd, test.tau, active=test.active(system.contact_names))
-    error, std = (found.mean - test.qdd_clean).abs(), found.std
+    std = found.std
+    assert std is not None
+    error = (found.mean - test.qdd_clean).abs()
     noisy = (found.mean - test.qdd).abs() < 2.0 * (std**2 + noise_std**2).sqrt()
     return {
         "mean": mean,
