@@ -15,6 +15,7 @@ from forcegp.forces.coulomb import CoulombFriction, coulomb_of
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForcePrior
 from forcegp.forces.projection import ForceMean, ForceNoise, WhitenedRows, combine, whiten
+from forcegp.forces.state_noise import state_jacobian
 from forcegp.forces.torque_noise import TORQUE_NOISE, stick_variance
 from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features
@@ -113,6 +114,14 @@ class Problem:
         std = self.torque_std if learned is None else learned.exp()
         return None if std is None else lambda at: std**2 + stick_variance(tensors, at)
 
+    def state_factor(self, system: ConstrainedSystem, measurement: int) -> Tensor | None:
+        """G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` where no noise of the state reaches it."""
+        if self.state_std is None:
+            return None
+        m, slopes = self.training.measurements[measurement], self.training.slopes
+        G = state_jacobian(system, m) if slopes is None else slopes[measurement]
+        return None if G is None else G * self.state_std
+
     def rows(self, tensors: Mapping[str, Tensor]) -> WhitenedRows:
         """Whitened rows at the noise and analytical parameters among the tensors."""
         system, force_noise = self.system_at(tensors), self.force_noise(tensors)
@@ -129,7 +138,7 @@ class Problem:
                     force_noise,
                     self.offsets,
                     friction,
-                    self.state_std,
+                    self.state_factor(system, i),
                     None if self.training.weights is None else self.training.weights[i],
                 )
                 for i, m in enumerate(self.training.measurements)

@@ -77,6 +77,8 @@ class Training:
         period: sampling period of the log that these are from [s]; 0 where its rows are not in order.
         weights: of the samples of each measurement `(n,)`, which their noise variance is divided by; `None`
             for one.
+        slopes: G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement with learned forces, `None` for a quantity
+            without; `None` for those of the robot file (`forces/state_noise.py`).
     """
 
     measurements: tuple[Measurement, ...]
@@ -85,6 +87,7 @@ class Training:
     part_of: int = 0
     period: float = 0.0
     weights: tuple[Tensor, ...] | None = None
+    slopes: tuple[Tensor | None, ...] | None = None
 
     @property
     def samples(self) -> int:
@@ -135,18 +138,24 @@ class Training:
             weights=None
             if self.weights is None
             else tuple(w[own] for w, own in zip(self.weights, rows, strict=True)),
+            slopes=None
+            if self.slopes is None
+            else tuple(None if G is None else G[own] for G, own in zip(self.slopes, rows, strict=True)),
         )
 
-    def joined(self, measurements: Sequence[Measurement], noise_std: Sequence[Tensor]) -> Training:
-        """These and further measurements, with the noise of the latter."""
-        weights = self.weights
+    def joined(self, more: Training, noise_std: Sequence[Tensor]) -> Training:
+        """These and further measurements, with the noise of the latter; slopes are of both."""
+        weights, slopes = self.weights, self.slopes
         if weights is not None:
-            weights = (*weights, *(torch.ones_like(m.t) for m in measurements))
+            weights = (*weights, *(torch.ones_like(m.t) for m in more.measurements))
+        if slopes is not None and more.slopes is not None:
+            slopes = (*slopes, *more.slopes)
         return dataclasses.replace(
             self,
-            measurements=(*self.measurements, *measurements),
+            measurements=(*self.measurements, *more.measurements),
             noise_std=(*self.noise_std, *noise_std),
             weights=weights,
+            slopes=slopes,
         )
 
     def moving(self, speed: float) -> Training:

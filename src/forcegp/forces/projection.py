@@ -25,8 +25,7 @@ from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.forces.coulomb import CoulombFriction, coupled
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import ForceMean, ForcePrior, prior_rows
-from forcegp.forces.quantities import AffineMap, States, affine_map
-from forcegp.forces.state_noise import state_jacobian
+from forcegp.forces.quantities import States, affine_map
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.structured_covariance import Block
 
@@ -173,7 +172,7 @@ def whiten(
     force_noise: ForceNoise | None = None,
     offsets: Mapping[str, Tensor] | None = None,
     coulomb: Sequence[CoulombFriction] = (),
-    state_std: Tensor | None = None,
+    state_factor: Tensor | None = None,
     weight: Tensor | None = None,
 ) -> WhitenedRows:
     """Rows of one measurement with unit white noise, without noise-free directions.
@@ -187,7 +186,7 @@ def whiten(
         force_noise: variance of the white noise on the joint force.
         offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
         coulomb: friction of contacts that is proportional to the multiplier.
-        state_std: `(2 nq,)` standard deviation of the noise of q and q̇.
+        state_factor: factor `(n, d, 2 nq)` of the covariance that noise of the state gives the values.
         weight: `(n,)` of each sample, which the variance of all its noise is divided by.
     """
     at = measurement.at(system)
@@ -195,14 +194,16 @@ def whiten(
     if coulomb:
         z = coupled(system, at, z, coulomb)
     # Noise of the state reaches the directions that the constraint fixes too, so their rows tell of it.
-    has_fixed = measurement.quantity == "qdd" and system.m > 0 and state_std is None
+    has_fixed = measurement.quantity == "qdd" and system.m > 0 and state_factor is None
     std = noise_std.expand_as(measurement.values)
     rows = prior_rows(priors, scales, mean, system, at, z)
     expected = rows.target
     for prior, W in zip(priors, rows.operators, strict=True):
         if offsets and prior.name in offsets:
             expected = expected + W @ offsets[prior.name]
-    noise = _noise_factors(system, at, measurement, z, force_noise, state_std)
+    noise = [] if state_factor is None else [state_factor]
+    if force_noise is not None:
+        noise.append(z.B_Q * force_noise(at).sqrt()[:, None, :])
     everything = _Rows(
         rows.features,
         tuple(W.shape[-1] for W in rows.operators),
@@ -248,23 +249,6 @@ def _fixed(A: Tensor, rank: int, violated: Tensor, weight: Tensor) -> Tensor:
     pinv = torch.linalg.pinv(rows) if C is None else torch.linalg.pinv(rows) @ C
     squares = ((pinv @ violated[..., None]) ** 2)[..., 0].sum(-1)
     return 0.5 * (weight * squares).sum() + 0.5 * rank * len(A) * math.log(2 * math.pi)
-
-
-def _noise_factors(
-    system: ConstrainedSystem,
-    at: States,
-    measurement: Measurement,
-    z: AffineMap,
-    force_noise: ForceNoise | None,
-    state_std: Tensor | None,
-) -> list[Tensor]:
-    """Factors `(n, d, k)` of the covariance of the noise beside that of the sensor."""
-    parts = []
-    if force_noise is not None:
-        parts.append(z.B_Q * force_noise(at).sqrt()[:, None, :])
-    if state_std is not None and (G := state_jacobian(system, measurement)) is not None:
-        parts.append(G * state_std)
-    return parts
 
 
 def combine(rows: Sequence[WhitenedRows]) -> WhitenedRows:

@@ -25,7 +25,6 @@ from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.quantities import affine_map
-from forcegp.forces.state_noise import state_jacobian
 
 STEPS = 5
 """Steps of the weights at given hyperparameters; each needs one posterior."""
@@ -82,7 +81,7 @@ def _weights(
     """Weights of the samples of a measurement `(n,)`."""
     m, std = problem.training.measurements[i], problem.noise_at(values, i)
     system, force_noise, coulomb = problem.system_at(values), problem.force_noise(values), posterior.coulomb
-    found = []
+    factor, found = problem.state_factor(system, i), []
     for first in range(0, len(m.q), CHUNK_STATES):
         rows = torch.arange(first, min(first + CHUNK_STATES, len(m.q)), device=m.q.device)
         part = m[rows]
@@ -93,8 +92,8 @@ def _weights(
         noise = torch.diag_embed((std if std.ndim == 1 else std[rows]).square().expand_as(part.values))
         if force_noise is not None:
             noise = noise + (z.B_Q * force_noise(at)[:, None, :]) @ z.B_Q.mT
-        if problem.state_std is not None and (G := state_jacobian(system, part)) is not None:
-            noise = noise + (G * problem.state_std.square()) @ G.mT
+        if factor is not None:
+            noise = noise + factor[rows] @ factor[rows].mT
         residual = part.values - mean
         square = residual[..., None] * residual[:, None, :] + spread
         L = torch.linalg.cholesky(noise)

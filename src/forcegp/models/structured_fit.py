@@ -21,6 +21,7 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
 from forcegp.forces.samples import draw_samples
+from forcegp.forces.state_noise import learned_slopes
 from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
@@ -140,6 +141,7 @@ class StructuredFit(FittedModel):
         The cost of a sparse fit does not depend on how many it has seen; that of an exact one grows with the
         square of their number.
         """
+        measurements = self.with_slopes(measurements)
         problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
         latent, central = self.posterior.latent, self.posterior.central
@@ -150,10 +152,14 @@ class StructuredFit(FittedModel):
         if isinstance(latent, SparsePosterior):
             return dataclasses.replace(self, posterior=posterior)
         noise = [problem.noise_at(self.hyperparameters, i) for i in range(len(measurements.measurements))]
-        whole = dataclasses.replace(
-            self.problem, training=self.training.joined(measurements.measurements, noise)
-        )
+        whole = dataclasses.replace(self.problem, training=self.training.joined(measurements, noise))
         return dataclasses.replace(self, problem=whole, posterior=posterior)
+
+    def with_slopes(self, measurements: Training) -> Training:
+        """Other measurements, with the slopes of the learned forces where the fit has them."""
+        if self.training.slopes is None:
+            return measurements
+        return learned_slopes(measurements, self.system, self.posterior)
 
     def _problem_of(self, measurements: Training) -> Problem:
         """The problem with other measurements and the learned robot, whose mechanics are compiled."""

@@ -267,7 +267,7 @@ class StructuredGP(Model[StructuredFit]):
                 hint='call fit(data, learn=["noise"]), which learns the noise alone',
             )
         values = fitted.hyperparameters if hyperparameters is None else hyperparameters
-        spec = self.specification
+        spec, training = self.specification, fitted.with_slopes(training)
         problem = prepared(spec, dataclasses.replace(fitted.problem, training=training), values)
         return self.adopt(conditioned(spec, problem, values, warnings=doubts))
 

@@ -36,6 +36,7 @@ from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.robot_update import with_updated_robot
+from forcegp.forces.slopes import with_learned_slopes, without_slopes
 from forcegp.forces.start import Search, initial
 from forcegp.forces.student_t import left_out, weighted
 from forcegp.forces.torque_noise import TORQUE_NOISE
@@ -288,6 +289,9 @@ def solve(
         part = dataclasses.replace(part, power=FIRST_POWER)
     learned, learned_on = search.solve(part, progress, begin), part.training.samples
     values = {**search.held, **learned.tensors}
+    if not is_sparse(spec.inference, part.priors, problem.training.all_samples):
+        part, learned = with_learned_slopes(part, search, learned, progress)
+        values = {**search.held, **learned.tensors}
     if spec.degrees_of_freedom is not None:
         for _ in range(ROUNDS):
             part = weighted(part, values, spec.degrees_of_freedom)
@@ -302,7 +306,8 @@ def solve(
         values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
     if correlated:
         part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
-    whole = dataclasses.replace(part, training=problem.training, inducing=None)
+    training = dataclasses.replace(problem.training, slopes=part.training.slopes)
+    whole = dataclasses.replace(part, training=training, inducing=None)
     whole = prepared(spec, whole, values)
     warnings = ()
     if spec.degrees_of_freedom is not None and (count := left_out(whole)):
@@ -327,6 +332,7 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """The problem with the inference that its samples ask for, and their weights under heavy-tailed noise."""
     if is_sparse(spec.inference, problem.priors, problem.training.all_samples):
+        problem = without_slopes(problem)
         if is_finite(problem.priors):
             problem = without_inducing(problem)
         else:

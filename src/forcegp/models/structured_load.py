@@ -128,7 +128,12 @@ def _training(settings: StructuredSettings, spec: Specification, tensors: Mappin
         for i, (m, w) in enumerate(zip(measurements, weights, strict=True)):
             if w.shape != m.t.shape or not bool((w > 0.0).all()):
                 raise ValueError(f"tensor 'data.{i}.weight' has shape {tuple(w.shape)}, or is not positive")
-    return Training(tuple(measurements), tuple(noise), scales, weights=weights)
+    slopes = tuple(tensors.get(f"data.{i}.slope") for i in range(len(measurements)))
+    for i, (m, G) in enumerate(zip(measurements, slopes, strict=True)):
+        if G is not None and G.shape != (*m.values.shape, 2 * m.q.shape[-1]):
+            raise ValueError(f"tensor 'data.{i}.slope' has shape {tuple(G.shape)}")
+    kept = None if all(G is None for G in slopes) else slopes
+    return Training(tuple(measurements), tuple(noise), scales, weights=weights, slopes=kept)
 
 
 def _check_hyperparameters(spec: Specification, training: Training, hyper: Mapping[str, Tensor]) -> None:

@@ -309,6 +309,8 @@ def _tensors_of(training: Training, in_time: bool) -> dict[str, Tensor]:
         tensors[f"data.{i}.noise_std"] = std
         if training.weights is not None:
             tensors[f"data.{i}.weight"] = training.weights[i]
+        if training.slopes is not None and (G := training.slopes[i]) is not None:
+            tensors[f"data.{i}.slope"] = G
     return tensors
 
 

@@ -1,0 +1,64 @@
+"""Noise of the state under the forces that were learned: their slopes and their hyperparameters in turn.
+
+The first fit carries the noise of the state through the equations of motion of the robot file
+(`state_noise.py`). They lack what was not known of the forces: a spring of 100 N m/rad turns a noise of
+1 mrad into 0.1 N m. So, as McHutchon and Rasmussen (*Gaussian process training with input noise*, 2011),
+take the slope of the posterior mean F̄ at each sample, and learn again with
+
+    cov(y_i) = Σ_y + G_i Σ_x G_iᵀ,   G_i = ∂(L b + H F̄)/∂(q, q̇) + H ∂F̄/∂(q, q̇),
+
+where the first derivative is at fixed F̄; likewise for multipliers. The posterior mean may be worse than the
+file, such as far from other samples, so slopes are kept only where the evidence of the training data, with
+the weak priors, grows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from forcegp.forces.inference import force_posterior
+from forcegp.forces.learn import Problem
+from forcegp.forces.start import Search
+from forcegp.forces.state_noise import learned_slopes
+from forcegp.gp.optimise import Learned, Progress
+
+ROUNDS = 3
+"""Rounds of slopes and hyperparameters."""
+GROWTH = 1.0
+"""Growth of the log evidence below which rounds end."""
+
+
+def with_learned_slopes(
+    problem: Problem, search: Search, learned: Learned, progress: Progress | None = None
+) -> tuple[Problem, Learned]:
+    """The problem with the slopes of its forces, and what is learned with them.
+
+    Where there is no noise of the state, or a force is a function of time, everything stays as it is.
+
+    Args:
+        problem: exact, with the slopes of the robot file.
+        search: what is learned and what is held.
+        learned: what was learned of the problem.
+        progress: called after each evaluation.
+    """
+    if problem.state_std is None or any(prior.in_time for prior in problem.priors):
+        return problem, learned
+    for _ in range(ROUNDS):
+        values = {**search.held, **learned.tensors}
+        posterior, system = force_posterior(problem, values), problem.system_at(values)
+        training = learned_slopes(problem.training, system, posterior)
+        again = dataclasses.replace(problem, training=training)
+        found = search.solve(again, progress, learned.tensors)
+        growth = learned.value - found.value
+        if growth > 0.0:
+            problem, learned = again, found
+        if growth < GROWTH:
+            break
+    return problem, learned
+
+
+def without_slopes(problem: Problem) -> Problem:
+    """The problem with the slopes of the robot file."""
+    if problem.training.slopes is None:
+        return problem
+    return dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))
