@@ -96,7 +96,8 @@ def main() -> None:
     for case in (case for maker in makers for case in maker(seeds)):
         if options.group is None or case.group in options.group:
             report = check(*case.make())
-            alarms = {f.kind: f.message for f in report.findings if f.severity != "note"}
+            serious = (finding for finding in report.findings if finding.severity != "note")
+            alarms = {kind: finding.message for finding in serious for kind in finding.kinds}
             result[case.name] = {k: v for k, v in alarms.items() if k not in TRUE.get(case.scene, ())}
             print(case.name, result[case.name] or "silent", flush=True)
     false = sum(bool(alarms) for alarms in result.values())

@@ -347,12 +347,22 @@ def _one_line(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, L
 
 
 def serious(report: Report) -> set[str]:
-    """Kinds of the warnings and errors of a report."""
-    return {finding.kind for finding in report.findings if finding.severity != "note"}
+    """Kinds of the warnings and errors of a report, alternatives among them."""
+    return {kind for finding in report.findings if finding.severity != "note" for kind in finding.kinds}
 
 
 def found(fault: Fault, report: Report, log: Log, rows: Rows) -> bool:
-    """Whether a report holds the fault: its kind, its joint, and half of its rows with few others."""
+    """Whether a report holds the fault: its kind, its joint, and half of its rows with few others.
+
+    A finding that names the fault as one of its alternatives holds it.
+    """
+    return is_named(fault, report, log, rows) or any(
+        _is(fault, other, log, rows) for finding in report.findings for other in finding.alternatives
+    )
+
+
+def is_named(fault: Fault, report: Report, log: Log, rows: Rows) -> bool:
+    """Whether a finding is the fault, not one of its alternatives."""
     return any(_is(fault, finding, log, rows) for finding in report.findings)
 
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import forcegp
-from forcegp.checks import Report, check, visibility
+from forcegp.checks import Report, check, log_of, visibility
 from forcegp.constraints import ConstrainedSystem
-from forcegp.simulate import make_engine
+from forcegp.scene import load_scene
+from forcegp.simulate import make_engine, simulate
 from planted_faults import FAULTS, REAL, Case, Fault, found, free_log, real_iiwa, real_pendulum, serious
 
+SOLVER: dict[str, Any] = {"engine": "mujoco", "contact": "solver"}
 needs_real = pytest.mark.skipif(not REAL.is_dir(), reason="the published logs are not here")
 
 
@@ -59,6 +63,39 @@ def test_a_fault_of_a_contact_is_found(touching: Case, fault: Fault) -> None:
     assert found(fault, report, log, rows), _told(report)
 
 
+PUSH, CURRENT = "a push of 120 rows, 20 to 0.3 N m", "current, at 14 to 6 N m/A"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "solver", "name"), [("pendulum_wire", {}, PUSH), ("panda_tilted", SOLVER, CURRENT)]
+)
+def test_a_fault_is_found_where_little_torque_is_left(scene: str, solver: dict, name: str) -> None:
+    """A push along a wire leaves one torque of two; friction makes most of the torque of light wrists."""
+    case = _lifting(scene, seed=11, **solver)
+    fault = next(fault for fault in FAULTS if fault.name == name)
+    system, log, rows = fault.plant(*case)
+    report = check(system, log)
+    assert found(fault, report, log, rows), _told(report)
+
+
+@pytest.mark.slow
+def test_a_wrist_that_sticks_and_slips_is_no_disturbance() -> None:
+    """Joint 5 of this arm hardly moves; when it breaks loose, its dry friction is in the torque."""
+    case = _lifting("panda_sphere", seed=6, lift_probability=0.2, joint_friction=False, **SOLVER)
+    assert serious(check(*case)) <= {"joint-still"}
+
+
+def _lifting(scene: str, joint_friction: bool = True, **settings: Any) -> Case:
+    """A bundled scene in which the tip is lifted now and then."""
+    loaded = load_scene(scene)
+    config = replace(loaded.simulation, **{"duration": 14.0, "lift_probability": 0.15, **settings})
+    if not joint_friction:
+        config = replace(config, solver=replace(config.solver, joint_friction=(), joint_damping=()))
+    system = loaded.system()
+    return system, log_of(simulate(system, config).data)
+
+
 TRUE_OF_IIWA = {"friction-undeclared", "torque-offset", "joint-still"}
 """The robot file declares more damping than the sensors see, they have offsets, and joint 1 hardly moves."""
 ON_IIWA = (
@@ -68,6 +105,7 @@ ON_IIWA = (
     "joints exchanged",
     "current, at 14 to 6 N m/A",
     "torque less gravity",
+    "masses × 0.6 and × 1.5",
 )
 
 

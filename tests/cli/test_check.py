@@ -14,10 +14,13 @@ import torch
 from typer.testing import CliRunner
 
 import forcegp
-from forcegp.checks import KINDS, Log
+from forcegp import checks
+from forcegp.checks import KINDS, Finding, Log, Report
+from forcegp.checks.alternatives import with_alternatives
 from forcegp.cli import app
 from planted_faults import free_log
 
+KINDS_OF_ONE = ("torque-gain", "masses-mismatch")
 SCENE = '[robot]\nmodel = "double_pendulum"\n'
 
 
@@ -85,6 +88,21 @@ def test_the_page_holds_all_and_fetches_nothing(folder: Path, log: Log) -> None:
         assert kind in text and KINDS[kind].remedy.split("/")[0] in text
     assert "verdict: stop" in text and text.count("data:image/svg+xml") >= 4
     assert "http://" not in text.replace("http://www.w3.org", "") and "<script" not in text
+
+
+def test_alternatives_are_shown_together(folder: Path, log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    def both(*_: object, **__: object) -> Report:
+        first, second = (Finding(kind, f"says {kind}", log.all_rows) for kind in KINDS_OF_ONE)
+        return Report((with_alternatives(first, [second]),), len(log), log.joint_names)
+
+    monkeypatch.setattr(checks, "check", both)
+    done = run(folder, log, "--out", str(folder / "check.html"))
+    page = (folder / "check.html").read_text()
+    for text in (done.stdout, page):
+        assert all(kind in text and f"says {kind}" in text for kind in KINDS_OF_ONE)
+    assert "hang a known weight" in page and "Torque scaled wrongly, or inertial parameters" in page
+    result = json.loads(run(folder, log, "--json").stdout)["findings"][0]
+    assert result["kind"] == KINDS_OF_ONE[0] and result["alternatives"][0]["kind"] == KINDS_OF_ONE[1]
 
 
 def test_the_function_takes_a_data_set(log: Log) -> None:

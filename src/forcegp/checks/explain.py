@@ -14,6 +14,7 @@ from functools import partial
 
 import numpy as np
 
+from forcegp.checks.alternatives import Tried, alternatives_of, with_alternatives
 from forcegp.checks.diagnosis import corrected, finding_of, plausible
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import Fit, Problem, cross_validate, gain_of, pooled_gain_of, score_of
@@ -22,6 +23,7 @@ from forcegp.checks.hypotheses import (
     ROBOT,
     Hypothesis,
     continuous,
+    current_hypothesis,
     delays,
     discrete,
     encoder_hypothesis,
@@ -46,6 +48,8 @@ SHARE = 0.03
 """Share of the best drop that a simpler hypothesis may leave to a second round."""
 SAME = 1e-3
 """Relative difference of errors that are equal."""
+DETERMINED = 3.0
+"""Standard errors of a gain from which it is known at all."""
 MATERIAL = 0.15
 """Drop of Σ_j log error that matters: 14 % less error in one joint."""
 MATERIAL_EACH = 0.05
@@ -78,6 +82,21 @@ class Explanation:
     rows: np.ndarray
 
 
+@dataclass(frozen=True)
+class Choice:
+    """The hypothesis that one round accepts.
+
+    Attributes:
+        tried: the hypothesis and its fit.
+        alike: joints of those of its kind that explain exactly as much.
+        alternatives: hypotheses of other kinds or joints that the log cannot tell from it.
+    """
+
+    tried: Tried
+    alike: tuple[int, ...]
+    alternatives: tuple[Tried, ...]
+
+
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     """Find the faults that explain the torque that the robot file leaves."""
     rows = log.rows(ROWS, margin=max(LAGS))
@@ -88,9 +107,10 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
         chosen = _best(system, log, rows, problem, kept, prior, taken)
         if chosen is None:
             break
-        hypothesis, fit, alike = chosen
-        found = finding_of(system, log, hypothesis, fit, alike)
-        findings += found
+        hypothesis, fit = chosen.tried
+        (found,) = finding_of(system, log, hypothesis, fit, chosen.alike)
+        others = [one for pair in chosen.alternatives for one in finding_of(system, log, *pair)]
+        findings.append(with_alternatives(found, others))
         taken.add((hypothesis.name, hypothesis.joints))
         if hypothesis.name not in ROBOT:
             theta = fit.theta
@@ -138,23 +158,20 @@ def _best(
     kept: Array,
     prior: Array,
     taken: set,
-) -> tuple[Hypothesis, Fit, tuple[int, ...]] | None:
-    """The simplest hypothesis within one standard error of the best, if it explains enough.
-
-    The third result lists the joints of those of its kind that explain exactly as much.
-    """
+) -> Choice | None:
+    """The simplest hypothesis within one standard error of the best, if it explains enough."""
     null = cross_validate(problem, kept, prior)
     tried = [
         (hypothesis, fit)
         for hypothesis, fit in _fits(system, log, rows, problem, kept, prior)
         if (hypothesis.name, hypothesis.joints) not in taken
     ]
-    good = []
-    for hypothesis, fit in tried:
-        if significant(fit.shares, null.shares, len(hypothesis.joints) or log.nq) and plausible(
-            system, hypothesis, fit
-        ):
-            good.append((hypothesis, fit))
+    tried = [(hypothesis, fit) for hypothesis, fit in tried if plausible(system, hypothesis, fit)]
+    good = [
+        (hypothesis, fit)
+        for hypothesis, fit in tried
+        if significant(fit.shares, null.shares, len(hypothesis.joints) or log.nq)
+    ]
     if not good:
         return None
     best = min(good, key=lambda pair: pair[1].score.mean())
@@ -165,7 +182,8 @@ def _best(
             near.append((hypothesis, fit))
     chosen, fit = min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
     alike = [h.joints for h, other in near if h.name == chosen.name and _same(other, fit)]
-    return chosen, fit, tuple(dict.fromkeys(j for joints in alike for j in joints))
+    others = tuple(alternatives_of(system, (chosen, fit), tried, null))
+    return Choice((chosen, fit), tuple(dict.fromkeys(j for joints in alike for j in joints)), others)
 
 
 def _same(fit: Fit, other: Fit) -> bool:
@@ -193,6 +211,18 @@ def _fits(
     if len(off) > 1:
         together = gain_hypothesis(log, rows, tuple(off))
         yield together, _fit(problem, together, kept, prior)
+    if 2 * len(off) > log.nq > 1:
+        yield from _currents(log, rows, problem, kept, prior)
+
+
+def _currents(log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: Array) -> Iterator[Tried]:
+    """Where most torques are scaled wrongly, all may be: gains of all joints that the log determines."""
+    fit = _fit(problem, current_hypothesis(log, rows, problem, tuple(range(log.nq))), kept, prior)
+    gains = 1.0 + fit.theta[: log.nq]
+    known = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[: log.nq])
+    if 2 * len(known) > log.nq:
+        hypothesis = current_hypothesis(log, rows, problem, tuple(int(j) for j in known))
+        yield hypothesis, _fit(problem, hypothesis, kept, prior)
 
 
 def _fit(problem: Problem, hypothesis: Hypothesis, kept: Array, prior: Array) -> Fit:
@@ -200,7 +230,8 @@ def _fit(problem: Problem, hypothesis: Hypothesis, kept: Array, prior: Array) ->
     assert hypothesis.columns is not None and hypothesis.prior is not None
     columns = np.concatenate([hypothesis.columns, kept], axis=-1)
     gains = hypothesis.joints if hypothesis.name == "gains" else ()
-    return cross_validate(problem, columns, np.concatenate([hypothesis.prior, prior]), gains)
+    every = np.concatenate([hypothesis.prior, prior])
+    return cross_validate(problem, columns, every, gains, hypothesis.instruments)
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:

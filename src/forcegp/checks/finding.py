@@ -27,6 +27,8 @@ class Finding:
         contact: the contact concerned, if one is.
         evidence: the numbers behind the message, by name.
         weight: severity where it differs from that of the kind.
+        alternatives: what else explains the log as well, so that only one of them need be true.
+        told_apart_by: what would tell them apart.
 
     Raises:
         UnknownNameError: no such kind.
@@ -39,6 +41,8 @@ class Finding:
     contact: str | None = None
     evidence: Mapping[str, SupportsFloat] = field(default_factory=dict)
     weight: Severity | None = None
+    alternatives: tuple[Finding, ...] = ()
+    told_apart_by: str | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -46,13 +50,26 @@ class Finding:
 
     @property
     def severity(self) -> Severity:
-        """`"error"` makes a fit worthless, `"warning"` biases it, `"note"` is worth knowing."""
-        return self.weight or KINDS[self.kind].severity
+        """`"error"` makes a fit worthless, `"warning"` biases it, `"note"` is worth knowing.
+
+        Of alternatives the lightest counts: it is not certain that the log is worse than that.
+        """
+        own: Severity = self.weight or KINDS[self.kind].severity
+        every = {own, *(other.severity for other in self.alternatives)}
+        return next(severity for severity in reversed(SEVERITIES) if severity in every)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Its kind and those of its alternatives, each once."""
+        return tuple(dict.fromkeys((self.kind, *(other.kind for other in self.alternatives))))
 
     @property
     def remedy(self) -> str:
-        """What to do about it."""
-        return KINDS[self.kind].remedy
+        """What to do about it; where there are alternatives, once it is known which is true."""
+        if not self.alternatives:
+            return KINDS[self.kind].remedy
+        each = "; ".join(f"{kind}: {KINDS[kind].remedy}" for kind in self.kinds)
+        return f"{self.told_apart_by}; then {each}" if self.told_apart_by else each
 
     @property
     def rows(self) -> int:
@@ -70,6 +87,8 @@ class Finding:
             "joints": list(self.joints),
             "contact": self.contact,
             "evidence": {name: float(value) for name, value in self.evidence.items()},
+            "alternatives": [other.to_dict() for other in self.alternatives],
+            "told_apart_by": self.told_apart_by,
         }
 
 

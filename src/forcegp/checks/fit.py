@@ -65,7 +65,11 @@ def blocks_of(n: int) -> Array:
 
 
 def cross_validate(
-    problem: Problem, columns: Array | None = None, prior: Array | None = None, gains: tuple[int, ...] = ()
+    problem: Problem,
+    columns: Array | None = None,
+    prior: Array | None = None,
+    gains: tuple[int, ...] = (),
+    instruments: Array | None = None,
 ) -> Fit:
     """Fit the nuisance and the columns of a hypothesis, and test them on held-out blocks.
 
@@ -76,10 +80,13 @@ def cross_validate(
         columns: Φ `(n, nq, p)`, or `None` for the nuisance alone.
         prior: s `(p,)`, how large parameters may be.
         gains: joints whose torque the first parameters scale.
+        instruments: Z `(n, nq, p)` in place of least squares: Zᵀ P (r − N η − Φ θ) = 0, for columns that hold
+            errors themselves (Wooldridge, *Introductory Econometrics*, ch. 15).
     """
     p = columns.shape[-1] if columns is not None else 0
     A, y, unit, weight = _equations(problem, columns, prior)
-    rest, thetas, whole = _held_out(A, y, weight)
+    Z = None if instruments is None else _with_instruments(A, problem, instruments)
+    rest, thetas, whole = _held_out(A, y, weight, Z)
     block = blocks_of(len(y))
     error = np.stack([np.sqrt((rest[block == k] ** 2).mean(axis=0)) for k in range(BLOCKS)])
     # Jackknife: (K − 1)/K Σ (θ_k − mean)².
@@ -114,6 +121,16 @@ def _equations(
     return A / unit, y, unit, weight
 
 
+def _with_instruments(A: Array, problem: Problem, instruments: Array) -> Array:
+    """The columns with the leading ones replaced by their instruments, in the same units."""
+    Z = instruments / problem.scale[:, None]
+    if problem.J.any():
+        Z = projector(problem.J, problem.scale) @ Z
+    size = np.sqrt((Z**2).sum(axis=(0, 1)))
+    Z = Z / np.where(size > 0.0, size, np.inf)
+    return np.concatenate([Z, A[..., Z.shape[-1] :]], axis=-1)
+
+
 def robust_parameters(problem: Problem, columns: Array, prior: Array) -> Array:
     """Parameters of the columns and of the nuisance that rows with a large residual hardly move.
 
@@ -131,17 +148,20 @@ def robust_parameters(problem: Problem, columns: Array, prior: Array) -> Array:
     return theta / unit
 
 
-def _held_out(A: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
+def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tuple[Array, Array, Array]:
     """Residual of each block under the parameters of the others, these parameters, and those of all."""
-    block, rest = blocks_of(len(y)), np.zeros_like(y)
-    parts = [(A[block == k].reshape(-1, A.shape[-1]), y[block == k]) for k in range(BLOCKS)]
-    grams = np.stack([a.T @ a for a, _ in parts])
-    sides = np.stack([a.T @ b.ravel() for a, b in parts])
-    thetas = []
-    for k, (a, b) in enumerate(parts):
-        thetas.append(_solve(grams.sum(axis=0) - grams[k], sides.sum(axis=0) - sides[k], weight))
-        rest[block == k] = b - (a @ thetas[-1]).reshape(b.shape)
-    return rest, np.stack(thetas), _solve(grams.sum(axis=0), sides.sum(axis=0), weight)
+    block, rest, solve = blocks_of(len(y)), np.zeros_like(y), _solve if Z is None else _solve_instrumented
+    Z = A if Z is None else Z
+    grams, sides, thetas = [], [], []
+    for rows in (block == k for k in range(BLOCKS)):
+        a, z = (x[rows].reshape(-1, A.shape[-1]) for x in (A, Z))
+        grams.append(z.T @ a)
+        sides.append(z.T @ y[rows].ravel())
+    gram, side = np.sum(grams, axis=0), np.sum(sides, axis=0)
+    for k in range(BLOCKS):
+        thetas.append(solve(gram - grams[k], side - sides[k], weight))
+        rest[block == k] = y[block == k] - A[block == k] @ thetas[-1]
+    return rest, np.stack(thetas), solve(gram, side, weight)
 
 
 def held_out(problem: Problem, columns: Array, prior: Array) -> Array:
@@ -161,6 +181,11 @@ def _solve(gram: Array, side: Array, weight: Array) -> Array:
     from scipy.linalg import cho_factor, cho_solve
 
     return cho_solve(cho_factor(gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram))), side)
+
+
+def _solve_instrumented(gram: Array, side: Array, weight: Array) -> Array:
+    """The same where instruments take the place of columns, so that `gram` is not symmetric."""
+    return np.linalg.solve(gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram)), side)
 
 
 def score_of(shares: Array) -> Array:

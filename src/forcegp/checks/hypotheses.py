@@ -46,6 +46,7 @@ class Hypothesis:
         prior: `(p,)` how large the parameters may be.
         joints: indices of the joints concerned.
         shift: delay of the torque in samples.
+        instruments: `(n, nq, p)` in place of least squares on columns that hold errors.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Hypothesis:
     prior: Array | None = None
     joints: tuple[int, ...] = ()
     shift: int = 0
+    instruments: Array | None = None
 
 
 def problem_of(system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None) -> Problem:
@@ -174,6 +176,16 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
     """The torques of some joints have to be scaled: u − τ = g τ."""
     columns = _diagonal(log.tau[rows])[..., list(joints)]
     return Hypothesis("gains", len(joints), unchanged, columns, np.full(len(joints), 100.0), joints)
+
+
+def current_hypothesis(log: Log, rows: np.ndarray, problem: Problem, joints: tuple[int, ...]) -> Hypothesis:
+    """Gains with the torque that the motion needs as instrument, as where another quantity was logged.
+
+    The logged torque of light joints is mostly friction that no robot file describes. As a column it holds
+    errors, which make its gain too small (errors in variables), down to a torque that counts for nothing.
+    """
+    needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
+    return replace(gain_hypothesis(log, rows, joints), instruments=needed)
 
 
 def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:

@@ -48,7 +48,9 @@ LOUD = 4.0
 MOVING = 0.05
 """Share of the largest speed from which an arm moves."""
 VISIBLE = 0.1
-"""A disturbance is also this share of the joint's torque."""
+"""A disturbance is also this share of the joint's torque, beyond what dry friction of the joint may be."""
+ONE_SIGMA = 84.13
+"""Percentile one standard deviation above the median of a normal distribution."""
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -208,7 +210,8 @@ def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Fi
     width = max(1, round(DISTURBANCE_SECONDS / stride))
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
-    visible = any_row(np.abs(trace) > VISIBLE * told.problem.size)
+    friction = _dry_friction(system.robot, told, rows, width)
+    visible = any_row(np.abs(trace) > VISIBLE * told.problem.size + friction)
     bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)
@@ -240,10 +243,28 @@ def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
         usual = level[here & moving]
         if len(usual) < LEAST_ROWS:
             usual = level[moving]
-        spread = max(float(robust_std(usual)), 0.2)
-        most = np.median(usual) + DISTURBANCE * spread
+        most = np.median(usual) + DISTURBANCE * max(_spread(usual), 0.2)
         bad[here] = level[here] > min(most, np.percentile(usual, 90) + 2.0 * np.log(LOUD))
     return bad
+
+
+def _spread(level: Array) -> float:
+    """Standard deviation of the level, from its upper side alone where that is narrower.
+
+    Where a contact leaves one torque, the level is the log of a few squares: its lower tail is twice as long
+    as its upper one, and says nothing of how loud a row may be.
+    """
+    middle, upper = np.percentile(level, [50.0, ONE_SIGMA])
+    return float(min(robust_std(level), upper - middle))
+
+
+def _dry_friction(robot: RobotModel, told: Explanation, rows: np.ndarray, width: int) -> Array:
+    """Torque `(n, nq)` that dry friction may make at joints that rest or reverse within the window."""
+    from scipy.ndimage import minimum_filter1d
+
+    size = np.maximum(robot.friction.numpy() - told.fit.known[told.log.nq : 2 * told.log.nq], 0.0)
+    slowest = minimum_filter1d(np.abs(told.log.qd[rows]), 2 * width + 1, axis=0)
+    return size * (slowest < robot.friction_velocity.numpy())
 
 
 def residual_trace(system: ConstrainedSystem, told: Explanation, rows: np.ndarray) -> Array:

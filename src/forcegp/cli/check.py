@@ -88,7 +88,8 @@ def _print(report: Report) -> None:
             )
             # Joint and parameter names may hold brackets, which are no markup.
             body = Text(f"{finding.message}\n").append(f"→ {finding.remedy}", style="dim")
-            table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), finding.kind, rows, body)
+            kinds = "\nor ".join(finding.kinds)
+            table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), kinds, rows, body)
         Console().print(table)
     for name, reason in report.skipped.items():
         typer.echo(f"not checked: {name} ({reason})")

@@ -21,7 +21,7 @@ class Section:
 
     Attributes:
         finding: the finding.
-        title: its kind in words.
+        title: its kind in words, and those of its alternatives.
         rows: the rows in words.
         picture: what it looks like.
     """
@@ -46,7 +46,7 @@ def write_check(path: Path, title: str, report: Report, system: ConstrainedSyste
     """
     log = of_robot(log, system.robot)
     sections = [
-        Section(finding, KINDS[finding.kind].title, _rows(finding, report), picture_of(finding, system, log))
+        Section(finding, _title(finding), _rows(finding, report), picture_of(finding, system, log))
         for finding in report.findings
     ]
     overview = draw_overview(report) if report.findings else None
@@ -54,6 +54,10 @@ def write_check(path: Path, title: str, report: Report, system: ConstrainedSyste
         path, render("check.html.j2", title=title, report=report, sections=sections, overview=overview)
     )
     return path
+
+
+def _title(finding: Finding) -> str:
+    return ", or ".join(KINDS[kind].title for kind in finding.kinds)
 
 
 def _rows(finding: Finding, report: Report) -> str:

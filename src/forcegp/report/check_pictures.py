@@ -43,7 +43,7 @@ def draw_overview(report: Report) -> Picture:
         axes.set_xlim(0, report.samples)
         axes.set_xlabel("row")
 
-    kinds = ", ".join(finding.kind for finding in report.findings)
+    kinds = ", ".join(" or ".join(finding.kinds) for finding in report.findings)
     return draw(paint, (6.2, 0.7 + 0.22 * len(report.findings)), f"Rows concerned by each finding: {kinds}")
 
 
