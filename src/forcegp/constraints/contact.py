@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.linalg import vecdot
 from torch.nn.functional import normalize
 
 from forcegp import kinematics
@@ -45,7 +46,7 @@ class MovingPoint(NamedTuple):
     @classmethod
     def of(cls, position: Tensor, jacobian: Tensor, bias: Tensor, qd: Tensor) -> MovingPoint:
         """From what `kinematics.point_motion` gives, and q̇."""
-        rate = (jacobian @ qd[..., None])[..., 0]
+        rate = vecdot(jacobian, qd[..., None, :])
         return cls(
             position, rate[..., 3:], bias[..., 3:], jacobian[..., 3:, :], rate[..., :3], jacobian[..., :3, :]
         )
@@ -75,9 +76,8 @@ class ContactPoint:
     def sliding(self) -> tuple[Tensor, Tensor]:
         """Jacobian (1 − n nᵀ) J_E `(*batch, 3, nq)` and velocity (1 − n nᵀ) ṗ `(*batch, 3)` along the
         surface."""
-        n = self.unit_normal[..., None]
-        along = self.velocity - (n @ (n.mT @ self.velocity[..., None]))[..., 0]
-        return self.jacobian - n @ (n.mT @ self.jacobian), along
+        n, J, v = self.unit_normal, self.jacobian, self.velocity
+        return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
 
 
 class ConstraintTerms(NamedTuple):
@@ -180,7 +180,7 @@ class SurfaceContact(Constraint):
         surface = self.center_surface
         c, normal = surface.value(tip.position), surface.gradient(tip.position)
         A = normal[..., None, :] @ tip.jacobian
-        b = -((normal * tip.bias).sum(-1) + surface.curvature(tip.position, tip.velocity))
+        b = -(vecdot(normal, tip.bias) + surface.curvature(tip.position, tip.velocity))
         touching = ContactPoint(tip.position, tip.velocity, tip.jacobian, normal)
         if self.radius:
             # The material point that touches lies below the centre of the ball.

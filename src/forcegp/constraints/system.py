@@ -9,6 +9,7 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.linalg import vecdot
 
 from forcegp import dynamics, kinematics
 from forcegp.constraints.contact import Constraint, ConstraintTerms, MovingPoint
@@ -304,7 +305,7 @@ class ConstrainedSystem:
         c = torch.cat([empty, *(term.c for term in terms)], dim=-1)
         b = torch.cat([empty, *(term.b for term in terms)], dim=-1)
         A = torch.cat([none, *(term.A for term in terms)], dim=-2)
-        cd = (A @ qd[..., None])[..., 0]
+        cd = vecdot(A, qd[..., None, :])
         if self.baumgarte is not None:
             b = self.baumgarte.stabilized(b, c, cd)
         open_ = self.active_rows(active, q.shape[:-1]).logical_not()

@@ -156,6 +156,8 @@ def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
 
 def _checked_noise(noise: NoiseStd, quantity: str, values: Tensor) -> Tensor:
     """A noise as a tensor `(d,)` or `(n, d)`."""
+    if isinstance(noise, float) and 0.0 < noise < math.inf:
+        return values.new_full(values.shape[-1:], noise)
     try:
         std = torch.as_tensor(noise, dtype=values.dtype, device=values.device)
     except (TypeError, ValueError, RuntimeError) as cause:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.linalg import vecdot
 
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.errors import ModelError, ShapeError, UnknownNameError
@@ -145,7 +146,7 @@ def _left(C: Tensor, z: AffineMap) -> AffineMap:
 def _acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
     """q̈ = L b + H (Q + Q_z)."""
     H = at.eom.H
-    return AffineMap(H, H, torch.zeros_like(H), (at.eom.L @ at.eom.b[..., None])[..., 0])
+    return AffineMap(H, H, torch.zeros_like(H), vecdot(at.eom.L, at.eom.b[..., None, :]))
 
 
 def _free_acceleration(system: ConstrainedSystem, at: States) -> AffineMap:

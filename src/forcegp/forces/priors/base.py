@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 
 from torch import Tensor
+from torch.linalg import vecdot
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
@@ -140,7 +141,7 @@ def prior_rows(
     Returns:
         Kernel inputs and operators B(x) E(x) of each prior, with o(x) + B(x) m(x) as target.
     """
-    target = z.o + (z.B_Q @ mean(system, at)[..., None])[..., 0]
+    target = z.o + vecdot(z.B_Q, mean(system, at)[..., None, :])
     by_target = {CONTACT: z.B_z, CONSTRAINT: z.B_N}
     features, operators = [], []
     for prior in priors:

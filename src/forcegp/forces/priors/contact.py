@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from torch.linalg import vecdot
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
@@ -214,7 +215,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
     def directions(self, system: ConstrainedSystem, at: States) -> Tensor:
         J, v = at.eom.contact_points[self.contact].sliding
         square = v.square().sum(-1, keepdim=True)
-        against = -(J.mT @ v[..., None])[..., 0]
+        against = -vecdot(J, v[..., None], dim=-2)
         dry = against / (square + self.smoothing**2).sqrt()
         columns = {"viscous": against, "dry": dry}
         if set(self.terms) & set(LOADED):
