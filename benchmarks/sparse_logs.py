@@ -24,7 +24,7 @@ SECONDS, STRETCH, NOISE = 600.0, 3.0, 0.1
 """Simulated motion [s], duration of a held-out stretch [s], noise of accelerations [rad/s²]."""
 TESTED, EXACT = 2000, 1000
 """Test samples, evenly spaced over all that are held out; training samples of the exact fit."""
-UPDATE_POINTS = 90
+UPDATE_POINTS = 70
 """Inducing points of one prior with which a model on the plane has about 500 basis functions."""
 UPDATE_SIZES = (1, 10)
 """Samples that a model is updated with at a time."""
