@@ -68,3 +68,14 @@ def test_inputs_of_each_component_give_the_same_functions() -> None:
     w = torch.randn(K, draw.size, S, dtype=torch.float64, generator=generator)
     terms = sum(basis(x) @ own for basis, own in draw.terms(w))
     torch.testing.assert_close(terms, draw.basis(x) @ w, rtol=SAME, atol=SAME)
+
+
+@pytest.mark.parametrize(
+    "kernel", [Linear(shared=True), Linear(shared=True) * SquaredExponential(shared=True)]
+)
+def test_terms_take_inputs_of_each_component(kernel: Kernel) -> None:
+    params, generator = kernel.initial(K, {"qd": 2}), torch.Generator().manual_seed(0)
+    X, x = ({"qd": torch.randn(n, K, 2, dtype=torch.float64, generator=generator)} for n in (N, 7))
+    w = torch.randn(K, N, S, dtype=torch.float64, generator=generator)
+    terms = sum(basis(x) @ own for basis, own in kernel_terms(kernel, params, X, w))
+    torch.testing.assert_close(terms, kernel.covariance(params, x, X) @ w, rtol=SAME, atol=SAME)

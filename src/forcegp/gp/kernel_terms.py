@@ -13,7 +13,6 @@ from forcegp.gp.decomposition import split
 from forcegp.gp.features import Features, stacked
 from forcegp.gp.kernels import Kernel, Linear, Parameters, Product, Stationary, Sum, sub
 from forcegp.gp.pathwise import Basis
-from forcegp.gp.structured_covariance import points
 
 
 def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> list[tuple[Basis, Tensor]]:
@@ -65,13 +64,14 @@ def _common(kernel: Kernel, params: Parameters, X: Features) -> _Common | None:
         slope, bias = torch.exp(2.0 * params["log_slope_std"]), kernel.bias_std(params).square()
         to = (stacked(X, kernel.inputs) * slope).mT
         size = torch.exp(2.0 * params["log_std"]) if kernel.shared else torch.ones_like(bias)
-        return _Common(
-            lambda x: [
-                (stacked(x, kernel.inputs) @ to)[None],
-                to.new_ones(1, 1, 1).expand(1, points(x), to.shape[1]),
-            ],
-            [size, bias],
-        )
+
+        def functions(x: Features) -> list[Tensor]:
+            line = stacked(x, kernel.inputs) @ to
+            # Components that have inputs of their own have a line each.
+            lines = line if line.ndim == 3 else line[None]
+            return [lines, lines.new_ones(1, 1, 1).expand_as(lines)]
+
+        return _Common(functions, [size, bias])
     if isinstance(kernel, Product):
         left, right = (_common(getattr(kernel, side), sub(params, side), X) for side in ("left", "right"))
         if left is not None and right is not None:
