@@ -63,7 +63,8 @@ class CompiledMechanics:
         out = torch.empty(len(q), self._places[-1][0].stop, dtype=self._dtype)
         if len(q):
             self._kernel([given[name]().contiguous() for name in self._arrays], out)
-        return [out[:, place].reshape(*shape, *own) for place, own in self._places]
+        blocks = out.split([place.stop - place.start for place, _ in self._places], dim=1)
+        return [x.reshape(*shape, *own) for x, (_, own) in zip(blocks, self._places, strict=True)]
 
 
 def _forces(links: Links) -> list[np.ndarray]:

@@ -179,7 +179,7 @@ class SurfaceContact(Constraint):
         (tip,) = points
         surface = self.center_surface
         c, normal = surface.value(tip.position), surface.gradient(tip.position)
-        A = normal[..., None, :] @ tip.jacobian
+        A = vecdot(normal[..., None], tip.jacobian, dim=-2)[..., None, :]
         b = -(vecdot(normal, tip.bias) + surface.curvature(tip.position, tip.velocity))
         touching = ContactPoint(tip.position, tip.velocity, tip.jacobian, normal)
         if self.radius:

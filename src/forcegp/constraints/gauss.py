@@ -101,8 +101,8 @@ class Equations:
             return W.mT
         if W.shape[-2] == 1:
             square = W.square().sum(-1, keepdim=True)
-            inactive = square == 0.0
-            return torch.where(inactive, 0.0, W / torch.where(inactive, 1.0, square)).mT
+            # An inactive row is zero, and stays so.
+            return (W / square.masked_fill(square == 0.0, 1.0)).mT
         return torch.linalg.pinv(W, rtol=rank_tolerance(W.dtype))
 
     @cached_property

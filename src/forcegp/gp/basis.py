@@ -120,9 +120,14 @@ class ProcessBasis:
 
     def rest_variance(self, features: Features) -> Tensor:
         """Prior variance of the part that inducing points approximate, `(components, n)`."""
-        if self.split.rest is None:
+        if self._variance is None:
             return next(iter(features.values())).new_zeros(self.components, points(features))
-        return self.split.rest.kernel.diagonal(self._rest_params, features)
+        return self._variance(features)
+
+    @cached_property
+    def _variance(self) -> Callable[[Features], Tensor] | None:
+        rest = self.split.rest
+        return None if rest is None else rest.kernel.variance(self._rest_params)
 
     @cached_property
     def _rest_params(self) -> dict[str, Tensor]:

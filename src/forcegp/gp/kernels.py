@@ -47,7 +47,7 @@ class Kernel(ABC):
         Args:
             outputs: number of outputs.
             widths: columns of each feature.
-            log_std: logarithm of the standard deviation of the functions, one or one an output.
+            log_std: logarithm of the standard deviation of the functions, one, or one per output.
         """
 
     @abstractmethod
@@ -59,8 +59,12 @@ class Kernel(ABC):
         return self.towards(params, x2)(x1)
 
     @abstractmethod
+    def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
+        """x ↦ k(x, x) `(k, n)`, with what depends on the hyperparameters alone computed once."""
+
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         """k(x, x) `(k, n)`."""
+        return self.variance(params)(x)
 
     @abstractmethod
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
@@ -140,9 +144,9 @@ class Linear(Kernel):
         b, bias = (stacked(x2, self.inputs) * slope).mT, self.bias_std(params).square()[:, None, None]
         return lambda x1: (stacked(x1, self.inputs) * slope) @ b + bias
 
-    def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        scaled = stacked(x, self.inputs) * self.slope_std(params)[:, None, :]
-        return (scaled * scaled).sum(-1) + self.bias_std(params).square()[:, None]
+    def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
+        slope, bias = self.slope_std(params)[:, None, :], self.bias_std(params).square()[:, None]
+        return lambda x: (stacked(x, self.inputs) * slope).square().sum(-1) + bias
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         return draws.LinearDraw(self.inputs, self.slope_std(params), self.bias_std(params))
@@ -166,8 +170,9 @@ class Constant(Kernel):
         variance, n2 = (self._std(params) ** 2)[:, None, None], stacked(x2, None).shape[-2]
         return lambda x1: variance.expand(-1, stacked(x1, None).shape[-2], n2)
 
-    def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        return (self._std(params) ** 2)[:, None].expand(-1, stacked(x, None).shape[-2])
+    def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
+        variance = (self._std(params) ** 2)[:, None]
+        return lambda x: variance.expand(-1, stacked(x, None).shape[-2])
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         return draws.ConstantDraw(self._std(params))
@@ -209,8 +214,9 @@ class Stationary(Kernel):
 
         return covariance
 
-    def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        return torch.exp(2.0 * params["log_std"])[:, None].expand(-1, len(next(iter(x.values()))))
+    def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
+        variance = torch.exp(2.0 * params["log_std"])[:, None]
+        return lambda x: variance.expand(-1, len(next(iter(x.values()))))
 
     @abstractmethod
     def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
@@ -296,9 +302,9 @@ class Sum(Kernel):
         right = self.right.towards(sub(params, "right"), x2)
         return lambda x1: self.combined(left(x1), right(x1))
 
-    def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        left = self.left.diagonal(sub(params, "left"), x)
-        return self.combined(left, self.right.diagonal(sub(params, "right"), x))
+    def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
+        left, right = self.left.variance(sub(params, "left")), self.right.variance(sub(params, "right"))
+        return lambda x: self.combined(left(x), right(x))
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         return draws.SumDraw(*self._drawn(params, features, generator))

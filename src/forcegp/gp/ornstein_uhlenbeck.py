@@ -63,8 +63,9 @@ class OrnsteinUhlenbeck(Kernel):
 
         return covariance
 
-    def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        return torch.exp(2.0 * params["log_std"])[:, None].expand(-1, points(x))
+    def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
+        variance = torch.exp(2.0 * params["log_std"])[:, None]
+        return lambda x: variance.expand(-1, points(x))
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         # The spectral density is a Cauchy density. Over uniform frequencies u, the mean of cos(u(s − s′)) is
