@@ -125,8 +125,7 @@ def test_slopes_are_saved_and_go_on(tmp_path: Path) -> None:
         model.predict(test.q, test.qd, test.tau).mean, again.predict(test.q, test.qd, test.tau).mean
     )
     more = measured(8, 20)[0]
-    updated = model.fitted.updated(model._training(more, ())[0])
-    G = updated.training.slopes
+    G = model.update(more).training.slopes
     assert G is not None and [len(own) for own in G if own is not None] == [SAMPLES, 20]
     conditioned = again.condition(more)
     assert conditioned.training.slopes is not None

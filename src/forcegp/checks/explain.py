@@ -220,7 +220,8 @@ def _currents(log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: 
     fit = _fit(problem, current_hypothesis(log, rows, problem, tuple(range(log.nq))), kept, prior)
     gains = 1.0 + fit.theta[: log.nq]
     known = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[: log.nq])
-    if 2 * len(known) > log.nq:
+    # A current has the sign of its torque; gains of both signs tell of something else.
+    if 2 * len(known) > log.nq and (gains[known] > 0.0).all():
         hypothesis = current_hypothesis(log, rows, problem, tuple(int(j) for j in known))
         yield hypothesis, _fit(problem, hypothesis, kept, prior)
 

@@ -52,9 +52,11 @@ class Finding:
     def severity(self) -> Severity:
         """`"error"` makes a fit worthless, `"warning"` biases it, `"note"` is worth knowing.
 
-        It is that of the finding itself, the simplest explanation, whatever the alternatives.
+        Of alternatives the lightest counts: it is not certain that the log is worse than that.
         """
-        return self.weight or KINDS[self.kind].severity
+        own: Severity = self.weight or KINDS[self.kind].severity
+        every = {own, *(other.severity for other in self.alternatives)}
+        return next(severity for severity in reversed(SEVERITIES) if severity in every)
 
     @property
     def kinds(self) -> tuple[str, ...]:

@@ -114,6 +114,8 @@ def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
 
 def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
     """The samples of each rank; where all share one, no copy is made of them."""
+    if not len(rank):
+        return []
     low, high = (int(value) for value in rank.aminmax())
     if low == high:
         return [(low, slice(None))]
