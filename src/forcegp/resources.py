@@ -1,6 +1,6 @@
-"""What work takes of the machine: memory, announced and refused before it is allocated, and threads.
+"""Memory and threads: a large allocation is announced, or refused, before it is made.
 
-Small tensors are computed on one thread, and SciPy computes on as many threads as PyTorch.
+Operations on small tensors run on one thread, and SciPy uses as many threads as PyTorch.
 """
 
 from __future__ import annotations

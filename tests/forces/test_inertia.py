@@ -167,7 +167,7 @@ def test_a_log_that_cannot_check_the_inertia_says_so(file: RobotModel, free: int
     data = data.replace(contact={"wire": torch.arange(len(data)) >= free})
     training = training_of(data, system, (prior,), None, {})
     doubts = inertia_of(system, prior, AnalyticalMean(), training).doubts
-    assert any(f"{free} samples in free motion" in doubt for doubt in doubts) == warns
+    assert any(f"{free} samples in free motion are too few" in doubt for doubt in doubts) == warns
     force = Observation(
         data.replace(contact_extras={"multiplier": {"wire": data.t}}), "multiplier", noise_std=0.5
     )

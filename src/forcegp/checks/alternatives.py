@@ -1,4 +1,4 @@
-"""Hypotheses that explain a log as well as the one that was chosen, and what would tell them apart."""
+"""Hypotheses that explain a log as well as the accepted one, and tests that tell them apart."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from forcegp.constraints import ConstrainedSystem
 
 Tried = tuple[Hypothesis, Fit]
 ALONE = 2.0
-"""Standard errors by which an alternative lowers the held-out error on its own: as something is known to be
-wrong, chance in 4 % of cases will do (Student's t, seven degrees of freedom)."""
+"""Standard errors by which an alternative must lower the held-out error on its own.
+
+The threshold is low (chance exceeds it in 4 % of cases), since it is already known that something is wrong.
+"""
 TESTS = {
     "torque-gain": "hang a known weight from the tip: its torque shows the gain, whatever the masses",
     "torque-current": "hang a known weight from the tip: its torque shows the gains, whatever the masses",
@@ -29,15 +31,16 @@ TESTS = {
     "payload-missing": "weigh what is mounted on the last link",
     "masses-mismatch": "compare the masses with those of the maker",
 }
-"""What shows whether a kind of fault is there, in the order in which it is tried."""
+"""A test for each kind of fault, in order of preference."""
 
 
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: Fit
 ) -> Iterator[Tried]:
-    """The hypotheses that held-out blocks cannot tell from the chosen one.
+    """The hypotheses that the held-out blocks cannot distinguish from the chosen one.
 
-    Each lowers the error on its own, within one standard error of as far as the chosen one, block by block.
+    Each lowers the error significantly, and by as much as the chosen one to within one standard error of the
+    difference over blocks.
     """
     for hypothesis, fit in tried:
         if _says_the_same(chosen[0], hypothesis):
@@ -49,21 +52,21 @@ def alternatives_of(
 
 
 def _says_the_same(chosen: Hypothesis, other: Hypothesis) -> bool:
-    """Whether a hypothesis is the chosen one with other numbers, or contains it, as masses contain a tool."""
+    """Whether a hypothesis has the kind and joints of the chosen one, or contains it, as masses do a tool."""
     if (chosen.name, other.name) == ("payload", "masses"):
         return True
     return other.name == chosen.name and (not other.joints or bool({*other.joints} & {*chosen.joints}))
 
 
 def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: Fit) -> bool:
-    """Whether every link has a positive mass, which masses that were merely fitted need not be."""
+    """Whether every link has a positive mass; the fit does not enforce it."""
     if hypothesis.name != "masses":
         return True
     return bool((system.robot.mass.numpy() + fit.theta[: 10 * system.robot.nq : 10] > 0.0).all())
 
 
 def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
-    """A finding that names what else it may be, if anything, and what would tell them apart."""
+    """The finding with its alternatives, if there are any, and a test that tells them apart."""
     found: list[Finding] = []
     for other in others:
         same = (f for f in (finding, *found) if f.kind == other.kind and {*f.joints} & {*other.joints})

@@ -49,7 +49,7 @@ SHARE = 0.03
 SAME = 1e-3
 """Relative difference of errors that are equal."""
 DETERMINED = 3.0
-"""Standard errors of a gain from which it is known at all."""
+"""A gain counts as known if it exceeds this many standard errors."""
 MATERIAL = 0.15
 """Drop of Σ_j log error that matters: 14 % less error in one joint."""
 MATERIAL_EACH = 0.05
@@ -216,11 +216,11 @@ def _fits(
 
 
 def _currents(log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: Array) -> Iterator[Tried]:
-    """Where most torques are scaled wrongly, all may be: gains of all joints that the log determines."""
+    """Gains of all joints that the log determines, tried where most torques are scaled wrongly."""
     fit = _fit(problem, current_hypothesis(log, rows, problem, tuple(range(log.nq))), kept, prior)
     gains = 1.0 + fit.theta[: log.nq]
     known = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[: log.nq])
-    # A current has the sign of its torque; gains of both signs tell of something else.
+    # A current has the sign of its torque, so gains of both signs have another cause.
     if 2 * len(known) > log.nq and (gains[known] > 0.0).all():
         hypothesis = current_hypothesis(log, rows, problem, tuple(int(j) for j in known))
         yield hypothesis, _fit(problem, hypothesis, kept, prior)

@@ -52,7 +52,7 @@ class Finding:
     def severity(self) -> Severity:
         """`"error"` makes a fit worthless, `"warning"` biases it, `"note"` is worth knowing.
 
-        Of alternatives the lightest counts: it is not certain that the log is worse than that.
+        A finding with alternatives has the lightest of their severities.
         """
         own: Severity = self.weight or KINDS[self.kind].severity
         every = {own, *(other.severity for other in self.alternatives)}
@@ -65,7 +65,7 @@ class Finding:
 
     @property
     def remedy(self) -> str:
-        """What to do about it; where there are alternatives, once it is known which is true."""
+        """What to do about it; with alternatives, the test that tells them apart and the remedy of each."""
         if not self.alternatives:
             return KINDS[self.kind].remedy
         each = "; ".join(f"{kind}: {KINDS[kind].remedy}" for kind in self.kinds)

@@ -122,7 +122,7 @@ def _equations(
 
 
 def _with_instruments(A: Array, problem: Problem, instruments: Array) -> Array:
-    """The columns with the leading ones replaced by their instruments, in the same units."""
+    """The columns, the leading ones replaced by their instruments, in the same units."""
     Z = instruments / problem.scale[:, None]
     if problem.J.any():
         Z = projector(problem.J, problem.scale) @ Z
@@ -184,7 +184,7 @@ def _solve(gram: Array, side: Array, weight: Array) -> Array:
 
 
 def _solve_instrumented(gram: Array, side: Array, weight: Array) -> Array:
-    """The same where instruments take the place of columns, so that `gram` is not symmetric."""
+    """Solve the instrumental equations, whose `gram` is not symmetric."""
     return np.linalg.solve(gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram)), side)
 
 

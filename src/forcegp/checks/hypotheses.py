@@ -179,10 +179,10 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
 
 
 def current_hypothesis(log: Log, rows: np.ndarray, problem: Problem, joints: tuple[int, ...]) -> Hypothesis:
-    """Gains with the torque that the motion needs as instrument, as where another quantity was logged.
+    """Gains of joints by instrumental variables; the instrument is the torque that the motion needs.
 
-    The logged torque of light joints is mostly friction that no robot file describes. As a column it holds
-    errors, which make its gain too small (errors in variables), down to a torque that counts for nothing.
+    The logged torque of a light joint is mostly friction that the robot file does not describe. Used as a
+    regressor, it contains errors, which bias its gain towards zero (errors in variables).
     """
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)

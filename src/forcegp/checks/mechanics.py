@@ -48,9 +48,9 @@ LOUD = 4.0
 MOVING = 0.05
 """Share of the largest speed from which an arm moves."""
 VISIBLE = 0.1
-"""A disturbance is also this share of the joint's torque, beyond what dry friction of the joint may be."""
+"""A disturbance must exceed this share of the joint's torque plus the dry friction of the joint."""
 ONE_SIGMA = 84.13
-"""Percentile one standard deviation above the median of a normal distribution."""
+"""Percentile of a normal distribution at one standard deviation above the mean."""
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -251,15 +251,15 @@ def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
 def _spread(level: Array) -> float:
     """Standard deviation of the level, from its upper side alone where that is narrower.
 
-    Where a contact leaves one torque, the level is the log of a few squares: its lower tail is twice as long
-    as its upper one, and says nothing of how loud a row may be.
+    If a contact leaves one free torque, the level is the logarithm of a few squares. Its lower tail is twice
+    as long as its upper one and says nothing about how large a residual is usual.
     """
     middle, upper = np.percentile(level, [50.0, ONE_SIGMA])
     return float(min(robust_std(level), upper - middle))
 
 
 def _dry_friction(robot: RobotModel, told: Explanation, rows: np.ndarray, width: int) -> Array:
-    """Torque `(n, nq)` that dry friction may make at joints that rest or reverse within the window."""
+    """Largest dry friction torque `(n, nq)` of joints that rest or reverse within the window, else zero."""
     from scipy.ndimage import minimum_filter1d
 
     size = np.maximum(robot.friction.numpy() - told.fit.known[told.log.nq : 2 * told.log.nq], 0.0)

@@ -103,11 +103,16 @@ def fit(
         for file in (checkpoint, beside(checkpoint)):
             file.unlink(missing_ok=True)
     _warn(fitted.result)
-    figures = {name: value for name, value in asdict(fitted.result).items() if name != "history"}
-    if not as_json:
-        # Warnings are printed above; only some models have a choice of inference.
-        figures = {name: value for name, value in figures.items() if name != "warnings" and value != ""}
+    figures = _figures(fitted.result, as_json)
     show({"model": regression.name, "training_points": len(training), **figures, "folder": str(out)}, as_json)
+
+
+def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
+    """The result by name; for a reader without the warnings, which were printed, and without empty fields."""
+    figures = {name: value for name, value in asdict(result).items() if name != "history"}
+    if as_json:
+        return figures
+    return {name: value for name, value in figures.items() if name != "warnings" and value != ""}
 
 
 def _check_places(out: Path, checkpoint: Path | None, data: list[Path]) -> None:

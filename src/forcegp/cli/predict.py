@@ -76,18 +76,17 @@ def predict(
     check_data_destination(out, data)
     regression = load_model(model)
     test = data_of_robot(read_data(data), regression.system.robot)
-    active = test.active(regression.system.contact_names)
-    means: list[Tensor] = []
-    stds: list[Tensor] = []
     if sensor and quantity != "multiplier":
         raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
+    active = test.active(regression.system.contact_names)
+    found = []
     with progress_bar(f"predicting {quantity}", len(test)) as progress:
         for first in range(0, len(test), CHUNK):
             rows = slice(first, first + CHUNK)
-            mean, std = _predicted(regression, test[rows], quantity, active[rows], noise, sensor)
-            means.append(mean)
-            stds += [std] if std is not None else []
+            found.append(_predicted(regression, test[rows], quantity, active[rows], noise, sensor))
             progress(min(first + CHUNK, len(test)))
+    means = [mean for mean, _ in found]
+    stds = [std for _, std in found if std is not None]
     test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", torch.cat(means))
     if stds:
         name = f"predicted_{quantity}_std"

@@ -87,15 +87,15 @@ def inertia_of(
 
 
 def _unchecked(training: Training) -> tuple[str, ...]:
-    """What a user is told of a log in contact that no free motion and no measured force goes with."""
+    """The warning for a log in contact with neither free motion nor a measured force."""
     closed = sum(int(m.active.any(-1).sum()) for m in training.measurements)
     if not closed or set(training.quantities) != {"qdd"}:
         return ()
     free = training.samples - closed
     return (
-        f"with {free} samples in free motion, the inertia of the robot file cannot be checked (expected: "
-        f"{LEAST} or more): the multiplier is off by as much as the masses are; add some seconds of free "
-        "motion to the log, or measure the contact force",
+        f"{free} samples in free motion are too few to check the masses of the robot file (expected: {LEAST} "
+        "or more), and any error of the masses biases the multiplier: add a few seconds of free motion to "
+        "the log, or measure the contact force",
     )
 
 

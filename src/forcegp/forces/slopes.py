@@ -1,15 +1,15 @@
-"""Noise of the state under the forces that were learned: their slopes and their hyperparameters in turn.
+"""Noise of the state propagated through the learned forces, alternating slopes and hyperparameters.
 
-The first fit carries the noise of the state through the equations of motion of the robot file
-(`state_noise.py`). They lack what was not known of the forces: a spring of 100 N m/rad turns a noise of
-1 mrad into 0.1 N m. So, as McHutchon and Rasmussen (*Gaussian process training with input noise*, 2011),
-take the slope of the posterior mean F̄ at each sample, and learn again with
+The first fit propagates the noise of the state through the equations of motion of the robot file
+(`state_noise.py`), which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m.
+Following McHutchon and Rasmussen (*Gaussian process training with input noise*, 2011), take the slope of the
+posterior mean F̄ at each sample and learn again with
 
     cov(y_i) = Σ_y + G_i Σ_x G_iᵀ,   G_i = ∂(L b + H F̄)/∂(q, q̇) + H ∂F̄/∂(q, q̇),
 
-where the first derivative is at fixed F̄; likewise for multipliers. The posterior mean may be worse than the
-file, such as far from other samples, so slopes are kept only where the evidence of the training data, with
-the weak priors, grows.
+where the first derivative is at fixed F̄; likewise for multipliers. The posterior mean can be worse than the
+robot file, for example far from other samples, so the slopes are kept only if the evidence of the training
+data, with the weak priors, increases.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from forcegp.forces.state_noise import learned_slopes
 from forcegp.gp.optimise import Learned, Progress
 
 ROUNDS = 3
-"""Rounds of slopes and hyperparameters."""
+"""Most rounds of slopes and hyperparameters."""
 GROWTH = 1.0
-"""Growth of the log evidence below which rounds end."""
+"""Increase of the log evidence below which the rounds end."""
 
 
 def with_learned_slopes(
     problem: Problem, search: Search, learned: Learned, progress: Progress | None = None
 ) -> tuple[Problem, Learned]:
-    """The problem with the slopes of its forces, and what is learned with them.
+    """The problem with the slopes of its learned forces, and what is learned with them.
 
-    Where there is no noise of the state, or a force is a function of time, everything stays as it is.
+    Nothing changes if a force is a function of time.
 
     Args:
-        problem: exact, with the slopes of the robot file.
+        problem: exact, with noise of the state and the slopes of the robot file.
         search: what is learned and what is held.
         learned: what was learned of the problem.
         progress: called after each evaluation.
     """
-    if problem.state_std is None or any(prior.in_time for prior in problem.priors):
+    if any(prior.in_time for prior in problem.priors):
         return problem, learned
     for _ in range(ROUNDS):
         values = {**search.held, **learned.tensors}

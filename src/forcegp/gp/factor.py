@@ -55,11 +55,11 @@ def cholesky(K: Tensor) -> tuple[Tensor, float]:
 def extended(L: Tensor, rows: Tensor) -> Tensor:
     """Lower factor of L Lᵀ + ΦᵀΦ, from the QR factorisation of Lᵀ above the rows Φ, in O(r n²).
 
-    Compiled where there is a C++ compiler, three to four times as fast for a few rows; else by LAPACK.
-    Its diagonal may be negative, which solves do not mind.
+    A compiled kernel does it where there is a C++ compiler, three to four times as fast as LAPACK for a few
+    rows. LAPACK may make diagonal entries negative, which is harmless in solves.
 
     Args:
-        L: lower factor on the CPU `(n, n)`, as fast as can be where its columns are contiguous.
+        L: lower factor on the CPU `(n, n)`; fastest if its columns are contiguous.
         rows: Φ `(r, n)`.
 
     Raises:

@@ -71,7 +71,7 @@ def posterior_of_tensors(
             expected=f"{basis.size} basis functions of {len(processes)} processes",
             got=f"{len(moments.v)} of {len(moments.prior)}",
         )
-    # Files keep rows; a factor has its columns side by side, as LAPACK leaves it.
+    # Files are row-major; the factor is kept column-major, as LAPACK returns it.
     return SparsePosterior(basis, moments, L.mT.contiguous().mT, jitter)
 
 

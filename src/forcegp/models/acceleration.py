@@ -33,9 +33,9 @@ class AccelerationFit(FittedModel):
         Args:
             q, qd, tau: `(*batch, nq)` states.
             quantity: `qdd`, the only one that this model knows.
-            active: without effect, since the model does not know of contacts.
+            active: ignored, since the model knows no contacts.
             covariance: whether to compute the covariance, where the model has one.
-            system: none but its own, since the model knows no forces.
+            system: must be the model's own, since the model knows no forces.
 
         Returns:
             Mean `(*batch, nq)` and covariance `(*batch, nq, nq)`, without measurement noise.

@@ -1,4 +1,4 @@
-"""How a fit went, and a model in one line and as a table for notebooks."""
+"""The result of a fit, and how models are shown: one line, or a table in notebooks."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class FitResult:
         message: why the optimiser stopped.
         history: the objective at each evaluation.
         force_correlation: mean posterior correlation of the joint force Q and the contact's force Q_z at
-            training
-            states: near −1 only their sum is identifiable, near 0 both are. `None` without priors on both.
+            training states: near −1 only their sum is identifiable, near 0 both are. `None` without priors on
+            both.
         warnings: doubts about the fit, each with a remedy.
         inference: `"exact"` or `"sparse"`, for models that have both.
         samples: number of samples that the model is conditioned on.
@@ -76,7 +76,7 @@ class FitResult:
 
 
 class HasResult:
-    """What has the result of a fit, whose fields are its own too."""
+    """Has the result of a fit and gives access to its fields."""
 
     result: FitResult
 

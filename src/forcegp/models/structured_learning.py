@@ -289,7 +289,9 @@ def solve(
         part = dataclasses.replace(part, power=FIRST_POWER)
     learned, learned_on = search.solve(part, progress, begin), part.training.samples
     values = {**search.held, **learned.tensors}
-    if not is_sparse(spec.inference, part.priors, problem.training.all_samples):
+    if part.state_std is not None and not is_sparse(
+        spec.inference, part.priors, problem.training.all_samples
+    ):
         part, learned = with_learned_slopes(part, search, learned, progress)
         values = {**search.held, **learned.tensors}
     if spec.degrees_of_freedom is not None:

@@ -1,1 +1,1 @@
-"""Code that is compiled on the user's machine, where there is a C++ compiler."""
+"""C++ code that is compiled on the user's machine, if there is a compiler."""

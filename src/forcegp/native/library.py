@@ -37,7 +37,7 @@ def find_compiler() -> str:
         if found := shutil.which(name):
             return found
     raise MissingDependencyError(
-        "the compiled dynamics need a C++ compiler and none was found",
+        "compiled kernels need a C++ compiler and none was found",
         expected=" or ".join(wanted) + " on the PATH",
         hint="install one (for example: apt install g++), set CXX, or use forcegp.dynamics, which needs none",
     )
