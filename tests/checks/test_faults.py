@@ -86,6 +86,13 @@ def test_a_wrist_that_sticks_and_slips_is_no_disturbance() -> None:
     assert serious(check(*case)) <= {"joint-still"}
 
 
+@pytest.mark.slow
+def test_torques_do_not_move_a_tip_off_its_surface() -> None:
+    """Torques of this log fit better with 2° added to joint 2, which takes the tip 17 mm off the board."""
+    case = _lifting("panda_tilted", seed=9, lift_probability=0.2, joint_friction=False, **SOLVER)
+    assert serious(check(*case)) == set()
+
+
 def _lifting(scene: str, joint_friction: bool = True, **settings: Any) -> Case:
     """A bundled scene in which the tip is lifted now and then."""
     loaded = load_scene(scene)

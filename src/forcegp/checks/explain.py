@@ -33,6 +33,7 @@ from forcegp.checks.hypotheses import (
     with_log,
 )
 from forcegp.checks.log import Log
+from forcegp.checks.placement import leaves_surface
 from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
 
@@ -166,7 +167,12 @@ def _best(
         for hypothesis, fit in _fits(system, log, rows, problem, kept, prior)
         if (hypothesis.name, hypothesis.joints) not in taken
     ]
-    tried = [(hypothesis, fit) for hypothesis, fit in tried if plausible(system, hypothesis, fit)]
+    tried = [
+        (hypothesis, fit)
+        for hypothesis, fit in tried
+        if plausible(system, hypothesis, fit)
+        and not leaves_surface(system, log, corrected(log, hypothesis, fit.theta))
+    ]
     good = [
         (hypothesis, fit)
         for hypothesis, fit in tried

@@ -243,12 +243,14 @@ def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
         usual = level[here & moving]
         if len(usual) < LEAST_ROWS:
             usual = level[moving]
-        most = np.median(usual) + DISTURBANCE * max(_spread(usual), 0.2)
+        closed = any(label[here].any() for label in labels)
+        spread = _upper_spread(usual) if closed else float(robust_std(usual))
+        most = np.median(usual) + DISTURBANCE * max(spread, 0.2)
         bad[here] = level[here] > min(most, np.percentile(usual, 90) + 2.0 * np.log(LOUD))
     return bad
 
 
-def _spread(level: Array) -> float:
+def _upper_spread(level: Array) -> float:
     """Standard deviation of the level, from its upper side alone where that is narrower.
 
     If a contact leaves one free torque, the level is the logarithm of a few squares. Its lower tail is twice

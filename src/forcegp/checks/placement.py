@@ -55,6 +55,22 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
     return [], log
 
 
+def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
+    """Whether changed angles take a tip off the surface in rows that are labelled as contact."""
+    if after.q is before.q:
+        return False
+    for contact in system.contacts:
+        if not isinstance(contact, SurfaceContact) or contact.name not in before.contact:
+            continue
+        rows = np.flatnonzero(before.contact[contact.name] & before.usable)
+        if len(rows) < LEAST_ROWS:
+            continue
+        rows = rows[:: max(1, len(rows) // ROWS)]
+        if _off(system, contact, before, rows) <= FAR < _off(system, contact, after, rows):
+            return True
+    return False
+
+
 def _explanation(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, most: float
 ) -> Outcome | None:
