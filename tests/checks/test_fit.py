@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from forcegp.checks.fit import Problem, cross_validate
-from forcegp.checks.mechanics import ONE_SIGMA, _spread
+from forcegp.checks.mechanics import ONE_SIGMA, _upper_spread
 from forcegp.robust import robust_std
 
 
@@ -38,8 +38,8 @@ def test_instruments_that_are_the_columns_are_least_squares() -> None:
 
 def test_the_spread_of_a_level_is_that_of_its_upper_side() -> None:
     normal = np.random.default_rng(2).normal(size=(100_000, 1))
-    assert abs(_spread(normal[:, 0]) - 1.0) < 0.02
+    assert abs(_upper_spread(normal[:, 0]) - 1.0) < 0.02
     level = np.log(normal[:, 0] ** 2)
     upper = np.percentile(level, ONE_SIGMA) - np.median(level)
-    assert _spread(level) == upper < 0.9 * float(robust_std(level))
-    assert _spread(-level) == float(robust_std(-level))
+    assert _upper_spread(level) == upper < 0.9 * float(robust_std(level))
+    assert _upper_spread(-level) == float(robust_std(-level))
