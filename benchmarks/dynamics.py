@@ -175,8 +175,7 @@ def measure(robot: forcegp.RobotModel, table: dict[str, Prepare], batches: tuple
 def _peak(name: str, batch: int, queue: multiprocessing.Queue) -> None:
     """Growth of the peak resident memory [bytes] while one batch is computed, in a process of its own."""
     robot = forcegp.load_robot("kuka_iiwa")
-    if name == "compiled":
-        compiled = compile_dynamics(robot)
+    compiled = compile_dynamics(robot) if name == "compiled" else None
     small, states = torch.ones(3, 2, robot.nq, dtype=robot.dtype), torch.ones(3, batch, robot.nq).double()
     run = {
         "forward dynamics": lambda x: dynamics.forward_dynamics(robot, *x),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -136,8 +138,7 @@ class Mujoco:
     """MuJoCo's `mj_forward`, one state at a time from Python."""
 
     def __init__(self, urdf: Path) -> None:
-        import mujoco
-
+        mujoco: Any = importlib.import_module("mujoco")
         self.mujoco = mujoco
         self.model = mujoco.MjModel.from_xml_path(str(urdf))
         self.model.dof_damping[:] = 0.0

@@ -104,7 +104,7 @@ def dense(data: forcegp.Dataset) -> Callable[[], float]:
     return evaluate
 
 
-def _measure(make: str, folder: str, samples: int, repeats: int, result: object) -> None:
+def _measure(make: str, folder: str, samples: int, repeats: int, result: multiprocessing.Queue) -> None:
     data, _ = training_data(Path(folder), samples)
     evaluate = {"projected": projected, "dense": dense}[make](data)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -329,13 +329,14 @@ def _label(which: str, seconds: float) -> Callable:
 
 def _one_line(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, Rows]:
     """Only the longest straight stretch of sliding is left of the log."""
-    name = next(iter(log.contact))
+    name, contact = next(iter(log.contact)), system.contacts[0]
+    assert isinstance(contact, forcegp.SurfaceContact)
     velocity = forcegp.kinematics.point_velocity(
         system.robot,
         torch.from_numpy(log.q),
         torch.from_numpy(log.qd),
-        system.contacts[0].frame,
-        system.contacts[0].point,
+        contact.frame,
+        contact.point,
     ).numpy()
     still = ~log.contact[name] | (np.linalg.norm(velocity, axis=1) < 0.02)
     edges = np.flatnonzero(np.concatenate([[True], still, [True]]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,7 @@ def test_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     blocks = _blocks("python")
     assert blocks
     for block in blocks:
-        names: dict[str, object] = {}
+        names: dict[str, Any] = {}
         exec(compile(block, "README.md", "exec"), names)
         assert names["force"].mean.shape == (480, 1)
         assert bool((names["force"].mean > 0.0).all())

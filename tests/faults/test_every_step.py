@@ -77,7 +77,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new(
 def test_a_call_that_fails_at_any_step_is_an_os_error_and_keeps_the_old(
     writer: Writer, code: int, tmp_path: Path
 ) -> None:
-    path, refused = tmp_path / f"target{writer.ending}", 0
+    path, refused, step = tmp_path / f"target{writer.ending}", 0, 0
 
     def fail() -> None:
         raise OSError(code, os.strerror(code))

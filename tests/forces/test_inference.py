@@ -184,6 +184,7 @@ def test_noise_of_the_dense_formula_matters() -> None:
 def test_redundant_and_nearly_redundant_contacts(angle: float) -> None:
     """Two contacts at one point whose normals differ by an angle: one row or two, never in between."""
     first, _ = two_contacts().contacts
+    assert isinstance(first, forcegp.SurfaceContact)
     again = forcegp.SurfaceContact("ball", first.frame, first.point, forcegp.Plane((angle, 0.2, 1), 0.055))
     system = forcegp.ConstrainedSystem(two_contacts().robot, [first, again], forcegp.Baumgarte())
     data = logged(system, 6)

@@ -67,8 +67,12 @@ def test_the_surface_is_found_from_the_path() -> None:
     scene = load_scene("ur5_wiping")
     log = simulate(scene.system(), replace(scene.simulation, duration=8.0)).data
     found = fit_surface(log, scene.system(), "table").surface
-    true = scene.system().contact("table").surface
+    contact = scene.system().contact("table")
+    assert isinstance(contact, forcegp.SurfaceContact)
+    true = contact.surface
+    assert isinstance(true, forcegp.Plane)
     middle = torch.tensor([*scene.simulation.center[:2], true.offset], dtype=torch.float64)
+    assert isinstance(found, forcegp.Plane)
     normal = torch.tensor(found.normal, dtype=torch.float64)
     assert abs(float(normal @ middle) - found.offset) < 0.2e-3
     assert math.degrees(math.acos(min(1.0, float(normal[2])))) < 0.2

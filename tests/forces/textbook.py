@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.quantities import affine_map, states
-from forcegp.gp.kernels import Kernel, Linear, Product, SquaredExponential, Sum, sub
+from forcegp.gp.kernels import Kernel, Linear, Product, SquaredExponential, Stationary, Sum, sub
 from forcegp.models.structured_gp import StructuredGP
 
 
@@ -23,6 +23,7 @@ def covariance(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict) ->
         left = covariance(kernel.left, sub(params, "left"), x1, x2)
         right = covariance(kernel.right, sub(params, "right"), x1, x2)
         return left * right if isinstance(kernel, Product) else left + right
+    assert isinstance(kernel, Linear | Stationary)
     a, b = (torch.cat([x[name] for name in kernel.inputs or tuple(x)], dim=-1) for x in (x1, x2))
     if a.ndim == 3:  # Each component has inputs of its own.
         one = [
@@ -85,7 +86,7 @@ class Textbook:
         return mean, operators, inputs
 
     def _covariance(self, one: tuple, two: tuple) -> Tensor:
-        total = 0.0
+        total = torch.zeros(())
         for p, prior in enumerate(self.model.force_priors):
             k = covariance(prior.kernel, sub(self.params, prior.prefix), one[2][p], two[2][p])
             kQ = torch.diag_embed(k.permute(1, 2, 0))

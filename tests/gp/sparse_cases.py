@@ -116,7 +116,7 @@ class DenseSparse:
         for a in one:
             line = []
             for b in two:
-                total = 0.0
+                total = np.zeros(())
                 for p in range(len(COMPONENTS)):
                     k = self.latent(p, a.features[p], b.features[p], kind)
                     total = total + np.einsum(

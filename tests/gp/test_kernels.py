@@ -10,7 +10,16 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp.kernels import Kernel, Linear, Matern32, Matern52, SquaredExponential
+from forcegp.gp.kernels import (
+    Kernel,
+    Linear,
+    Matern32,
+    Matern52,
+    Product,
+    SquaredExponential,
+    Stationary,
+    Sum,
+)
 
 WIDTHS = {"q": 3, "qd": 2}
 OUTPUTS = 2
@@ -60,10 +69,11 @@ def by_hand(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict, k: in
         side: {n[len(side) + 1 :]: v for n, v in params.items() if n.startswith(side)}
         for side in ("left", "right")
     }
-    if hasattr(kernel, "left"):
+    if isinstance(kernel, Sum | Product):
         left = by_hand(kernel.left, parts["left"], x1, x2, k, i, j)
         right = by_hand(kernel.right, parts["right"], x1, x2, k, i, j)
-        return left * right if type(kernel).__name__ == "Product" else left + right
+        return left * right if isinstance(kernel, Product) else left + right
+    assert isinstance(kernel, Linear | Stationary)
     names = kernel.inputs or tuple(x1)
     a = [float(v) for n in names for v in x1[n][i]]
     b = [float(v) for n in names for v in x2[n][j]]
@@ -176,7 +186,7 @@ def test_random_features_have_the_kernel_as_covariance(kernel: Kernel) -> None:
     assert basis.shape[:2] == (OUTPUTS, 4)
     K = kernel.covariance(params, x, x)
     scale = kernel.diagonal(params, x).amax(-1)[:, None, None]
-    chance = 5.0 if type(kernel).__name__ == "Product" else 2.0  # products of features spread more
+    chance = 5.0 if isinstance(kernel, Product) else 2.0  # products of features spread more
     assert float(((basis @ basis.mT - K) / scale).abs().max()) < chance * 3.0 / math.sqrt(DRAWS)
 
 

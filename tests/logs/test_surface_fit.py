@@ -39,8 +39,10 @@ def test_the_error_bars_of_a_plane_hold() -> None:
         points, normal, _ = on_plane(400, 2e-4, seed)
         points[::37] += 0.02  # rows that were labelled wrongly
         fit = surface_fit._plane("table", points, np.array([0.0, 0.0, 1.0]))
-        tilt = np.linalg.norm(np.cross(fit.surface.normal, normal))
-        offset = np.array(fit.surface.normal) @ points.mean(0) - fit.surface.offset
+        plane = fit.surface
+        assert isinstance(plane, Plane)
+        tilt = np.linalg.norm(np.cross(plane.normal, normal))
+        offset = np.array(plane.normal) @ points.mean(0) - plane.offset
         middle = points.mean(0) @ normal - 0.2
         errors.append((tilt / fit.std["tilt"], (offset - middle) / fit.std["offset"]))
     tilts, offsets = np.abs(np.array(errors)).T

@@ -24,6 +24,7 @@ from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.operator import OperatorForcePrior
 from forcegp.forces.quantities import QUANTITIES
 from forcegp.forces.start import negative_log_prior
+from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.structured_gp import StructuredGP
@@ -79,6 +80,7 @@ def test_few_samples(n: int) -> None:
 
 def test_duplicated_rows() -> None:
     model = fitted(data[torch.tensor([0, 0, 0, 1, 1, 2])])
+    assert isinstance(model.posterior.latent, ExactPosterior)
     assert model.posterior.latent.conditioned.jitter == 0.0
     is_right(model)
 

@@ -42,7 +42,9 @@ def test_changed_settings_run_the_stage_again_and_all_that_follow(tmp_path: Path
 
 
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt, ValueError])
-def test_an_interrupted_stage_leaves_nothing_and_runs_next_time(tmp_path: Path, interruption: type) -> None:
+def test_an_interrupted_stage_leaves_nothing_and_runs_next_time(
+    tmp_path: Path, interruption: type[BaseException]
+) -> None:
     first, work = Work("first"), Work("second")
 
     def breaks(folder: Path, advance: Advance) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -14,6 +14,8 @@ from forcegp import dynamics, kinematics
 from forcegp.errors import InertiaError, RobotFileError, RobotFileWarning, UnsupportedRobotError
 from forcegp.robot.load import BUNDLED
 from robots import random_states
+
+mujoco: Any = pytest.importorskip("mujoco")
 
 RELATIVE = 1e-8  # MuJoCo diagonalises inertias on loading, which costs it some digits
 BRANCHED = Path(__file__).parent / "data" / "branched.xml"
@@ -27,14 +29,14 @@ def load_text(folder: Path, body: str, rest: str = "", **options: object) -> for
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[forcegp.RobotModel, mujoco.MjModel]:
+def pair() -> tuple[forcegp.RobotModel, Any]:
     with pytest.warns(RobotFileWarning, match="site 'left_tip' shares its name"):
         robot = forcegp.load_robot(BRANCHED)
     text = BRANCHED.read_text().replace('<mesh name="cover" file="not_there.stl"/>', "")
     return robot, mujoco.MjModel.from_xml_string(text.replace('<geom type="mesh" mesh="cover"/>', ""))
 
 
-def test_dynamics_equal_mujoco(pair: tuple[forcegp.RobotModel, mujoco.MjModel]) -> None:
+def test_dynamics_equal_mujoco(pair: tuple[forcegp.RobotModel, Any]) -> None:
     robot, model = pair
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     data = mujoco.MjData(model)
@@ -54,7 +56,7 @@ def test_dynamics_equal_mujoco(pair: tuple[forcegp.RobotModel, mujoco.MjModel]) 
         assert np.abs(tau - expected).max() < RELATIVE * np.abs(expected).max()
 
 
-def test_frames_of_bodies_and_sites_equal_mujoco(pair: tuple[forcegp.RobotModel, mujoco.MjModel]) -> None:
+def test_frames_of_bodies_and_sites_equal_mujoco(pair: tuple[forcegp.RobotModel, Any]) -> None:
     robot, model = pair
     data = mujoco.MjData(model)
     q = random_states(robot, 1, seed=3)[0][0]
@@ -70,7 +72,7 @@ def test_frames_of_bodies_and_sites_equal_mujoco(pair: tuple[forcegp.RobotModel,
         assert np.abs(p.numpy() - position).max() < RELATIVE, name
 
 
-def test_joint_figures_are_read(pair: tuple[forcegp.RobotModel, mujoco.MjModel]) -> None:
+def test_joint_figures_are_read(pair: tuple[forcegp.RobotModel, Any]) -> None:
     robot, _ = pair
     assert robot.joint_names == ("turn", "lift", "left_1", "right_1", "joint_4", "right_3")
     assert robot.joint_types == ("revolute", "prismatic", *["revolute"] * 4)
