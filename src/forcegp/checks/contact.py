@@ -198,7 +198,7 @@ def _labels(
             where = f"by up to {1e3 * most:.3g} mm, in {describe(rows)}"
             text = f"contact {contact.name!r} is {texts[kind]}, {where}"
             found.append(Finding(kind, text, rows, contact=contact.name, evidence={"distance_m": most}))
-    return [*found, *_missed(contact, path, usable & ~closed, c, touch, log)]
+    return [*found, *_missed(contact, path, usable & ~closed & settled, c, touch, log)]
 
 
 def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
@@ -211,7 +211,10 @@ def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
 def _missed(
     contact: SurfaceContact, path: Path, open_: np.ndarray, c: Array, touch: float, log: Log
 ) -> list[Finding]:
-    """Rows labelled open in which the tip slides along the surface."""
+    """Rows labelled open in which the tip slides along the surface.
+
+    A tip that takes off gently is near for a while, but soon moves along the normal faster than in contact.
+    """
     if not np.isfinite(log.dt):
         return []
     near = open_ & (np.abs(c) <= touch)
