@@ -301,10 +301,13 @@ class ConstrainedSystem:
         self, q: Tensor, qd: Tensor, terms: Sequence[ConstraintTerms], active: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """c and ċ of all contacts, and the stabilized A and b of the active ones."""
-        empty, none = q.new_zeros(*q.shape[:-1], 0), q.new_zeros(*q.shape[:-1], 0, q.shape[-1])
-        c = torch.cat([empty, *(term.c for term in terms)], dim=-1)
-        b = torch.cat([empty, *(term.b for term in terms)], dim=-1)
-        A = torch.cat([none, *(term.A for term in terms)], dim=-2)
+        if len(terms) == 1:
+            c, A, b = terms[0].c, terms[0].A, terms[0].b
+        else:
+            empty, none = q.new_zeros(*q.shape[:-1], 0), q.new_zeros(*q.shape[:-1], 0, q.shape[-1])
+            c = torch.cat([empty, *(term.c for term in terms)], dim=-1)
+            b = torch.cat([empty, *(term.b for term in terms)], dim=-1)
+            A = torch.cat([none, *(term.A for term in terms)], dim=-2)
         cd = vecdot(A, qd[..., None, :])
         if self.baumgarte is not None:
             b = self.baumgarte.stabilized(b, c, cd)

@@ -113,7 +113,7 @@ def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
 
 
 def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
-    """The samples of each rank; where all share one, no copy is made of them."""
+    """The samples of each rank; one slice of all of them where they share it, of which no copy is made."""
     if not len(rank):
         return []
     low, high = (int(value) for value in rank.aminmax())
@@ -139,7 +139,9 @@ class _Rows:
     rows: Tensor
 
     def of(self, own: Tensor | slice, U: Tensor) -> _Rows:
-        """Uᵀ times the rows of some samples."""
+        """Uᵀ times the rows of some samples, or of all of them where `own` is a slice."""
+        if isinstance(own, slice):
+            return _Rows(self.features, self.widths, U.mT @ self.rows)
         features = tuple({name: x[own] for name, x in f.items()} for f in self.features)
         return _Rows(features, self.widths, U.mT @ self.rows[own])
 

@@ -120,14 +120,13 @@ class AffineMap(NamedTuple):
     Attributes:
         B_Q: `(n, d, nq)` operator on the joint force Q.
         B_z: `(n, d, nq)` operator on the contact's dissipative force Q_z.
-        B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ: B_Q, but exactly 0 for q̈, since H Aᵀ
-            = 0.
+        B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ: B_Q, but `None` for q̈, since H Aᵀ = 0.
         o: `(n, d)` offset.
     """
 
     B_Q: Tensor
     B_z: Tensor
-    B_N: Tensor
+    B_N: Tensor | None
     o: Tensor
 
 
@@ -146,7 +145,7 @@ def _left(C: Tensor, z: AffineMap) -> AffineMap:
 def _acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
     """q̈ = L b + H (Q + Q_z)."""
     H = at.eom.H
-    return AffineMap(H, H, torch.zeros_like(H), vecdot(at.eom.L, at.eom.b[..., None, :]))
+    return AffineMap(H, H, None, vecdot(at.eom.L, at.eom.b[..., None, :]))
 
 
 def _free_acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
@@ -238,7 +237,8 @@ def affine_maps(
         first += z.o.shape[-1]
     if len(maps) == 1:
         return next(iter(maps.values())), rows
-    return AffineMap(*(torch.cat(parts, dim=1) for parts in zip(*maps.values(), strict=True))), rows
+    filled = [z._replace(B_N=torch.zeros_like(z.B_Q)) if z.B_N is None else z for z in maps.values()]
+    return AffineMap(*(torch.cat(parts, dim=1) for parts in zip(*filled, strict=True))), rows
 
 
 def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:

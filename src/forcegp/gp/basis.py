@@ -102,6 +102,22 @@ class ProcessBasis:
             return whitened, explained
         return torch.cat([whitened, self.finite.basis(features)], dim=-1), explained
 
+    def rows(self, W: Tensor, values: Tensor) -> Tensor:
+        """Rows W_i V_iᵀ of n samples in terms of the basis functions, `(n d, Σ sizes)`.
+
+        Args:
+            W: operators `(n, d, components)`.
+            values: V of the samples, as `values` gives it.
+        """
+        whole = W[..., None] * values.transpose(0, 1)[:, None]
+        whole = whole.reshape(W.shape[0] * W.shape[1], self.used.numel())
+        return whole if self._filled else whole.index_select(1, self.columns)
+
+    @cached_property
+    def _filled(self) -> bool:
+        """Whether all values are basis functions."""
+        return bool(self.used.all())
+
     def fold(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Weights of basis functions as those of k(x, Z) and of the exact features.
 

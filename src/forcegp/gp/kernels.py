@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.linalg import vecdot
 
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.gp import draws
@@ -204,12 +205,12 @@ class Stationary(Kernel):
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         inverse = torch.exp(-params["log_lengthscale"])[:, None, :]
         b = stacked(x2, self.inputs) * inverse
-        squares = (b * b).sum(-1)[:, None, :]
+        squares = vecdot(b, b)[:, None, :]
         variance = torch.exp(2.0 * params["log_std"])[:, None, None]
 
         def covariance(x1: Features) -> Tensor:
             a = stacked(x1, self.inputs) * inverse
-            r2 = torch.baddbmm((a * a).sum(-1)[:, :, None] + squares, a, b.mT, alpha=-2.0)
+            r2 = torch.baddbmm(vecdot(a, a)[:, :, None] + squares, a, b.mT, alpha=-2.0)
             return variance * self.profile(r2)
 
         return covariance

@@ -169,20 +169,20 @@ def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> t
         The new moments, and Φ with rows W_i V_iᵀ `(rows, size)`.
     """
     Phi = moments.v.new_zeros(sum(block.rows for block in blocks), basis.size)
-    prior, missed = list(moments.prior.unbind()), list(moments.missed.unbind())
+    traces = [moments.v.new_zeros(2)] * len(basis.parts)
     for block, rows in zip(blocks, Phi.split([block.rows for block in blocks]), strict=True):
         for p, (part, x, W) in enumerate(zip(basis.parts, block.features, block.operators, strict=True)):
             if not bool(W.any()):
                 continue
-            V, own_prior, own_missed = part.evaluate(x)
-            rows[:, basis.of_process(p)] = (W[:, :, part.owner] * V[:, None, :]).flatten(0, 1)
-            S_kk = torch.linalg.vecdot(W, W, dim=1)
-            prior[p] = prior[p] + (S_kk * own_prior).sum()
-            missed[p] = missed[p] + (S_kk * own_missed).sum()
+            values, explained = part.values(x)
+            rows[:, basis.of_process(p)] = part.rows(W, values)
+            S_kk, variance = torch.linalg.vecdot(W, W, dim=1).mT, part.rest_variance(x)
+            traces[p] = traces[p] + (S_kk * torch.stack([variance, variance - explained])).sum((1, 2))
     y = torch.cat([block.target.reshape(-1) for block in blocks])
     v = torch.addmv(moments.v, Phi.mT, y)
-    sums = Moments(v, moments.yy + y @ y, moments.rows + len(y), torch.stack(prior), torch.stack(missed))
-    return sums, Phi
+    prior, missed = torch.stack(traces, dim=1)
+    yy, rows = moments.yy + y @ y, moments.rows + len(y)
+    return Moments(v, yy, rows, moments.prior + prior, moments.missed + missed), Phi
 
 
 def _runs(columns: list[slice]) -> list[slice]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 
+import torch
 from torch import Tensor
 from torch.linalg import vecdot
 
@@ -75,6 +76,10 @@ class ForcePrior(ABC):
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         """E(x) `(n, nq, outputs)`."""
 
+    def carried(self, B: Tensor, system: ConstrainedSystem, at: States) -> Tensor:
+        """B E(x) `(n, d, outputs)`, with B `(n, d, nq)` from a generalized force to a quantity."""
+        return B @ self.operator(system, at)
+
     def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
         """Where learning what the operator E contains begins, by name; nothing for most priors."""
         return {}
@@ -85,6 +90,19 @@ class ForcePrior(ABC):
 
     def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
         """Raise a typed error where the prior does not fit the system."""
+
+
+class PerJointPrior(ForcePrior):
+    """An independent process for each joint's force, E = I."""
+
+    def outputs(self, robot: RobotModel) -> int:
+        return robot.nq
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
+
+    def carried(self, B: Tensor, system: ConstrainedSystem, at: States) -> Tensor:
+        return B
 
 
 def check_inputs(name: str, inputs: tuple[str, ...], known: tuple[str, ...]) -> None:
@@ -146,6 +164,10 @@ def prior_rows(
     features, operators = [], []
     for prior in priors:
         features.append(prior.features(system, at))
-        operators.append(by_target.get(prior.target, z.B_Q) @ prior.operator(system, at))
+        B = by_target.get(prior.target, z.B_Q)
+        if B is None:
+            operators.append(z.o.new_zeros(*z.o.shape, prior.outputs(system.robot)))
+        else:
+            operators.append(prior.carried(B, system, at))
     standard = (scale.apply(x) for scale, x in zip(scales, features, strict=True))
     return Block(tuple(standard), tuple(operators), target)

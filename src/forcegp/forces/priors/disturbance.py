@@ -12,18 +12,17 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.priors.base import JOINT, PerJointPrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel
 from forcegp.gp.ornstein_uhlenbeck import SEGMENT, TIME, OrnsteinUhlenbeck
-from forcegp.robot.model import RobotModel
 
 NEW_MOTION = -1.0
 """Number of the trajectory of states that are not of the training log."""
 
 
 @dataclass(frozen=True)
-class DisturbancePrior(ForcePrior):
+class DisturbancePrior(PerJointPrior):
     """Q_i = d_i(t), an Ornstein–Uhlenbeck process of each joint, independent from one trajectory to the next.
 
     Its standard deviation σ_i and correlation time T_i are learned. A new motion tells nothing of it, so it
@@ -47,13 +46,7 @@ class DisturbancePrior(ForcePrior):
     scaled = False
     in_time = True
 
-    def outputs(self, robot: RobotModel) -> int:
-        return robot.nq
-
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         if at.time is None:
             return {TIME: torch.zeros_like(at.q[:, :1]), SEGMENT: torch.full_like(at.q[:, :1], NEW_MOTION)}
         return {TIME: at.time[:, :1], SEGMENT: at.time[:, 1:]}
-
-    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)

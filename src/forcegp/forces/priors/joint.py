@@ -10,10 +10,9 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import damping_force
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.priors.base import JOINT, ForcePrior, check_inputs
+from forcegp.forces.priors.base import JOINT, PerJointPrior, check_inputs
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, SquaredExponential
-from forcegp.robot.model import RobotModel
 
 TERMS = ("bias", "gravity", "friction", "actuation")
 """Q_C, Q_G, Q_D and Q_u: the known parts of Q."""
@@ -66,7 +65,7 @@ def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
 
 
 @dataclass(frozen=True)
-class JointForcePrior(ForcePrior):
+class JointForcePrior(PerJointPrior):
     """An independent process for each joint's force Q_i (eq. 31), E = I.
 
     Args:
@@ -93,9 +92,6 @@ class JointForcePrior(ForcePrior):
     def __post_init__(self) -> None:
         check_inputs(self.name, self.inputs, ("q", "qd", "tau"))
 
-    def outputs(self, robot: RobotModel) -> int:
-        return robot.nq
-
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         x = {name: getattr(at, name) for name in self.inputs}
         if self.periodic and "q" in x:
@@ -103,6 +99,3 @@ class JointForcePrior(ForcePrior):
             angle = x["q"][:, turns]
             x["q"] = torch.cat([torch.sin(angle), torch.cos(angle), x["q"][:, ~turns]], dim=-1)
         return x
-
-    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)

@@ -17,10 +17,9 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.priors.base import JOINT, PerJointPrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, Linear
-from forcegp.robot.model import RobotModel
 
 SPEEDS = (0.02, 0.1, 0.5)
 """Velocities at which the Coulomb features saturate [rad/s, m/s]: a sharp step, and two slower
@@ -30,7 +29,7 @@ OFFSET = 0.3
 
 
 @dataclass(frozen=True)
-class JointFrictionPrior(ForcePrior):
+class JointFrictionPrior(PerJointPrior):
     """Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)).
 
     The weights w_i and the offset c_i are Gaussian and marginalised. Three things are learned: how large the
@@ -80,9 +79,6 @@ class JointFrictionPrior(ForcePrior):
         """Which Coulomb feature is the dry friction of a joint that may stick."""
         return self.speeds.index(min(self.speeds))
 
-    def outputs(self, robot: RobotModel) -> int:
-        return robot.nq
-
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         v = at.qd[..., None]
         columns = {"velocity": v}
@@ -92,6 +88,3 @@ class JointFrictionPrior(ForcePrior):
         if self.load:
             columns["load"] = at.eom.Q_G.abs()[..., None] * columns["coulomb_0"]
         return columns
-
-    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
