@@ -8,7 +8,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 
-import torch
 from torch import Tensor
 from torch.linalg import vecdot
 
@@ -56,6 +55,8 @@ class ForcePrior(ABC):
     """Whether the force is a function of time, which couples the samples of a trajectory."""
     scaled: bool = True
     """Whether the inputs are standardized."""
+    per_joint: bool = False
+    """Whether f has a component for each joint and E = I, so that no product with E is needed."""
     centred: bool = True
     """Whether the mean of the training data is subtracted from the inputs before they are scaled."""
 
@@ -76,10 +77,6 @@ class ForcePrior(ABC):
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         """E(x) `(n, nq, outputs)`."""
 
-    def carried(self, B: Tensor, system: ConstrainedSystem, at: States) -> Tensor:
-        """B E(x) `(n, d, outputs)`, with B `(n, d, nq)` from a generalized force to a quantity."""
-        return B @ self.operator(system, at)
-
     def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
         """Where learning what the operator E contains begins, by name; nothing for most priors."""
         return {}
@@ -90,19 +87,6 @@ class ForcePrior(ABC):
 
     def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
         """Raise a typed error where the prior does not fit the system."""
-
-
-class PerJointPrior(ForcePrior):
-    """An independent process for each joint's force, E = I."""
-
-    def outputs(self, robot: RobotModel) -> int:
-        return robot.nq
-
-    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
-
-    def carried(self, B: Tensor, system: ConstrainedSystem, at: States) -> Tensor:
-        return B
 
 
 def check_inputs(name: str, inputs: tuple[str, ...], known: tuple[str, ...]) -> None:
@@ -168,6 +152,6 @@ def prior_rows(
         if B is None:
             operators.append(z.o.new_zeros(*z.o.shape, prior.outputs(system.robot)))
         else:
-            operators.append(prior.carried(B, system, at))
+            operators.append(B if prior.per_joint else B @ prior.operator(system, at))
     standard = (scale.apply(x) for scale, x in zip(scales, features, strict=True))
     return Block(tuple(standard), tuple(operators), target)

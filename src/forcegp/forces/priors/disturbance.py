@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.priors.base import JOINT, PerJointPrior
+from forcegp.forces.priors.base import JOINT
+from forcegp.forces.priors.joint import PerJointPrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel
 from forcegp.gp.ornstein_uhlenbeck import SEGMENT, TIME, OrnsteinUhlenbeck

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,9 +11,10 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import damping_force
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.priors.base import JOINT, PerJointPrior, check_inputs
+from forcegp.forces.priors.base import JOINT, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, SquaredExponential
+from forcegp.robot.model import RobotModel
 
 TERMS = ("bias", "gravity", "friction", "actuation")
 """Q_C, Q_G, Q_D and Q_u: the known parts of Q."""
@@ -62,6 +64,23 @@ def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
     if mean not in named:
         raise UnknownNameError("mean", mean, named)
     return named[mean]
+
+
+class PerJointPrior(ForcePrior):
+    """A force of each joint, E = I; a subclass may have another operator."""
+
+    per_joint = True
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "operator" in vars(cls):
+            cls.per_joint = False
+
+    def outputs(self, robot: RobotModel) -> int:
+        return robot.nq
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
 
 
 @dataclass(frozen=True)

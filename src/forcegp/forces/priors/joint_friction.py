@@ -17,7 +17,8 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.priors.base import JOINT, PerJointPrior
+from forcegp.forces.priors.base import JOINT
+from forcegp.forces.priors.joint import PerJointPrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, Linear
 
