@@ -17,6 +17,7 @@ from forcegp.compiled import compile_dynamics
 from forcegp.compiled.program import QUANTITIES, trace
 from forcegp.compiled.source import cuda_source
 from forcegp.errors import MissingDependencyError, ModelError, ShapeError, UnknownNameError
+from forcegp.native import cache as cache_module
 from forcegp.native.library import find_compiler
 from forcegp.robot.model import RobotModel
 from random_robots import random_robot
@@ -148,6 +149,25 @@ def test_a_failing_compiler_says_why(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     with pytest.raises(MissingDependencyError, match=r"could not build the kernel(.|\n)*no space left"):
         compile_dynamics(random_robot(7))
     assert set(cache.iterdir()) == before
+
+
+def test_a_compiler_that_is_no_program_is_one_clear_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "text").write_text("no program")
+    (tmp_path / "text").chmod(0o700)
+    monkeypatch.setenv("CXX", str(tmp_path / "text"))
+    with pytest.raises(MissingDependencyError, match=r"cannot be used(.|\n)*set CXX"):
+        compile_dynamics(random_robot(7))
+
+
+def test_a_user_without_a_home_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(cache_module, "cache_directory", no_home)
+    with pytest.raises(MissingDependencyError, match=r"home directory(.|\n)*FORCEGP_CACHE"):
+        compile_dynamics(random_robot(7))
 
 
 def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

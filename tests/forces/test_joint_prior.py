@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.priors.base import ForcePrior, prior_rows
+from forcegp.errors import ModelError
+from forcegp.forces.priors.base import ForcePrior, check_priors, prior_rows
 from forcegp.forces.priors.disturbance import DisturbancePrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
@@ -48,3 +49,21 @@ def test_no_acceleration_shows_a_force_along_the_constraint() -> None:
     shown = operators_of(prior, ["qdd", "multiplier"])
     assert not shown[:, : system.robot.nq].any()
     torch.testing.assert_close(shown[:, system.robot.nq :], -L.mT @ prior.operator(system, at))
+
+
+def test_an_operator_may_be_inherited_from_elsewhere() -> None:
+    class Half:
+        def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+            return 0.5 * JointForcePrior().operator(system, at)
+
+    class Mixed(Half, JointForcePrior):
+        pass
+
+    for prior in (Mixed(), type("Heir", (Geared,), {})()):
+        expected = at.eom.H @ prior.operator(system, at)
+        torch.testing.assert_close(operators_of(prior, "qdd"), expected, rtol=0.0, atol=0.0)
+
+
+def test_a_prior_that_shares_with_a_missing_one_is_refused() -> None:
+    with pytest.raises(ModelError, match="shares the hyperparameters of a prior that is missing"):
+        check_priors((NormalForcePrior(), JointFrictionPrior()), system)

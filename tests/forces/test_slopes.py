@@ -130,3 +130,20 @@ def test_slopes_are_saved_and_go_on(tmp_path: Path) -> None:
     conditioned = again.condition(more)
     assert conditioned.training.slopes is not None
     torch.testing.assert_close(conditioned.training.slopes[0], G[1])
+
+
+def test_forces_without_slopes_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_tensors(*given: object) -> Training:
+        raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
+
+    monkeypatch.setattr(slopes, "learned_slopes", no_tensors)
+    model = fitted(1)
+    assert model.training.slopes is None
+    assert any("slopes of the learned forces" in warning for warning in model.fitted.result.warnings)
+
+
+def test_a_fit_that_learns_nothing_conditions_as_it_was_learned() -> None:
+    model, more = fitted(1), measured(8, 20)[0]
+    value = model.condition(more).log_marginal_likelihood
+    again = fitted(1).fit(more, learn=[])
+    assert again.training.slopes is not None and again.log_marginal_likelihood == value

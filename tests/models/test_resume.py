@@ -97,6 +97,19 @@ def test_a_checkpoint_of_other_data_is_refused(case: tuple[Callable[[], Any], An
 
 
 @pytest.mark.parametrize(
+    "other", [{"standardize": False}, {"degrees_of_freedom": 4.0}, {"inducing_points": 7}]
+)
+def test_a_checkpoint_of_another_objective_is_refused(other: dict[str, Any], tmp_path: Path) -> None:
+    file, options = tmp_path / "fit.ckpt", forcegp.LearningOptions(max_evaluations=3)
+    model = forcegp.StructuredGP(table_system(), noise_std=0.1)
+    model.fit(DATA, options=options, checkpoint=file, keep_checkpoint=True)
+    with pytest.raises(ModelError, match="belongs to another fit"):
+        forcegp.StructuredGP(table_system(), noise_std=0.1, **other).fit(
+            DATA, options=options, checkpoint=file
+        )
+
+
+@pytest.mark.parametrize(
     ("name", "value", "message"),
     [
         ("weights.0.weight", float("nan"), "holds a value that no training reaches"),

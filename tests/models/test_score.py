@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,3 +52,12 @@ def test_score_is_the_coefficient_of_determination() -> None:
         model.score(data, "qdd_free")
     with pytest.raises(DataError, match="two samples"):
         model.score(data[:1])
+
+
+@pytest.mark.parametrize("inertia", ["file", "auto"])
+def test_a_saved_model_knows_where_its_inertia_is_from(inertia: str, tmp_path: Path) -> None:
+    model = forcegp.StructuredGP(two_contacts(), noise_std=0.1, inertia=inertia)
+    model.fit(logged(two_contacts(), 12), learn=[])
+    model.save(tmp_path / "model")
+    loaded = forcegp.load_model(tmp_path / "model")
+    assert isinstance(loaded, forcegp.StructuredGP) and loaded.get_params()["inertia"] == inertia

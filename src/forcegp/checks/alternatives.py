@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import Fit, gain_of
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.constraints import ConstrainedSystem
 
 Tried = tuple[Hypothesis, Fit]
+SMALL_MASS = 1e-6
+"""Share of the robot's mass below which a mass is zero."""
 ALONE = 2.0
 """Standard errors by which an alternative must lower the held-out error on its own.
 
@@ -19,17 +23,17 @@ The threshold is low (chance exceeds it in 4 % of cases), since it is already kn
 TESTS = {
     "torque-gain": "hang a known weight from the tip: its torque shows the gain, whatever the masses",
     "torque-current": "hang a known weight from the tip: its torque shows the gains, whatever the masses",
-    "torque-sign": "push the joint at rest by hand: the torque that holds it shows its sign",
-    "torque-order": "push one joint after another by hand: only its torque must change",
-    "torque-delay": "step the torque of one joint: its acceleration must follow at once",
-    "torque-without-gravity": "hold the stretched arm still: its torque must hold it against gravity",
+    "torque-sign": "push a joint in its positive direction while the arm holds still: its torque must fall",
+    "torque-order": "twist one joint after another, without loading the others: only its torque must change",
+    "torque-delay": "apply a torque step to one joint: its acceleration must change in the same sample",
+    "torque-without-gravity": "hold the arm outstretched and still: the torque must balance gravity",
     "joint-sign": "turn one joint after another by hand, and watch the sign of its position",
     "joint-order": "turn one joint after another by hand, and watch which position changes",
     "encoder-offset": "move the joint to its zero mark: its position must be zero there",
     "base-tilted": "put a spirit level on the base",
-    "gravity-direction": "see how the base is mounted",
+    "gravity-direction": "check how the base is mounted",
     "payload-missing": "weigh what is mounted on the last link",
-    "masses-mismatch": "compare the masses with those of the maker",
+    "masses-mismatch": "compare the masses with the manufacturer's data",
 }
 """A test for each kind of fault, in order of preference."""
 
@@ -39,10 +43,10 @@ def alternatives_of(
 ) -> Iterator[Tried]:
     """The hypotheses that the held-out blocks cannot distinguish from the chosen one.
 
-    Each lowers the error significantly, and by as much as the chosen one to within one standard error of the
-    difference over blocks.
+    The best comes first. Each lowers the error significantly, and by as much as the chosen one to within one
+    standard error of the difference over blocks.
     """
-    for hypothesis, fit in tried:
+    for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
         if _says_the_same(chosen[0], hypothesis):
             continue
         gain, error = gain_of(fit.score, null.score)
@@ -59,18 +63,21 @@ def _says_the_same(chosen: Hypothesis, other: Hypothesis) -> bool:
 
 
 def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: Fit) -> bool:
-    """Whether every link has a positive mass; the fit does not enforce it."""
+    """Whether every link keeps a mass that is positive, or zero in the robot file; the fit does not enforce
+    it."""
     if hypothesis.name != "masses":
         return True
-    return bool((system.robot.mass.numpy() + fit.theta[: 10 * system.robot.nq : 10] > 0.0).all())
+    given = system.robot.mass.numpy()
+    found = given + fit.theta[: 10 * system.robot.nq : 10]
+    return bool(np.where(given > 0.0, found > 0.0, found >= -SMALL_MASS * given.sum()).all())
 
 
 def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
     """The finding with its alternatives, if there are any, and a test that tells them apart."""
     found: list[Finding] = []
     for other in others:
-        same = (f for f in (finding, *found) if f.kind == other.kind and {*f.joints} & {*other.joints})
-        if next(same, None) is None:
+        alike = (f for f in (finding, *found) if f.kind == other.kind)
+        if not any({*f.joints} & {*other.joints} or not other.joints for f in alike):
             found.append(other)
     if not found:
         return finding

@@ -71,7 +71,12 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
 def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
     """The sampling period against that of the header."""
     stated = log.header.dt
-    if stated is None or not log.header.ordered or abs(log.dt / stated - 1.0) <= UNIFORM_TOLERANCE:
+    if (
+        stated is None
+        or not log.header.ordered
+        or not np.isfinite(log.dt)
+        or abs(log.dt / stated - 1.0) <= UNIFORM_TOLERANCE
+    ):
         return [], log
     text = f"the header states a period of {stated:.4g} s, and the rows are {log.dt:.4g} s apart"
     evidence = {"stated_s": stated, "period_s": log.dt}

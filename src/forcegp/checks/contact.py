@@ -28,6 +28,8 @@ ROUGH = 8.0
 """Robust standard deviations of the distance in contact within which a tip touches."""
 LANDING = 5
 """Rows within which a tip that lands stops."""
+CREEP = 1e-3
+"""Speed along the normal that a touching tip may have, at least [m/s]."""
 STOPS = 2.0
 """Factor by which a landing tip is faster than one that rests."""
 DRIFT = 2e-3
@@ -55,6 +57,11 @@ class Path:
     p: Array
     v: Array
     normal: Array
+
+    @property
+    def approach(self) -> Array:
+        """Speed along the normal `(n,)` [m/s]."""
+        return np.abs((self.v * self.normal).sum(axis=1))
 
 
 def tip_path(system: ConstrainedSystem, contact: SurfaceContact, log: Log) -> Path:
@@ -91,7 +98,7 @@ def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Findin
     usable = np.isfinite(path.c) & log.usable
     closed = log.contact[contact.name] & usable
     if closed.sum() < LEAST_ROWS:
-        return []
+        return _missed(contact, path, usable & ~closed & (path.approach <= CREEP), path.c, TOUCH, log)
     found, distance = _placement(contact, path, closed, log)
     rough = ROUGH * float(robust_std(distance[closed]))
     return [*found, *_labels(contact, path, closed, usable, distance, rough, log)]
@@ -164,8 +171,8 @@ def _labels(
     at which the tip moves along the normal no faster than in the rest of the contact.
     """
     touch = max(TOUCH, rough)
-    approach = np.abs((path.v * path.normal).sum(axis=1))
-    slow = ROUGH * float(robust_std(approach[closed]))
+    approach, moving = path.approach, closed & (np.linalg.norm(path.v, axis=1) > CREEP)
+    slow = max(CREEP, ROUGH * float(robust_std(approach[moving])) if moving.any() else 0.0)
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     off = closed & (np.abs(c) > touch)

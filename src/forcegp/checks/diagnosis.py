@@ -9,6 +9,7 @@ from forcegp.checks.fit import Fit
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.checks.log import Log
 from forcegp.checks.statistics import Array
+from forcegp.checks.units import displacement
 from forcegp.constraints import ConstrainedSystem
 
 CURRENT = 1.6
@@ -68,7 +69,7 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
 
 def finding_of(
     system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit, alike: tuple[int, ...] = ()
-) -> list[Finding]:
+) -> Finding:
     """The finding that a hypothesis stands for; `alike` are the joints of those that explain the same."""
     names = tuple(log.joint_names[j] for j in hypothesis.joints)
     listed = "all joints" if len(names) == log.nq > 1 else " and ".join(names)
@@ -82,8 +83,8 @@ def finding_of(
         "joint-order": f"{listed} fit the robot file when exchanged",
     }
     if hypothesis.name in texts:
-        return [Finding(hypothesis.name, texts[hypothesis.name], log.all_rows, names)]
-    return [_PARAMETRIC[hypothesis.name](system, log, hypothesis, fit)]
+        return Finding(hypothesis.name, texts[hypothesis.name], log.all_rows, names)
+    return _PARAMETRIC[hypothesis.name](system, log, hypothesis, fit)
 
 
 def _delay(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
@@ -119,10 +120,8 @@ def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit
 
 def _encoder(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
     name, offset = log.joint_names[hypothesis.joints[0]], float(fit.theta[0])
-    text = (
-        f"{name} fits with {offset:+.4f} rad ({np.degrees(offset):+.2f}°) added to its position, "
-        f"± {fit.spread[0]:.4f}"
-    )
+    added = displacement(system.robot, hypothesis.joints[0], offset)
+    text = f"{name} fits with {added} added to its position, ± {fit.spread[0]:.4f}"
     return Finding("encoder-offset", text, log.all_rows, (name,), evidence={"add_rad": offset})
 
 
@@ -134,7 +133,7 @@ def _gravity(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: F
     evidence = {"angle_deg": angle, **{f"g{axis}": value for axis, value in zip("xyz", found, strict=True)}}
     vector = ", ".join(f"{value:.3g}" for value in found)
     if given > 0.0 and size < WEIGHTLESS:
-        text = "the torque holds no gravity: a torque with gravity compensation taken off"
+        text = "the torque contains no gravity: gravity compensation was subtracted"
         return Finding("torque-without-gravity", text, log.all_rows, log.joint_names, evidence=evidence)
     tilted = given > 0.0 and angle <= TILT
     text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"

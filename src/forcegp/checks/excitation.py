@@ -11,6 +11,7 @@ from forcegp.checks.hypotheses import MASS_SHARE, MOMENT_ARM
 from forcegp.checks.log import Log
 from forcegp.checks.residual import tensors
 from forcegp.checks.statistics import Array
+from forcegp.checks.units import position_unit
 from forcegp.constraints import ConstrainedSystem
 from forcegp.identification import base_parameters, regressor
 
@@ -32,8 +33,8 @@ LEARNED = 0.5
 
 def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
     """Logs too short for anything."""
-    seconds = len(log.rows(len(log))) * log.dt
-    if not log.header.ordered or not np.isfinite(seconds) or seconds >= SHORT_SECONDS:
+    seconds = len(log.rows(len(log))) * log.dt if np.isfinite(log.dt) else 0.0
+    if not log.header.ordered or seconds >= SHORT_SECONDS:
         return [], log
     text = f"{seconds:.3g} s of the log can be used"
     return [Finding("log-short", text, log.all_rows, evidence={"seconds": seconds})], log
@@ -51,9 +52,9 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     if still.any():
         joints = tuple(log.joint_names[j] for j in np.flatnonzero(still))
         verb, whose = ("moves", "its") if len(joints) == 1 else ("move", "their")
-        text = (
-            f"{', '.join(joints)} {verb} by less than {STILL} rad: {whose} friction and inertia are not seen"
-        )
+        unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
+        least = f"{', '.join(joints)} {verb} by less than {STILL} {unit}"
+        text = f"{least}: {whose} friction and inertia are not seen"
         found.append(Finding("joint-still", text, log.all_rows, joints))
     if not log.header.ordered:
         return found, log

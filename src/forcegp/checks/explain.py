@@ -109,8 +109,8 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
         if chosen is None:
             break
         hypothesis, fit = chosen.tried
-        (found,) = finding_of(system, log, hypothesis, fit, chosen.alike)
-        others = [one for pair in chosen.alternatives for one in finding_of(system, log, *pair)]
+        found = finding_of(system, log, hypothesis, fit, chosen.alike)
+        others = [finding_of(system, log, *pair) for pair in chosen.alternatives]
         findings.append(with_alternatives(found, others))
         taken.add((hypothesis.name, hypothesis.joints))
         if hypothesis.name not in ROBOT:

@@ -80,6 +80,7 @@ class Finding:
         """The finding as JSON holds it."""
         return {
             "kind": self.kind,
+            "kinds": list(self.kinds),
             "severity": self.severity,
             "message": self.message,
             "remedy": self.remedy,
@@ -90,6 +91,10 @@ class Finding:
             "alternatives": [other.to_dict() for other in self.alternatives],
             "told_apart_by": self.told_apart_by,
         }
+
+
+class NotJudgedError(Exception):
+    """A check cannot be made on this log; the message is the reason that `Report.skipped` gives."""
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,13 @@ _TABLE: tuple[tuple[str, str, Severity, str, str], ...] = (
         "the model explains too little",
         "check robot file and scene",
     ),
-    ("disturbance", "mechanics", "warning", "unmodelled torque for a while", "label the contact, or mask"),
+    (
+        "disturbance",
+        "mechanics",
+        "warning",
+        "unmodelled torque for a while",
+        "label the contact, or mask it",
+    ),
     ("robot-mismatch", "mechanics", "warning", "logged on another robot", "use the scene of that robot"),
     # contact
     ("contact-unlabelled", "contact", "error", "contact state is not logged", "add a contact column"),
@@ -116,9 +122,15 @@ _TABLE: tuple[tuple[str, str, Severity, str, str], ...] = (
     # noise
     ("noise-understated", "noise", "warning", "more noise than stated", "raise noise_std, or learn it"),
     ("noise-overstated", "noise", "warning", "less noise than stated", "lower noise_std, or learn it"),
-    ("noise-filtered", "noise", "warning", "filtered data, not white noise", "thin out; learn the noise"),
+    (
+        "noise-filtered",
+        "noise",
+        "warning",
+        "filtered data, not white noise",
+        "downsample; learn the noise",
+    ),
     # excitation
-    ("log-short", "excitation", "warning", "too few rows", "log for longer"),
+    ("log-short", "excitation", "warning", "too few rows", "record a longer log"),
     ("joint-still", "excitation", "warning", "a joint does not move", "move the joint through its range"),
     ("few-reversals", "excitation", "note", "few changes of direction", "reverse each joint several times"),
     ("poor-excitation", "excitation", "note", "parameters not identified", "add the motion stated"),

@@ -120,7 +120,7 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
     if log.derived:
         return _check_long_step(log)
     first, second = match(log, "q", "qd"), match(log, "qd", "qdd")
-    if first is None or second is None:
+    if first is None or second is None or not (first.moving & second.moving).any():
         return [], log
     factor = float(np.median(first.low[first.moving]))
     if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or not first.right(factor)[first.moving].all():

@@ -9,7 +9,7 @@ import numpy as np
 from forcegp.checks.clock import Outcome
 from forcegp.checks.excitation import still_joints
 from forcegp.checks.explain import Explanation, explain
-from forcegp.checks.finding import Finding
+from forcegp.checks.finding import Finding, NotJudgedError
 from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of, robust_parameters
 from forcegp.checks.hypotheses import (
     LAGS,
@@ -22,6 +22,7 @@ from forcegp.checks.log import Log
 from forcegp.checks.residual import projector, residual
 from forcegp.checks.smooth import smoothed
 from forcegp.checks.statistics import any_row, describe, intervals
+from forcegp.checks.units import force_unit, position_unit
 from forcegp.checks.visibility import check_visibility
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
@@ -56,22 +57,23 @@ ONE_SIGMA = 84.13
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     """Signs, orders, gains, delays, gravity, tool, masses, friction, offsets: all that the torque tells."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
-        return [], log
-    found, log = _without_torque(log)
-    if found:
-        return found, log
+        raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
+    passive = _without_torque(log)
+    if any(finding.severity == "error" for finding in passive):
+        return passive, log
     smooth = smoothed(log)
     if not _enough(smooth):
-        return [], log
+        raise NotJudgedError(f"fewer than {LEAST_ROWS} rows that lie {max(LAGS)} from the ends of a stretch")
     told = explain(system, smooth)
-    disturbed, rows = _disturbances(system, told)
+    disturbed, rows = _disturbances(system, told) if log.header.ordered else ([], np.zeros(len(log), bool))
     if disturbed and _enough(smooth.mask(rows)):
         # What happened in these rows must pass neither for friction nor for a mass.
         told = explain(system, smooth.mask(rows))
     found = [
+        *passive,
         *_confounded(told),
         *_friction(system.robot, _with_other_friction(system, told)),
-        *_offsets(told),
+        *_offsets(system.robot, told),
         *_unexplained(told),
         *check_visibility(system, told),
     ]
@@ -84,20 +86,19 @@ def _enough(log: Log) -> bool:
     return len(log.rows(LEAST_ROWS, margin=max(LAGS))) == LEAST_ROWS
 
 
-def _without_torque(log: Log) -> Outcome:
+def _without_torque(log: Log) -> list[Finding]:
     """Torques that are constant though the joint moves."""
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
     if not still.any():
-        return [], log
+        return []
     joints = tuple(log.joint_names[j] for j in np.flatnonzero(still))
     word = "zero" if zero[still].all() else "constant"
     # One passive joint is a design; an arm without any torque is a missing column.
     weight = "error" if still.all() else "warning"
     text = f"the torque of {', '.join(joints)} is {word} throughout"
-    found = [Finding("torque-zero", text, log.all_rows, joints, weight=weight)]
-    return (found, log) if still.all() else ([], log)
+    return [Finding("torque-zero", text, log.all_rows, joints, weight=weight)]
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ def _confounded(told: Explanation) -> list[Finding]:
             message=f"{finding.message}; or the masses, which do not fit either, are to blame for both",
             weight="warning",
         )
-        if finding.kind == "torque-current"
+        if finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds
         else finding
         for finding in told.findings
     ]
@@ -170,7 +171,9 @@ def _friction(robot: RobotModel, told: Explanation) -> list[Finding]:
         index = np.flatnonzero(hit)
         joints = tuple(log.joint_names[j] for j in index)
         listed = ", ".join(
-            f"{log.joint_names[j]} {viscous[j]:.3g} N m s/rad, {coulomb[j]:.3g} N m" for j in index
+            f"{log.joint_names[j]} {viscous[j]:.3g} {force_unit(robot, j)} s/{position_unit(robot, j)}, "
+            f"{coulomb[j]:.3g} {force_unit(robot, j)}"
+            for j in index
         )
         text = f"joints show {word} friction than the robot file declares (viscous, Coulomb): {listed}"
         evidence = {f"viscous {log.joint_names[j]}": viscous[j] for j in index}
@@ -179,14 +182,14 @@ def _friction(robot: RobotModel, told: Explanation) -> list[Finding]:
     return found
 
 
-def _offsets(told: Explanation) -> list[Finding]:
+def _offsets(robot: RobotModel, told: Explanation) -> list[Finding]:
     log, nq = told.log, told.log.nq
     offset = -told.fit.known[2 * nq : 3 * nq]
     index = [j for j in range(nq) if _part(told, j, [2 * nq + j]).there]
     if not index:
         return []
     joints = tuple(log.joint_names[j] for j in index)
-    listed = ", ".join(f"{log.joint_names[j]} {offset[j]:+.3g} N m" for j in index)
+    listed = ", ".join(f"{log.joint_names[j]} {offset[j]:+.3g} {force_unit(robot, j)}" for j in index)
     evidence = {f"offset {log.joint_names[j]}": offset[j] for j in index}
     text = f"the logged torque is off by a constant: {listed}"
     return [Finding("torque-offset", text, log.all_rows, joints, evidence=evidence)]
@@ -224,10 +227,10 @@ def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Fi
     worst = int(np.argmax((np.abs(trace) / scale)[bad].max(axis=0)))
     peak = float(np.abs(trace[bad][:, worst]).max())
     text = (
-        f"torque of up to {peak:.3g} N m at {log.joint_names[worst]} that neither robot nor labelled "
-        f"contacts explain, in {describe(whole)}"
+        f"torque of up to {peak:.3g} {force_unit(system.robot, worst)} at {log.joint_names[worst]} that "
+        f"neither robot nor labelled contacts explain, in {describe(whole)}"
     )
-    evidence = {"peak_Nm": peak}
+    evidence = {"peak": peak}
     return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence=evidence)], mask
 
 

@@ -22,8 +22,10 @@ from forcegp.checks.hypotheses import Hypothesis, flipped, swapped, unchanged
 from forcegp.checks.log import Log
 from forcegp.checks.residual import tensors
 from forcegp.checks.statistics import Array
+from forcegp.checks.units import displacement
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data.fields import JOINT_VECTORS
+from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
 
 ROWS = 2000
@@ -81,7 +83,7 @@ def _explanation(
         if near:
             # Two joints that turn in one plane and their mirror image touch alike.
             alike = [h for h, _ in near if h.name == near[0][0].name]
-            return [_finding(log, contact, alike)], near[0][1]
+            return [_finding(system.robot, log, contact, alike)], near[0][1]
     return None
 
 
@@ -127,15 +129,14 @@ def _moved(log: Log, j: int, offset: float) -> Log:
     return log.replace(q=q)
 
 
-def _finding(log: Log, contact: SurfaceContact, alike: list[Hypothesis]) -> Finding:
+def _finding(robot: RobotModel, log: Log, contact: SurfaceContact, alike: list[Hypothesis]) -> Finding:
     names = tuple(dict.fromkeys(log.joint_names[j] for h in alike for j in h.joints))
     listed = (" and " if alike[0].name == "joint-order" and len(alike) == 1 else " or ").join(names)
     touches = f"the tip touches {contact.name!r} where the log says so if"
     if alike[0].name == "encoder-offset":
         offset = float(alike[0].columns[0])  # type: ignore[index]
-        text = (
-            f"{touches} {offset:+.4f} rad ({np.degrees(offset):+.2f}°) are added to the position of {listed}"
-        )
+        added = displacement(robot, alike[0].joints[0], offset)
+        text = f"{touches} {added} are added to the position of {listed}"
         return Finding("encoder-offset", text, log.all_rows, names, contact.name, {"add_rad": offset})
     change = {"joint-sign": "turns the other way", "joint-order": "are exchanged"}[alike[0].name]
     return Finding(alike[0].name, f"{touches} {listed} {change}", log.all_rows, names, contact.name)

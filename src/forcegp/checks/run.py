@@ -23,7 +23,7 @@ from forcegp.checks import (
     values,
 )
 from forcegp.checks.clock import Outcome
-from forcegp.checks.finding import SEVERITIES, Finding, Report
+from forcegp.checks.finding import SEVERITIES, Finding, NotJudgedError, Report
 from forcegp.checks.kinds import KINDS
 from forcegp.checks.log import Log, log_of, of_robot
 from forcegp.constraints import ConstrainedSystem
@@ -118,13 +118,17 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
             progress(done, len(CHECKS))
         if name in OF_CONTACTS and not system.contacts:
             continue
-        void = next((finding.kind for finding in findings if finding.kind in VOIDS.get(name, ())), None)
+        kinds = (kind for finding in findings for kind in finding.kinds)
+        void = next((kind for kind in kinds if kind in VOIDS.get(name, ())), None)
         if void:
             skipped[name] = f"not judged after {void}"
             continue
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            found, log = run(system, log)
+            try:
+                found, log = run(system, log)
+            except NotJudgedError as reason:
+                skipped[name], found = str(reason), []
         findings += found
         if not log.usable.any():
             text = "no row of the log is usable"

@@ -20,6 +20,7 @@ from forcegp.checks.hypotheses import encoder_hypothesis, robot_columns
 from forcegp.checks.log import Log
 from forcegp.checks.residual import residual, tensors
 from forcegp.checks.statistics import Array
+from forcegp.checks.units import position_unit
 from forcegp.constraints import ConstrainedSystem
 from forcegp.identification import parameter_vector, regressor
 
@@ -41,7 +42,7 @@ WORTH = {
 """Sizes that a user expects a check to see: share, rad, degrees, s, share of a link's inertial parameters."""
 UNITS = {
     "torque-gain": "a gain of {joint} wrong by less than {size:.0%}",
-    "encoder-offset": "an encoder offset of {joint} under {size:.2g} rad",
+    "encoder-offset": "an encoder offset of {joint} under {size:.2g} {unit}",
     "base-tilted": "a base tilted by less than {size:.2g}°",
     "torque-delay": "a torque delay under {size:.2g} s",
     "masses-mismatch": "masses wrong by less than {size:.0%}",
@@ -73,10 +74,12 @@ def check_visibility(system: ConstrainedSystem, told: Explanation) -> list[Findi
     hidden = {key: size for key, size in sizes.items() if size > WORTH[key[0]]}
     if not hidden:
         return []
+    robot = system.robot
+    units = {name: position_unit(robot, j) for j, name in enumerate(robot.joint_names)}
     texts = [
         NEVER[kind].format(joint=joint)
         if size >= MOST.get(kind, LARGEST)
-        else UNITS[kind].format(joint=joint, size=size)
+        else UNITS[kind].format(joint=joint, size=size, unit=units.get(joint))
         for (kind, joint), size in hidden.items()
     ]
     more = f" and {len(texts) - 5} more" if len(texts) > 5 else ""

@@ -77,8 +77,8 @@ def _print(report: Report) -> None:
 
     if report.findings:
         table = Table(box=None, pad_edge=False)
-        for heading in ("weight", "kind", "rows", "finding and remedy"):
-            table.add_column(heading, no_wrap=heading in ("weight", "kind"), overflow="fold")
+        for heading in ("severity", "kind", "rows", "finding and remedy"):
+            table.add_column(heading, no_wrap=heading in ("severity", "kind"), overflow="fold")
         for finding in report.findings:
             whole = finding.intervals == ((0, report.samples),)
             rows = (

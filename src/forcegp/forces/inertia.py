@@ -91,7 +91,7 @@ def _unchecked(training: Training) -> tuple[str, ...]:
     closed = sum(int(m.active.any(-1).sum()) for m in training.measurements)
     if not closed or set(training.quantities) != {"qdd"}:
         return ()
-    free = training.samples - closed
+    free = max(int((~m.active.any(-1)).sum()) for m in training.measurements)
     return (
         f"{free} samples in free motion are too few to check the masses of the robot file (expected: {LEAST} "
         "or more), and any error of the masses biases the multiplier: add a few seconds of free motion to "

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from forcegp.errors import NumericalError
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem
 from forcegp.forces.start import Search
@@ -30,31 +31,39 @@ GROWTH = 1.0
 
 def with_learned_slopes(
     problem: Problem, search: Search, learned: Learned, progress: Progress | None = None
-) -> tuple[Problem, Learned]:
+) -> tuple[Problem, Learned, tuple[str, ...]]:
     """The problem with the slopes of its learned forces, and what is learned with them.
 
-    Nothing changes if a force is a function of time.
+    Nothing changes if a force is a function of time, or if the slopes cannot be computed or learned with, as
+    those of a force that is not made of tensors; a warning says so.
 
     Args:
         problem: exact, with noise of the state and the slopes of the robot file.
         search: what is learned and what is held.
         learned: what was learned of the problem.
         progress: called after each evaluation.
+
+    Returns:
+        The problem, what is learned, and warnings.
     """
     if any(prior.in_time for prior in problem.priors):
-        return problem, learned
+        return problem, learned, ()
     for _ in range(ROUNDS):
         values = {**search.held, **learned.tensors}
         posterior, system = force_posterior(problem, values), problem.system_at(values)
-        training = learned_slopes(problem.training, system, posterior)
-        again = dataclasses.replace(problem, training=training)
-        found = search.solve(again, progress, learned.tensors)
+        try:
+            training = learned_slopes(problem.training, system, posterior)
+            again = dataclasses.replace(problem, training=training)
+            found = search.solve(again, progress, learned.tensors)
+        except (NumericalError, RuntimeError) as cause:
+            text = "the slopes of the learned forces, which noise of the state asks for, cannot be used"
+            return problem, learned, (f"{text}: {str(cause).splitlines()[0]}",)
         growth = learned.value - found.value
         if growth > 0.0:
             problem, learned = again, found
-        if growth < GROWTH:
+        if not growth >= GROWTH:
             break
-    return problem, learned
+    return problem, learned, ()
 
 
 def without_slopes(problem: Problem) -> Problem:

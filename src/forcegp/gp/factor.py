@@ -65,7 +65,9 @@ def extended(L: Tensor, rows: Tensor) -> Tensor:
     Raises:
         NumericalError: LAPACK refuses the arguments.
     """
-    kernel = _kernel() if L.dtype == torch.float64 and len(rows) else None
+    plain = all(x.dtype == torch.float64 and x.device.type == "cpu" for x in (L, rows))
+    fits = L.shape[0] == L.shape[1] == rows.shape[1] and len(rows) > 0
+    kernel = _kernel() if plain and fits else None
     if kernel is None:
         return _extended_by_lapack(L, rows)
     upper, below = L.mT.contiguous(), rows.clone(memory_format=torch.contiguous_format)

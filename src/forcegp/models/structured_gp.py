@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError
-from forcegp.forces.inference import check_method, require_double
+from forcegp.forces.inference import check_method, is_sparse, require_double
 from forcegp.forces.measurements import Training
 from forcegp.forces.observations import NoiseStd, Observation
 from forcegp.forces.posterior import ForcePosterior
@@ -217,6 +217,8 @@ class StructuredGP(Model[StructuredFit]):
         if self._fitted is None:
             self.specification = self.specification.for_data(known)
         chosen = None if learn is None else chosen_of(self.specification, learn)
+        if chosen == () and self._fitted is not None and not isinstance(data, StreamedDataset):
+            return self.condition(data)
         given = given_to(self.specification, self._fitted, known, chosen)
         self.specification, training = given.specification, given.training
         spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
@@ -267,7 +269,9 @@ class StructuredGP(Model[StructuredFit]):
                 hint='call fit(data, learn=["noise"]), which learns the noise alone',
             )
         values = fitted.hyperparameters if hyperparameters is None else hyperparameters
-        spec, training = self.specification, fitted.with_slopes(training)
+        spec, priors = self.specification, fitted.problem.priors
+        if not is_sparse(spec.inference, priors, training.all_samples):
+            training = fitted.with_slopes(training)
         problem = prepared(spec, dataclasses.replace(fitted.problem, training=training), values)
         return self.adopt(conditioned(spec, problem, values, warnings=doubts))
 

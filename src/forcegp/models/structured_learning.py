@@ -255,10 +255,19 @@ def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[s
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
     record, robot = pack_system(problem.system)
     named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
-    state = () if problem.state_std is None else (problem.state_std,)
+    scales = [x for scale in training.scales for side in (scale.mean, scale.std) for x in side.values()]
+    noise = [*training.noise_std, *(x for x in (problem.state_std, problem.torque_std) if x is not None)]
+    options = (
+        spec.inference,
+        spec.inducing_points,
+        spec.degrees_of_freedom,
+        spec.standardize,
+        search.options,
+    )
     return Checkpoint.key_of(
-        problem.mean, priors, spec.inference, search.options, training.quantities, *data, *training.noise_std,
-        record, *robot.values(), *(part for pair in named for part in pair), *state,
+        problem.mean, priors, problem.pinned, options, training.quantities, training.part_of, *data, *noise,
+        *scales, *problem.offsets, *problem.offsets.values(), record, *robot.values(),
+        *(part for pair in named for part in pair),
     )  # fmt: skip
 
 
@@ -288,11 +297,13 @@ def solve(
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)
     learned, learned_on = search.solve(part, progress, begin), part.training.samples
+    warnings: list[str] = []
     values = {**search.held, **learned.tensors}
     if part.state_std is not None and not is_sparse(
         spec.inference, part.priors, problem.training.all_samples
     ):
-        part, learned = with_learned_slopes(part, search, learned, progress)
+        part, learned, doubts = with_learned_slopes(part, search, learned, progress)
+        warnings += doubts
         values = {**search.held, **learned.tensors}
     if spec.degrees_of_freedom is not None:
         for _ in range(ROUNDS):
@@ -311,11 +322,10 @@ def solve(
     training = dataclasses.replace(problem.training, slopes=part.training.slopes)
     whole = dataclasses.replace(part, training=training, inducing=None)
     whole = prepared(spec, whole, values)
-    warnings = ()
     if spec.degrees_of_freedom is not None and (count := left_out(whole)):
         samples = whole.training.samples
-        warnings = (f"{count} of {samples} samples lie far outside the noise and hardly count",)
-    return Lesson(whole, values, learned, learned_on, warnings)
+        warnings.append(f"{count} of {samples} samples lie far outside the noise and hardly count")
+    return Lesson(whole, values, learned, learned_on, tuple(warnings))
 
 
 def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:
@@ -325,7 +335,7 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
     piece by piece, a few contiguous stretches are looked at.
     """
     power, correlation = residual_times(part, values, training)
-    if part.training is training:
+    if part.training.measurements is training.measurements:
         power = part.power
     share = training.samples / training.all_samples
     return dataclasses.replace(part, power=power * share, correlation=correlation)

@@ -80,6 +80,7 @@ def _specification(
         settings.inference,
         settings.inducing_points,
         state_noise=settings.state_noise,
+        inertia=settings.inertia,
         standardize=settings.standardize,
         degrees_of_freedom=settings.degrees_of_freedom,
     )

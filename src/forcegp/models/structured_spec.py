@@ -221,6 +221,7 @@ class StructuredSettings(Settings):
     inducing_points: PositiveInt = LIMIT
     standardize: bool = True
     degrees_of_freedom: float | None = Field(default=None, gt=2.0)
+    inertia: Literal["file", "auto"] | None = None
     power: float = Field(gt=0.0, le=1.0)
     correlation_time: float = Field(default=0.0, ge=0.0)
     priors: tuple[dict[str, Any], ...]
@@ -280,6 +281,7 @@ def _settings_of(
         inducing_points=spec.inducing_points,
         standardize=spec.standardize,
         degrees_of_freedom=spec.degrees_of_freedom,
+        inertia=spec.inertia,  # pyright: ignore[reportArgumentType]
         power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,

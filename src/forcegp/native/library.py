@@ -39,7 +39,7 @@ def find_compiler() -> str:
     raise MissingDependencyError(
         "compiled kernels need a C++ compiler and none was found",
         expected=" or ".join(wanted) + " on the PATH",
-        hint="install one (for example: apt install g++), set CXX, or use forcegp.dynamics, which needs none",
+        hint="install one (for example: apt install g++), or set CXX",
     )
 
 
@@ -61,12 +61,19 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
         level: of optimisation.
 
     Raises:
-        MissingDependencyError: no compiler, it failed, or the cache cannot be written or trusted.
+        MissingDependencyError: there is no compiler, it failed, or the cache cannot be written or trusted.
     """
     compiler = find_compiler()
-    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    try:
+        version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+        place = cache.cache_directory()
+    except (OSError, RuntimeError) as cause:
+        raise MissingDependencyError(
+            "the C++ compiler or the folder of its results cannot be used",
+            got=str(cause),
+            hint="set CXX to a C++ compiler, and FORCEGP_CACHE to a folder that can be written",
+        ) from cause
     key = hashlib.sha256("\0".join([source, version, _machine(), level, *FLAGS]).encode()).hexdigest()[:32]
-    place = cache.cache_directory()
     try:
         folder = cache.private_folder(place)
         kept = cache.find(folder, key)
@@ -105,5 +112,5 @@ def _run_compiler(compiler: Sequence[str], source: str, library: Path) -> None:
         raise MissingDependencyError(
             f"the C++ compiler {compiler[0]} could not build the kernel",
             got=done.stderr.strip()[-2000:],
-            hint="set CXX to a recent GCC or Clang, or use forcegp.dynamics, which needs no compiler",
+            hint="set CXX to a recent GCC or Clang",
         )

@@ -39,7 +39,8 @@ def draw_overview(report: Report) -> Picture:
             least = report.samples / 300.0
             spans = [(a, max(b - a, least)) for a, b in finding.intervals]
             axes.broken_barh(spans, (lane - 0.35, 0.7), color=COLOURS[finding.severity], linewidth=0)
-        axes.set_yticks(range(len(report.findings)), [finding.kind for finding in reversed(report.findings)])
+        lanes = [" or ".join(finding.kinds) for finding in reversed(report.findings)]
+        axes.set_yticks(range(len(lanes)), lanes)
         axes.set_xlim(0, report.samples)
         axes.set_xlabel("row")
 

@@ -107,7 +107,8 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
     """Check that priors fit a system and have names of their own, which prefix their hyperparameters.
 
     Raises:
-        ModelError: no prior is given, two share a name, or a name is not one word.
+        ModelError: no prior is given, two share a name, a name is not one word, or a prior shares the
+            hyperparameters of one that is missing.
         UnknownNameError: a prior names a contact that the system does not have.
     """
     names = [prior.name for prior in priors]
@@ -120,6 +121,12 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
                 expected=f"a name without dots that is none of {', '.join(RESERVED)}",
             )
     for prior in priors:
+        if prior.prefix not in names:
+            raise ModelError(
+                f"force prior {prior.name!r} shares the hyperparameters of a prior that is missing",
+                expected=f"{prior.prefix!r} among the priors",
+                got=", ".join(names),
+            )
         prior.check(system)
 
 

@@ -73,8 +73,7 @@ class PerJointPrior(ForcePrior):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if "operator" in vars(cls):
-            cls.per_joint = False
+        cls.per_joint = cls.operator is PerJointPrior.operator
 
     def outputs(self, robot: RobotModel) -> int:
         return robot.nq

@@ -1,0 +1,120 @@
+"""Logs that are in order but unusual: at rest, passive, unordered, never in contact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from forcegp.checks import Log, check, log_of
+from forcegp.checks.alternatives import _possible, with_alternatives
+from forcegp.checks.finding import Finding
+from forcegp.checks.fit import cross_validate
+from forcegp.checks.hypotheses import Hypothesis, problem_of, unchanged
+from forcegp.constraints import ConstrainedSystem
+from forcegp.scene import load_scene
+from forcegp.simulate import simulate
+
+Case = tuple[ConstrainedSystem, Log]
+
+
+@pytest.fixture(scope="module")
+def wire() -> Case:
+    """The double pendulum on a wire, with lifts."""
+    scene = load_scene("pendulum_wire")
+    config = replace(scene.simulation, duration=8.0, lift_probability=0.3, seed=3)
+    return scene.system(), log_of(simulate(scene.system(), config).data)
+
+
+def kinds_of(case: Case) -> set[str]:
+    return {kind for finding in check(*case).findings for kind in finding.kinds}
+
+
+def rested(log: Log, rows: int) -> Log:
+    """The log after a rest in the first pose that is in contact."""
+    first = int(np.argmax(log.contact["wire"]))
+
+    def led(x: np.ndarray, value: float | None = None) -> np.ndarray:
+        head = np.repeat(x[first : first + 1], rows, axis=0)
+        return np.concatenate([head if value is None else np.full_like(head, value), x])
+
+    t = np.concatenate([log.t[0] - log.dt * np.arange(rows, 0, -1), log.t])
+    contact = {"wire": led(log.contact["wire"])}
+    segment = np.concatenate([np.zeros(rows, np.int64), log.segment + 1])
+    return log.replace(
+        t=t, q=led(log.q), qd=led(log.qd, 0.0), qdd=led(log.qdd, 0.0), tau=led(log.tau), contact=contact,
+        segment=segment,
+    )  # fmt: skip
+
+
+def unlabelled(log: Log, kept: int = 0) -> Log:
+    closed = np.flatnonzero(log.contact["wire"])
+    return log.replace(contact={"wire": np.isin(np.arange(len(log)), closed[:kept])})
+
+
+def test_a_rest_in_contact_hides_no_contact_that_was_missed(wire: Case) -> None:
+    system, log = wire
+    closed = np.flatnonzero(log.contact["wire"])
+    missed = log.contact["wire"].copy()
+    missed[closed[len(closed) // 2 :][:60]] = False
+    wrong = log.replace(contact={"wire": missed})
+    assert "contact-missed" in kinds_of((system, wrong))
+    assert "contact-missed" in kinds_of((system, rested(wrong, len(closed))))
+    assert not {"contact-missed", "contact-early"} & kinds_of((system, rested(log, len(closed))))
+
+
+@pytest.mark.parametrize("kept", [0, 10])
+def test_a_contact_column_that_is_hardly_ever_true(wire: Case, kept: int) -> None:
+    system, log = wire
+    assert "contact-missed" in kinds_of((system, unlabelled(log, kept)))
+
+
+def test_one_joint_without_torque_is_a_warning(wire: Case) -> None:
+    system, log = wire
+    tau = log.tau.copy()
+    tau[:, 1] = 0.0
+    report = check(system, log.replace(tau=tau))
+    (found,) = (finding for finding in report.findings if finding.kind == "torque-zero")
+    assert found.severity == "warning" and found.joints == (log.joint_names[1],)
+
+
+def test_an_arm_at_rest_says_nothing_of_the_clock(wire: Case) -> None:
+    system, log = wire
+    still = np.repeat(log.q[:1], len(log), axis=0)
+    kinds = kinds_of((system, log.replace(q=still, qd=0 * log.qd, qdd=0 * log.qdd)))
+    assert "joint-still" in kinds and not {"time-scale", "time-unit", "log-short"} & kinds
+
+
+def test_what_cannot_be_judged_is_told(wire: Case) -> None:
+    system, log = wire
+    pieces = log.replace(segment=np.arange(len(log), dtype=np.int64) // 30)
+    assert "fewer than 200 rows" in check(system, pieces).skipped["dynamics"]
+    apart = log.replace(
+        segment=np.arange(len(log), dtype=np.int64), header=log.header.model_copy(update={"ordered": False})
+    )
+    assert check(system, apart).samples == len(log)
+
+
+def test_alternatives_of_one_kind_are_named_once() -> None:
+    def of(kind: str, text: str, *joints: str) -> Finding:
+        return Finding(kind, text, ((0, 1),), joints)
+
+    gain, late, later = of("torque-gain", "gain", "a"), of("torque-delay", "8 rows"), of("torque-delay", "11")
+    found = with_alternatives(gain, [late, later, of("torque-gain", "again", "a", "b")])
+    assert found.alternatives == (late,)
+    assert found.to_dict()["kinds"] == ["torque-gain", "torque-delay"]
+
+
+@pytest.mark.parametrize(("change", "possible"), [(0.0, True), (1.0, True), (-10.0, False)])
+def test_a_link_without_mass_may_stay_without(wire: Case, change: float, possible: bool) -> None:
+    system, log = wire
+    robot = system.robot
+    massless = replace(system, robot=robot.replace(mass=robot.mass * (robot.mass == robot.mass.max())))
+    rows = log.rows(400, margin=20)
+    columns = np.zeros((len(rows), log.nq, 10 * log.nq))
+    masses = Hypothesis("masses", 20, unchanged, columns)
+    fit = cross_validate(problem_of(massless, log, rows), columns)
+    theta = np.zeros(10 * log.nq)
+    theta[10 * int(np.argmax(robot.mass.numpy()))] = change
+    assert _possible(massless, masses, replace(fit, theta=theta)) == possible
