@@ -41,6 +41,8 @@ def check(
 
     forcegp check --robot ur3.urdf --data run.parquet
     """
+    from threadpoolctl import threadpool_limits
+
     from forcegp.checks import check as run
     from forcegp.checks import read_log
     from forcegp.destination import check_destination, write_or_keep
@@ -50,7 +52,8 @@ def check(
         check_apart(out, data)
     system = system_of(scene, robot)
     log = read_log(data)
-    with progress_bar("checking", 1) as progress:
+    # Matrices are small: threads of BLAS cost more than they save, and two checks at once would fight.
+    with progress_bar("checking", 1) as progress, threadpool_limits(1, user_api="blas"):
         report = run(system, log, progress=progress)
     if out is not None:
         from forcegp.report.check import write_check
