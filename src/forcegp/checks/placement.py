@@ -39,12 +39,7 @@ STEPS = 6
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
     """Joints that turn the other way, are exchanged or have an offset, told by the tip in contact."""
-    for contact in system.contacts:
-        if not isinstance(contact, SurfaceContact) or contact.name not in log.contact:
-            continue
-        rows = np.flatnonzero(log.contact[contact.name] & log.usable)
-        if len(rows) < LEAST_ROWS:
-            continue
+    for contact, rows in _touching(system, log):
         path = tip_path(system, contact, log)
         if abs(np.median(path.c[rows])) <= FAR:
             continue
@@ -57,16 +52,20 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
     return [], log
 
 
+def _touching(system: ConstrainedSystem, log: Log) -> Iterator[tuple[SurfaceContact, np.ndarray]]:
+    """The contacts with surfaces that are labelled as closed in enough rows, and these rows."""
+    for contact in system.contacts:
+        if isinstance(contact, SurfaceContact) and contact.name in log.contact:
+            rows = np.flatnonzero(log.contact[contact.name] & log.usable)
+            if len(rows) >= LEAST_ROWS:
+                yield contact, rows
+
+
 def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
     """Whether changed angles take a tip off the surface in rows that are labelled as contact."""
     if after.q is before.q:
         return False
-    for contact in system.contacts:
-        if not isinstance(contact, SurfaceContact) or contact.name not in before.contact:
-            continue
-        rows = np.flatnonzero(before.contact[contact.name] & before.usable)
-        if len(rows) < LEAST_ROWS:
-            continue
+    for contact, rows in _touching(system, before):
         rows = rows[:: max(1, len(rows) // ROWS)]
         if _off(system, contact, before, rows) <= FAR < _off(system, contact, after, rows):
             return True
