@@ -6,22 +6,28 @@ solution λ = (I + LᵀU)⁻¹ λ₀. So at a given μ every quantity remains an
 and offset B_Q, B_z, o become
 
     B_Q − G Lᵀ,  B_z − G Lᵀ,  o + G (A M⁻¹ Aᵀ)⁺ b   with   G = B_z U (I + LᵀU)⁻¹.
+
+Learned μ and ε are uncertain. To first order in their errors δ, friction differs by ∂(μ u λ)/∂(log μ, log ε) δ
+at fixed λ, a contact force to which λ responds as to any other. So δ is one more latent force: the posterior
+over all of them is the Laplace approximation with δ marginalised, and contains (∂z/∂δ)² Var δ of every quantity.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Measurement
-from forcegp.forces.priors.base import COULOMB, ForcePrior
+from forcegp.forces.priors.base import CONTACT, COULOMB, ForcePrior
 from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.quantities import AffineMap, States
+from forcegp.gp.kernels import Constant, Kernel
+from forcegp.robot.model import RobotModel
 
 SHARP = 1e-6
 """A smoothing speed so small that all friction has its full size [m/s]."""
@@ -31,6 +37,8 @@ FRICTION_COEFFICIENT = 0.2
 """Where learning a friction coefficient begins."""
 NEARLY_JAMMED = 0.95
 """Largest friction coefficient that is considered, relative to the one at which the contact jams."""
+LEARNED = 2
+"""Numbers that are learned of the friction of a contact: μ and ε."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +84,45 @@ def coulomb_of(
 
 def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
     return [p for p in priors if isinstance(p, SlidingFrictionPrior) and p.coupled]
+
+
+@dataclass(frozen=True, eq=False)
+class CoulombErrorPrior(ForcePrior):
+    """Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ, δ ~ N(0, 1): what learning leaves unknown of a contact's friction.
+
+    λ̂ is the multiplier of the analytical forces with the learned friction. One e-fold is about the width of
+    the weak priors that μ and ε are learned with (`forces/start.py`).
+
+    Attributes:
+        contact: whose friction is uncertain.
+        friction: learned friction of all contacts, on which λ̂ depends.
+    """
+
+    contact: str
+    friction: tuple[CoulombFriction, ...]
+    kernel: Kernel = field(default_factory=lambda: Constant(group=LEARNED))
+    target: str = CONTACT
+
+    @property
+    def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return f"{COULOMB}_error_{self.contact}"
+
+    def outputs(self, robot: RobotModel) -> int:
+        return LEARNED
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return {"one": torch.zeros_like(at.q[:, :1])}
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        if self.contact not in system.contact_names:
+            return at.q.new_zeros(*at.q.shape, LEARNED)
+        own = next(f for f in self.friction if f.contact == self.contact)
+        v, u = at.eom.contact_points[self.contact].sliding[1], against_sliding(at, self.contact, own.smoothing)
+        Q_bar = with_coulomb(system, at, at.eom.Q_K + at.tau, self.friction)
+        load = own.coefficient * at.eom.multiplier(Q_bar)[:, _row(system, self.contact)]
+        # ∂s/∂log ε = −s ε²/(|v|² + ε²)
+        fading = own.smoothing**2 / (v.square().sum(-1) + own.smoothing**2)
+        return torch.stack([load, -load * fading], dim=-1)[:, None, :] * u[..., None]
 
 
 def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tensor:

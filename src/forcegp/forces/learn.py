@@ -11,14 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.coulomb import CoulombFriction, coulomb_of
+from forcegp.forces.coulomb import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForcePrior
 from forcegp.forces.projection import ForceMean, ForceNoise, WhitenedRows, combine, whiten
 from forcegp.forces.state_noise import state_jacobian
 from forcegp.forces.torque_noise import TORQUE_NOISE, stick_variance
 from forcegp.gp.bound import negative_bound
-from forcegp.gp.features import Features
+from forcegp.gp.features import Features, Standardization
 from forcegp.gp.kernels import sub
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.structured_covariance import Block
@@ -107,6 +107,23 @@ class Problem:
     def has_coulomb(self) -> bool:
         """Whether a prior goes with Coulomb friction that is proportional to the multiplier."""
         return any(prior.coupled for prior in self.priors)
+
+    def with_coulomb_errors(self, tensors: Mapping[str, Tensor]) -> tuple[Problem, Tensors]:
+        """The problem with what is unknown of learned Coulomb friction as one more force, and its tensors.
+
+        It is conditioned on, not learned with: there, the friction itself is what explains the data.
+        """
+        friction = self.coulomb(tensors)
+        priors = tuple(CoulombErrorPrior(f.contact, friction) for f in friction)
+        one = self.system.robot.mass.new_zeros(1, 1)
+        scales = (Standardization.none({"one": one}),) * len(priors)
+        inducing = None if self.inducing is None else (*self.inducing, *({"one": one[:0]} for _ in priors))
+        return dataclasses.replace(
+            self,
+            priors=(*self.priors, *priors),
+            training=dataclasses.replace(self.training, scales=(*self.training.scales, *scales)),
+            inducing=inducing,
+        ), {**tensors, **{f"{prior.name}.log_scale": one[0] for prior in priors}}
 
     def force_noise(self, tensors: Mapping[str, Tensor]) -> ForceNoise | None:
         """Variance of the white noise on the joint force, or `None` for none."""

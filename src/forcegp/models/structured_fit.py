@@ -164,7 +164,8 @@ class StructuredFit(FittedModel):
     def _problem_of(self, measurements: Training) -> Problem:
         """The problem with other measurements and the learned robot, whose mechanics are compiled."""
         system = compiled_system(self.system)
-        return dataclasses.replace(self.problem, training=measurements, system=system, parameters=None)
+        problem = dataclasses.replace(self.problem, training=measurements, system=system, parameters=None)
+        return problem.with_coulomb_errors(self.hyperparameters)[0]
 
     def without(self, measurements: Training) -> StructuredFit:
         """The fit without samples that it was conditioned on.
@@ -323,7 +324,7 @@ def conditioned(
     """
     measured = enumerate(problem.training.measurements)
     noise = {m.quantity: typical(problem.noise_at(hyperparameters, i)) for i, m in measured}
-    posterior, constant = forces or forces_and_constant(problem, hyperparameters)
+    posterior, constant = forces or forces_and_constant(*problem.with_coulomb_errors(hyperparameters))
     lost, more_points = lost_by_inducing(posterior)
     likelihood, jitter = log_likelihood(posterior) - float(constant), posterior.latent.jitter
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")

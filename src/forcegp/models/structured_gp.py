@@ -236,7 +236,7 @@ class StructuredGP(Model[StructuredFit]):
         lesson, saved = learned(spec, problem, search, file, progress, begin, neighbours)
         values, doubts = lesson.hyperparameters, (*given.doubts, *lesson.warnings)
         if log is not None and lesson.problem.inducing is not None:
-            forces = log.forces(lesson.problem, values)
+            forces = log.forces(*lesson.problem.with_coulomb_errors(values))
         fitted = self.adopt(
             conditioned(spec, lesson.problem, values, lesson.learned, doubts, lesson.learned_on, forces)
         )

@@ -167,7 +167,7 @@ def _restored(
         torque_std=tensors.get("torque_std"),
         pinned=settings.pinned,
     )
-    posterior = _posterior(problem, hyper, tensors)
+    posterior = _posterior(*problem.with_coulomb_errors(hyper), tensors)
     constant = tuple(
         f"{p.name}.{name}"
         for p, scale in zip(spec.priors, training.scales, strict=True)
