@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,22 @@ import torch
 from torch import Tensor
 
 import forcegp
-from forcegp.forces.coulomb import CoulombFriction, below_jamming, coulomb_keys, coupled, with_coulomb
+from forcegp.forces.coulomb import (
+    CoulombErrorPrior,
+    CoulombFriction,
+    below_jamming,
+    coulomb_keys,
+    coupled,
+    with_coulomb,
+)
+from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.quantities import States, affine_map, states
+from forcegp.forces.samples import ForceSamples
+from forcegp.gp.kernels import Linear
 from forces.cases import CONTACTS, draw, logged, mixed_contacts, two_contacts
 from random_data import table_system
 
@@ -25,6 +36,10 @@ DENSE = 1e-8
 """Agreement of two solves of the same equations in double precision, relative to forces of 100 N m."""
 GRADIENT = 1e-5
 """Of central differences with steps of 1e-5 on values of order 100."""
+WIDTH_MU, WIDTH_EPS = 1.4e-3, 0.1
+"""Scale of a grid over log μ and log ε, about the standard deviations that 30 samples leave."""
+INTEGRATED = 0.02
+"""Relative error of a standard deviation by a Laplace approximation with 30 samples."""
 
 
 def friction() -> list[CoulombFriction]:
@@ -126,6 +141,25 @@ def test_the_coefficient_is_learned_and_the_multiplier_found(tmp_path: Path) -> 
     assert torch.equal(read.mean, again.mean) and torch.equal(read.variance, again.variance)
 
 
+def test_updates_and_samples_carry_the_error_of_learned_friction() -> None:
+    train, test = pressed(0.12, 30), pressed(0.12, 10, seed=7)
+    prior = SlidingFrictionPrior("table", Linear(), coupled=True)
+    model = forcegp.StructuredGP(table_system(), "analytical", [prior], noise_std=0.05, torque_noise=None)
+    fit = model.fit(train[:20])
+    updated = model.update(train[20:])
+    model.adopt(fit)
+    whole = model.condition(train)
+    one, other = (f.predict(test.q, test.qd, test.tau, "multiplier").variance for f in (updated, whole))
+    assert one is not None and other is not None
+    torch.testing.assert_close(one, other, rtol=1e-6, atol=0.0)
+    samples = whole.force_samples(4000, torch.Generator().manual_seed(0))
+    assert isinstance(samples, ForceSamples)
+    at = states(whole.system, test.q, test.qd, test.tau, torch.ones(10, 1, dtype=torch.bool))
+    multiplier = at.eom.multiplier(sum(samples.forces(whole.system, at)))
+    spread = multiplier[..., 0].var(0) / other[:, 0]
+    assert float((spread - 1.0).abs().max()) < 5.0 * math.sqrt(2.0 / 4000)
+
+
 def test_accelerations_follow_from_the_force_field() -> None:
     fit = forcegp.StructuredGP(
         two_contacts(), "analytical", [JointFrictionPrior(), SlidingFrictionPrior("table", coupled=True)], 0.1
@@ -174,3 +208,52 @@ def unit_friction_of_table(at: States, i: int) -> np.ndarray:
     J = at.eom.contact_points["table"].jacobian[i].numpy() * np.array([[1.0], [1.0], [0.0]])
     v = J @ at.qd[i].numpy()
     return -J.T @ v / np.linalg.norm(v)
+
+
+def test_the_error_of_learned_friction_acts_as_its_derivative() -> None:
+    at, system, names = at_states(), two_contacts(), list(CONTACTS)
+    laws = friction()
+    for k, contact in enumerate(names):
+        E = CoulombErrorPrior(contact, tuple(laws)).operator(system, at)
+        z = coupled(system, at, affine_map(system, at, "multiplier"), laws)
+        found = z.B_z @ E
+        for j, key in enumerate(("coefficient", "smoothing")):
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = list(laws)
+                value = getattr(laws[k], key) * math.exp(sign * 1e-5)
+                moved[k] = dataclasses.replace(laws[k], **{key: value})
+                ends.append(at.eom.multiplier(with_coulomb(system, at, at.eom.Q_K + at.tau, moved)))
+            difference = (ends[0] - ends[1]) / 2e-5
+            torch.testing.assert_close(found[..., j], difference, rtol=1e-4, atol=1e-4)
+
+
+def test_the_multiplier_is_as_uncertain_as_learned_friction_leaves_it() -> None:
+    """The variance of λ against an integral over (log μ, log ε) on a grid, at given θ_v and θ_d."""
+    train, test = pressed(0.12, 30), pressed(0.12, 20, seed=7)
+    prior = SlidingFrictionPrior("table", Linear(), coupled=True)
+    model = forcegp.StructuredGP(
+        table_system(), "analytical", [prior], noise_std=0.05, torque_noise=None, inference="exact"
+    )
+    fit, keys = model.fit(train), coulomb_keys("table")
+    at = states(fit.system, test.q, test.qd, test.tau, torch.ones(20, 1, dtype=torch.bool))
+    z = affine_map(fit.system, at, "multiplier")
+    centre = torch.stack([fit.hyperparameters[key] for key in keys])
+    means, variances, losses = [], [], []
+    steps = torch.linspace(-4.0, 4.0, 9, dtype=torch.float64)
+    for move in torch.cartesian_prod(steps * WIDTH_MU, steps * WIDTH_EPS):
+        values = {**fit.hyperparameters, **dict(zip(keys, centre + move, strict=True))}
+        rows = fit.problem.rows(values)
+        loss = fit.problem.negative_log_likelihood(kernel_parameters(values), rows)
+        mean, covariance = force_posterior(fit.problem, values).read(fit.system, at, z)
+        means.append(mean[:, 0])
+        variances.append(covariance[:, 0, 0])
+        losses.append(loss + 0.5 * move.square().sum())
+    weights = torch.softmax(-torch.stack(losses), 0)[:, None]
+    mean = (weights * torch.stack(means)).sum(0)
+    expected = (weights * (torch.stack(variances) + (torch.stack(means) - mean) ** 2)).sum(0)
+    found = fit.predict(test.q, test.qd, test.tau, "multiplier").variance
+    assert found is not None
+    alone = force_posterior(fit.problem, fit.hyperparameters).read(fit.system, at, z)[1][:, 0, 0]
+    torch.testing.assert_close(found[:, 0].sqrt(), expected.sqrt(), rtol=INTEGRATED, atol=0.0)
+    assert bool((alone.sqrt() < 0.8 * expected.sqrt()).any()), "the friction hardly matters here"

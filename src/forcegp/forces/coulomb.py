@@ -117,7 +117,10 @@ class CoulombErrorPrior(ForcePrior):
         if self.contact not in system.contact_names:
             return at.q.new_zeros(*at.q.shape, LEARNED)
         own = next(f for f in self.friction if f.contact == self.contact)
-        v, u = at.eom.contact_points[self.contact].sliding[1], against_sliding(at, self.contact, own.smoothing)
+        v, u = (
+            at.eom.contact_points[self.contact].sliding[1],
+            against_sliding(at, self.contact, own.smoothing),
+        )
         Q_bar = with_coulomb(system, at, at.eom.Q_K + at.tau, self.friction)
         load = own.coefficient * at.eom.multiplier(Q_bar)[:, _row(system, self.contact)]
         # ∂s/∂log ε = −s ε²/(|v|² + ε²)
