@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from forcegp.paper.learning import FLOOR, TASK, UNKNOWN, curve_table
-from forcegp.paper.page import findings, render_markdown
+from forcegp.paper.page import findings, render_markdown, render_page
 from forcegp.paper.results import Results, paper_numbers
 from forcegp.paper.scores import error_table, overview_table
 from forcegp.paper.trajectories import bands, tip_error
@@ -57,7 +57,9 @@ def test_the_curve_table_has_both_splits_and_the_paper() -> None:
 
 
 def test_readings_of_results_that_bear_the_paper_out() -> None:
-    assert reading("Order").agrees and "worse than the GP" in reading("Order").text
+    network = [score("nn", 5000, "stretches", noisy_mae=0.26)]
+    fair = results([s for s in results().scores if s.model != "nn"] + network)
+    assert reading("Order", fair).agrees and "0.120, as in the paper" in reading("Order", fair).text
     assert reading("Constraint").agrees
     assert reading("Multiplier").agrees
     assert reading("Identification").agrees and "from evaluation 2 on" in reading("Identification").text
@@ -85,6 +87,33 @@ def test_readings_of_results_that_do_not() -> None:
     ):
         assert reading(topic, results(bad), **changes).agrees is False, topic
     assert "N = 200: 0.310, paper 0.28" in reading("GP against", results(bad)).text
+
+
+@pytest.mark.parametrize(
+    ("model", "error"), [("nn", 1.0), ("nn", 0.1), ("analytical", 0.1), ("sgp-zero", 0.3)]
+)
+def test_the_order_covers_every_model_that_it_names(model: str, error: float) -> None:
+    fair = {"nn": 0.26, model: error}
+    kept = [s for s in results().scores if s.model not in fair]
+    own = [
+        score(m, points, "stretches", noisy_mae=e)
+        for m, e in fair.items()
+        for points in ((100, 200) if m == "sgp-zero" else (5000,))
+    ]
+    found = reading("Order", results([*kept, *own]))
+    assert found.agrees is False and f"{error:.3f}" in found.text and "in the paper" in found.text
+
+
+def test_comparisons_with_the_paper_do_not_confirm_it() -> None:
+    assert reading("S-GP, analytical mean against").verdict == "lower (task differs)"
+    assert reading("Points needed").verdict in ("fewer (task differs)", "more (task differs)")
+    assert "against the paper**: lower (task differs). " in render_markdown(results(), figures())
+    assert reading("Constraint").verdict == "confirmed" and reading("Held-out").verdict is None
+
+
+def test_no_page_calls_the_multiplier_a_result_of_accelerations_alone() -> None:
+    text = render_markdown(results(), figures()) + render_page(results(), figures())
+    assert "accelerations alone" not in text
 
 
 def test_comparisons_with_the_paper_name_its_unknown_settings_in_favourable_cases_too() -> None:

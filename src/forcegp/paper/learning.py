@@ -24,6 +24,9 @@ FLOOR = (2.0 / torch.pi) ** 0.5
 PAPER_LINE, KERNEL_LINE = (0, (2, 1.5)), (0, (6, 1.5))
 UNKNOWN = "The paper does not fully state its task settings."
 """Part of every comparison with the paper, favourable or not."""
+ERROR_WORDS = ("lower (task differs)", "higher (task differs)")
+POINTS_WORDS = ("fewer (task differs)", "more (task differs)")
+"""Verdicts of comparisons with the paper's errors and numbers of points: the task is not the same."""
 WIDE = 5000
 """Training points from which they are drawn on a logarithmic axis."""
 TASK = (
@@ -213,7 +216,7 @@ def against_paper(results: Results, paper: PaperNumbers, model: str) -> Finding 
     if same != model:
         n, best = max(results.sizes(model)), results.mean(model, "selection", None, "noisy_mae")
         text += "" if best is None else f". With our default kernels {best:.3f} at N = {n}"
-    return Finding(f"{label(model)} against the paper", not above, f"{text}. {UNKNOWN}")
+    return Finding(f"{label(model)} against the paper", not above, f"{text}. {UNKNOWN}", ERROR_WORDS)
 
 
 def efficiency(results: Results, paper: PaperNumbers) -> Finding | None:
@@ -236,4 +239,4 @@ def efficiency(results: Results, paper: PaperNumbers) -> Finding | None:
         f"accelerations "
         f"separates models. {UNKNOWN}"
     )
-    return Finding("Points needed", reached[0], text)
+    return Finding("Points needed", reached[0], text, POINTS_WORDS)

@@ -69,7 +69,7 @@ class MultiplierData(Header):
 def predicted_multiplier(
     models: Mapping[str, Model], data: Dataset, c: Tensor, held_out: Tensor
 ) -> MultiplierData:
-    """The first contact's multiplier by several models, conditioned on accelerations alone (eq. 25).
+    """The first contact's multiplier by several models, conditioned on accelerations (eq. 25).
 
     Args:
         models: fitted structured models by name.
@@ -119,9 +119,9 @@ def multiplier_block(data: MultiplierData) -> Block:
     return Block(
         "Figure 2: surface error and multiplier",
         "The error of the surface equation in simulation, and the Lagrange multiplier λ (the normal force) "
-        "predicted from accelerations alone, beside the simulator's own. The shaded time contains no "
-        "training "
-        "point. The lower panels show the same relative to the simulator's value. Bands are ±2σ.",
+        "that the equations of motion give with the forces learned from accelerations, beside the "
+        "simulator's own. The shaded time contains no training point. The lower "
+        "panels show the same relative to the simulator's value. Bands are ±2σ.",
         (draw_constraint(data), *(draw_multiplier(data, band) for band in data.bands)),
         "stages/figures/multiplier/data.json",
     )
@@ -144,7 +144,7 @@ def draw_constraint(data: MultiplierData) -> Picture:
 
 
 def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> Picture:
-    """The multiplier predicted from accelerations beside the simulator's (bottom)."""
+    """The predicted multiplier beside the simulator's (bottom)."""
     mean, simulated = as_tensor(band.mean), as_tensor(data.simulated)
     spread, shown = BAND * as_tensor(band.std), colour(band.model)
 
@@ -182,7 +182,10 @@ def multiplier_finding(data: MultiplierData) -> Finding | None:
     )
     informed = [b for b in data.bands if b.model != "sgp-zero"]
     agrees = all(b.inside >= INSIDE and b.smallest > 0.0 for b in informed)
-    text = f"λ predicted from accelerations alone, over {data.t[-1] - data.t[0]:.0f} s: {listed}."
+    text = (
+        "λ by the equations of motion with the forces learned from accelerations, without a force sensor, "
+        f"over {data.t[-1] - data.t[0]:.0f} s: {listed}."
+    )
     if len(informed) < len(data.bands):
         text += (
             " Accelerations do not show the force along the surface normal, as H Aᵀ = 0; with a zero mean "

@@ -39,7 +39,6 @@ ROLLOUTS = "stages/figures/rollouts/data.json"
 """Where a reproduction keeps the data of its trajectories."""
 OPENING = "sgp-mean"
 """The model whose multiplier opens the page."""
-VERDICT = {True: " (confirmed)", False: " (differs)", None: ""}
 
 
 def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list[Finding]:
@@ -85,8 +84,8 @@ def _opening(results: Results, paper: PaperNumbers, figures: FigureData) -> Bloc
         drawn[f"Contact force ({label(OPENING)})"] = draw_multiplier(figures.multiplier, band)
     pictures = tuple(dataclasses.replace(picture, title=title) for title, picture in drawn.items())
     caption = (
-        "Error of predicted accelerations on motion without training points, and the contact force predicted "
-        "from accelerations alone; the shaded time contains no training point."
+        "Error of predicted accelerations on motion without training points, and the contact force "
+        "predicted without a force sensor; the shaded time contains no training point."
     )
     return Block("In short", caption, pictures, "results.json")
 
@@ -133,7 +132,7 @@ def render_markdown(results: Results, figures: FigureData) -> str:
         f"{about_task(results)}",
         tables["overview"],
         "## Findings",
-        "\n".join(f"- **{f.topic}**{VERDICT[f.agrees]}. {f.text}" for f in said),
+        "\n".join(f"- **{f.topic}**{'' if f.verdict is None else f': {f.verdict}'}. {f.text}" for f in said),
         "## Errors",
         *(tables[name] for name in ("errors", "noisy", "clean")),
         "## Uncertainty, constraint, cost",

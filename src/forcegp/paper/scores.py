@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from forcegp.paper.learning import paper_value
-from forcegp.paper.results import GP_MODELS, SPLITS, PaperNumbers, Results
+from forcegp.paper.results import GP_MODELS, SPLITS, PaperNumbers, Results, like
 from forcegp.report.html import Finding
 from forcegp.report.style import label
 from forcegp.report.tables import Table, number
@@ -73,35 +73,46 @@ def quality_table(results: Results) -> Table:
 
 
 def order(results: Results) -> Finding | None:
-    """The models by their error on held-out stretches, beside the paper's order."""
-    errors = {m: results.mean(m, "stretches", None, "noisy_mae") for m in results.models}
-    known = {m: e for m, e in errors.items() if e is not None}
-    paper = [m for m in ("gp", "sgp-zero", "sgp-mean") if m in known]
-    if len(paper) < 2:
+    """The order of the models by their error on held-out stretches, pair by pair as the paper has it.
+
+    Structured models and the GP are compared at their largest common number of training points, with the
+    paper's kernel; the analytical model and the networks, with all their points, against the GP with all its.
+    """
+    chain = [like(results, m) for m in ("gp", "sgp-zero", "sgp-mean") if m in results.models]
+    sizes = [{n for n in results.sizes(m) if results.values(m, "stretches", n, "noisy_mae")} for m in chain]
+    common = set.intersection(*sizes) if sizes else set()
+    if len(chain) < 2 or not common:
         return None
-    most = {m: results.sizes(m)[-1] for m in known}
-    ranked = sorted(known, key=lambda m: -known[m])
-    listed = ", ".join(f"{label(m)} ({most[m]} points) {known[m]:.3f}" for m in ranked)
-    text = f"From the largest to the smallest error on held-out stretches [rad/s²]: {listed}."
-    networks = [m for m in known if m.startswith("nn")]
-    if networks and "gp" in known:
-        best = min(networks, key=lambda m: known[m])
-        ratio = known[best] / known["gp"]
-        apart = "better than" if ratio < 1.0 else "worse than"
-        close = "about as good as" if abs(ratio - 1.0) <= CLOSE else apart
-        text += (
-            f" The best network ({label(best)}, {most[best]} points) is {close} the GP with {most['gp']} "
-            f"points; "
-            "in the paper they are about the same with 10,000 and 1,000."
-        )
-    if "analytical" in known and "gp" in known:
-        worse = known["analytical"] > known["gp"]
-        text += " The analytical model without contact friction is " + (
-            "worse than the GP averaged over the joints, as in the paper."
-            if worse
-            else "better than the GP averaged over the joints; its error is in the last joints."
-        )
-    return Finding("Order of the models", all(known[a] >= known[b] for a, b in pairwise(paper)), text)
+    n = max(common)
+    pairs = [_pair(results, (a, n), (b, n)) for a, b in pairwise(chain)]
+    if "gp" in chain:
+        gp = "gp", results.sizes("gp")[-1]
+        largest = {m: results.mean(m, "stretches", None, "noisy_mae") for m in results.models}
+        known = {m: e for m, e in largest.items() if e is not None}
+        networks = [m for m in known if m.startswith("nn")]
+        if networks:
+            best = min(networks, key=lambda m: known[m])
+            pairs.append(_pair(results, (best, results.sizes(best)[-1]), gp, close=True))
+        if "analytical" in known:
+            pairs.append(_pair(results, ("analytical", results.sizes("analytical")[-1]), gp))
+    listed = "; ".join(text for _, text in pairs)
+    text = f"Error on held-out stretches [rad/s²], beside the paper's order: {listed}."
+    return Finding("Order of the models", all(same for same, _ in pairs), text)
+
+
+def _pair(
+    results: Results, first: tuple[str, int], second: tuple[str, int], close: bool = False
+) -> tuple[bool, str]:
+    """Whether the first model is worse than the second, or about as good (`close`), and a sentence on it."""
+    (a, n), (b, m) = first, second
+    one, two = results.mean(a, "stretches", n, "noisy_mae"), results.mean(b, "stretches", m, "noisy_mae")
+    assert one is not None and two is not None
+    alike = abs(one / two - 1.0) <= CLOSE
+    found = "about as good as" if close and alike else "worse than" if one >= two else "better than"
+    wanted = "about as good as" if close else "worse than"
+    beside = "as in the paper" if found == wanted else f"in the paper {wanted} it"
+    text = f"{label(a)} ({n} points) {one:.3f} is {found} {label(b)} ({m} points) {two:.3f}, {beside}"
+    return found == wanted, text
 
 
 def splits(results: Results) -> Finding | None:

@@ -32,13 +32,20 @@ class Finding:
 
     Attributes:
         topic: a few words.
-        agrees: whether the claim is confirmed; `None` if none is made.
+        agrees: whether the claim holds; `None` if none is made.
         text: the sentence, with its numbers.
+        words: verdict on a claim that holds, and on one that does not.
     """
 
     topic: str
     agrees: bool | None
     text: str
+    words: tuple[str, str] = ("confirmed", "differs")
+
+    @property
+    def verdict(self) -> str | None:
+        """The verdict, or `None` if no claim is made."""
+        return None if self.agrees is None else self.words[0 if self.agrees else 1]
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:
