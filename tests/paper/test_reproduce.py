@@ -161,7 +161,7 @@ def test_trajectories_of_all_models_start_where_an_unseen_motion_is(made: Reprod
         assert model.tip_error[0] < 1e-3
         structured = model.model.startswith("sgp")
         assert (model.coverage is not None) == structured == bool(model.tip_bands)
-        assert (model.inflation is not None) == (model.calibrated_coverage is not None) == structured
+        assert model.inflation is model.calibrated_coverage is None, "too few trajectories to calibrate with"
         if structured:
             assert len(model.tip_bands[0].lower) == len(data.t)
         # Nothing holds models of accelerations on the surface.
