@@ -7,9 +7,10 @@ and offset B_Q, B_z, o become
 
     B_Q − G Lᵀ,  B_z − G Lᵀ,  o + G (A M⁻¹ Aᵀ)⁺ b   with   G = B_z U (I + LᵀU)⁻¹.
 
-Learned μ and ε are uncertain. To first order in their errors δ, friction differs by ∂(μ u λ)/∂(log μ, log ε) δ
-at fixed λ, a contact force to which λ responds as to any other. So δ is one more latent force: the posterior
-over all of them is the Laplace approximation with δ marginalised, and contains (∂z/∂δ)² Var δ of every quantity.
+Learned μ and ε are uncertain. To first order in their errors δ, friction changes at fixed λ by
+∂(μ u λ)/∂(log μ, log ε) δ, a contact force to which λ responds as to any other. So δ is one more latent
+force; the posterior over all of them is a Laplace approximation that marginalises δ, and the variance of
+every quantity z contains (∂z/∂δ)² Var δ.
 """
 
 from __future__ import annotations
