@@ -36,7 +36,7 @@ def pressed(system: forcegp.ConstrainedSystem, n: int, seed: int, dry: float) ->
     """Random states in which the tip is pressed on the plane and slides."""
     generator = torch.Generator().manual_seed(seed)
     name, nq = system.contact_names[0], system.robot.nq
-    q, qd, tau = torch.randn(3, n, nq, dtype=torch.float64, generator=generator)
+    q, qd, tau = (s * torch.randn(n, nq, dtype=torch.float64, generator=generator) for s in (1.0, 0.3, 20.0))
     closed = torch.ones(n, 1, dtype=torch.bool)
     eom = system.equations(q, qd, closed)
     joints = -dry * torch.tanh(qd / 0.02)
@@ -60,8 +60,9 @@ def pressed(system: forcegp.ConstrainedSystem, n: int, seed: int, dry: float) ->
 
 def friction(samples: int, seed: int, joint_friction: bool) -> Tensor:
     """Which multipliers are within ±2σ."""
-    system = forcegp.load_scene("kuka_plane").system()
-    name, dry = system.contact_names[0], JOINT_FRICTION * joint_friction
+    table = forcegp.SurfaceContact("table", "lbr_iiwa_link_7", (0.0, 0.0, 0.1), forcegp.Plane())
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("kuka_iiwa"), [table])
+    name, dry = table.name, JOINT_FRICTION * joint_friction
     train, test = pressed(system, samples, 2 * seed, dry), pressed(system, TESTS, 2 * seed + 1, dry)
     priors = [forcegp.JointFrictionPrior()] if joint_friction else []
     priors.append(forcegp.SlidingFrictionPrior(name, Linear(), coupled=True))
