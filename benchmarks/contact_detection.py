@@ -19,10 +19,10 @@ from typing import Any
 
 from forcegp.errors import DataError
 from forcegp.logs import import_log
-from forcegp.paper.foreign_log import mapping_of, write_foreign_log
-from forcegp.paper.real_contact import SCENES, rows_right, surface_error
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
+from reproduction.foreign_log import mapping_of, write_foreign_log
+from reproduction.real_contact import SCENES, rows_right, surface_error
 
 SOURCES = ("distance", "wrench", "multiplier")
 

@@ -28,10 +28,10 @@ from forcegp.files import write_text
 from forcegp.logs import import_log
 from forcegp.models.registry import create
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.paper.foreign_log import mapping_of, write_foreign_log
-from forcegp.paper.real_contact import MODEL, rows_right, selected
 from forcegp.scene import load_scene
 from forcegp.simulate import Sensors, simulate
+from reproduction.foreign_log import mapping_of, write_foreign_log
+from reproduction.real_contact import MODEL, rows_right, selected
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -48,7 +49,6 @@ LAYERS = (
     ("evaluation",),
     ("view",),
     ("report", "sweep"),
-    ("paper",),
     ("cli",),
     ("__main__",),
 )
@@ -112,6 +112,19 @@ def test_hidden_imports_are_found(tmp_path: Path) -> None:
         "def late():\n    import forcegp.robot.tree\n    from forcegp.robot import model\n"
     )
     assert imports(path) == {"data", "robot.tree", "robot.model"}
+
+
+def test_the_study_is_not_part_of_the_library_and_uses_the_exports_of_the_report() -> None:
+    study = Path(__file__).parents[1] / "reproduction"
+    used: set[str] = set()
+    for path in study.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("forcegp.report"):
+                assert node.module == "forcegp.report", f"{path.name} imports {node.module}"
+                used.update(alias.name for alias in node.names)
+    assert used == set(importlib.import_module("forcegp.report").__all__)
+    for name, path in modules().items():
+        assert "reproduction" not in re.findall(r"(?:from|import) (\w+)", path.read_text("utf-8")), name
 
 
 def public_definitions(path: Path) -> list[ast.ClassDef | ast.FunctionDef]:

@@ -50,7 +50,7 @@ def test_help_needs_no_heavy_package() -> None:
         "from forcegp.cli import main; main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert "reproduce" in done.stdout and done.stderr.split() == []
+    assert "simulate" in done.stdout and done.stderr.split() == []
 
 
 def test_the_package_is_typed_and_its_versions_of_python_are_tested() -> None:

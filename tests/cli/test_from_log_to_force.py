@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 from forcegp.cli import app
 from forcegp.data import Dataset
-from forcegp.paper.foreign_log import mapping_of, write_foreign_log
-from forcegp.paper.real_contact import rows_of
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
+from reproduction.foreign_log import mapping_of, write_foreign_log
+from reproduction.real_contact import rows_of
 
 pytest.importorskip("mujoco")
 

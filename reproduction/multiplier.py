@@ -1,0 +1,223 @@
+"""Figure 2: the constraint error in simulation, and the multiplier predicted from accelerations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.files import Header
+from forcegp.models.base import Model
+from forcegp.models.load import load_model
+from forcegp.report import (
+    INK,
+    Block,
+    Finding,
+    Part,
+    Picture,
+    Series,
+    as_tensor,
+    colour,
+    draw,
+    label,
+    series,
+    shade,
+)
+from reproduction.fits import MODEL
+from reproduction.stages import write_data
+from reproduction.task import Task, motion_of
+
+STEP = 4
+"""Every fourth sample is predicted."""
+BAND = 2.0
+"""Standard deviations on either side."""
+INSIDE = 0.90
+"""Coverage from which the claim about the multiplier counts as confirmed."""
+WIDTH = 4.6
+
+
+class MultiplierBand(Part):
+    """The multiplier as one model predicts it.
+
+    Attributes:
+        model: registry name.
+        mean, std: [N].
+        inside: ±2σ coverage of the simulator's value.
+        inside_held_out: the same over held-out samples only; `None` if there are none.
+        mean_error: mean absolute error [N].
+        smallest: the smallest predicted mean [N].
+    """
+
+    model: str
+    mean: Series
+    std: Series
+    inside: float
+    inside_held_out: float | None
+    mean_error: float
+    smallest: float
+
+
+class MultiplierData(Header):
+    """Constraint error in simulation and the predicted multiplier.
+
+    Attributes:
+        t: [s].
+        c: constraint error [m].
+        simulated: the simulator's multiplier [N].
+        held_out: intervals of time without training points [s].
+        bands: one per model.
+    """
+
+    FORMAT: ClassVar[str] = "forcegp-multiplier"
+    VERSION: ClassVar[int] = 2
+
+    t: Series
+    c: Series
+    simulated: Series
+    held_out: list[tuple[float, float]]
+    bands: list[MultiplierBand]
+
+
+def make_multiplier(
+    folder: Path, run: Path, rows: Path, *fits: Path, models: list[str], seconds: float
+) -> None:
+    """Write the figure's data: some seconds around the first held-out stretch, by several models."""
+    task = Task.read(run, rows)
+    shown = task.around(seconds, STEP)
+    held = torch.zeros(len(task.data), dtype=torch.bool)
+    for first, last in task.stretches():
+        held[first:last] = True
+    loaded = {name: load_model(fit / MODEL) for name, fit in zip(models, fits, strict=True)}
+    c = motion_of(run)["c"][shown, 0]
+    write_data(folder, predicted_multiplier(loaded, task.data[shown], c, held[shown]))
+
+
+@torch.no_grad()
+def predicted_multiplier(
+    models: Mapping[str, Model], data: Dataset, c: Tensor, held_out: Tensor
+) -> MultiplierData:
+    """The first contact's multiplier by several models, conditioned on accelerations alone (eq. 25).
+
+    Args:
+        models: fitted structured models by name.
+        data: the states, sorted by time, with the simulator's multiplier.
+        c: `(n,)` constraint error of that contact [m].
+        held_out: `(n,)` bool, samples in stretches without training points.
+    """
+    contact = next(iter(models.values())).system.contact_names[0]
+    simulated = data.contact_extras["multiplier"][contact]
+    return MultiplierData(
+        t=series(data.t),
+        c=series(c),
+        simulated=series(simulated),
+        held_out=spans(data.t, held_out),
+        bands=[_band(name, model, data, simulated, held_out) for name, model in models.items()],
+    )
+
+
+def _band(name: str, model: Model, data: Dataset, simulated: Tensor, held_out: Tensor) -> MultiplierBand:
+    active = data.active(model.system.contact_names)
+    predicted = model.predict(data.q, data.qd, data.tau, "multiplier", active=active)
+    assert predicted.std is not None
+    mean, std = predicted.mean[:, 0], predicted.std[:, 0]
+    error = (mean - simulated).abs()
+    inside = error <= BAND * std
+    return MultiplierBand(
+        model=name,
+        mean=series(mean),
+        std=series(std),
+        inside=float(inside.double().mean()),
+        inside_held_out=float(inside[held_out].double().mean()) if bool(held_out.any()) else None,
+        mean_error=float(error.mean()),
+        smallest=float(mean.min()),
+    )
+
+
+def spans(t: Tensor, marked: Tensor) -> list[tuple[float, float]]:
+    """The times at which runs of marked samples begin and end."""
+    zero = marked.new_zeros(1).int()
+    edges = torch.diff(marked.int(), prepend=zero, append=zero)
+    begins, ends = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0] - 1
+    return [(float(t[i]), float(t[j])) for i, j in zip(begins, ends, strict=True)]
+
+
+def multiplier_block(data: MultiplierData) -> Block:
+    """Figure 2 under its caption."""
+    return Block(
+        "Figure 2: surface error and multiplier",
+        "The error of the surface equation in simulation, and the Lagrange multiplier λ (the normal force) "
+        "predicted from accelerations alone, beside the simulator's own. The shaded time contains no "
+        "training "
+        "point. The lower panels show the same relative to the simulator's value. Bands are ±2σ.",
+        (draw_constraint(data), *(draw_multiplier(data, band) for band in data.bands)),
+        "stages/figures/multiplier/data.json",
+    )
+
+
+def draw_constraint(data: MultiplierData) -> Picture:
+    """Constraint error in simulation (top)."""
+    error = as_tensor(data.c)
+
+    def paint(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot(data.t, 1e6 * error, color=INK)
+        axes.set_xlabel("time [s]")
+        axes.set_ylabel("surface error c(q) [µm]")
+        axes.margins(x=0.0)
+
+    largest = 1e6 * float(error.abs().max())
+    alt = f"Surface error over {data.t[-1] - data.t[0]:.3g} s, at most {largest:.2g} micrometres."
+    return draw(paint, (WIDTH, 2.1), alt, "Surface error c(q) in simulation")
+
+
+def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> Picture:
+    """The multiplier predicted from accelerations beside the simulator's (bottom)."""
+    mean, simulated = as_tensor(band.mean), as_tensor(data.simulated)
+    spread, shown = BAND * as_tensor(band.std), colour(band.model)
+
+    def paint(figure: Figure) -> None:
+        both, error = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        filled: dict[str, Any] = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ"}
+        for axes, centre in ((both, torch.zeros_like(mean)), (error, simulated)):
+            shade(axes, data.held_out)
+            axes.fill_between(data.t, mean - spread - centre, mean + spread - centre, **filled)
+            axes.plot(data.t, simulated - centre, color=INK, linewidth=1.0, label="simulator")
+            axes.plot(data.t, mean - centre, color=shown, linewidth=1.1, label="predicted")
+            axes.margins(x=0.0)
+        both.set_ylim(bottom=min(0.0, float((mean - spread).min())))
+        both.set_ylabel("multiplier λ [N]")
+        error.set_ylabel("error [N]")
+        error.set_xlabel("time [s]")
+        figure.align_ylabels()
+        figure.legend(*both.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+
+    alt = (
+        f"{label(band.model)}: multiplier over {data.t[-1] - data.t[0]:.3g} s, predicted with its band "
+        f"beside "
+        f"the simulator's; mean error {band.mean_error:.2g} N, coverage {100 * band.inside:.0f} %."
+    )
+    return draw(paint, (WIDTH, 4.2), alt, label(band.model))
+
+
+def multiplier_finding(data: MultiplierData) -> Finding | None:
+    """Whether the multiplier is positive and within its band."""
+    listed = "; ".join(
+        f"{label(b.model)}: ±2σ coverage {100 * b.inside:.0f} %"
+        + ("" if b.inside_held_out is None else f" ({100 * b.inside_held_out:.0f} % of held-out samples)")
+        + f", mean error {b.mean_error:.2f} N, minimum {b.smallest:.1f} N"
+        for b in data.bands
+    )
+    informed = [b for b in data.bands if b.model != "sgp-zero"]
+    agrees = all(b.inside >= INSIDE and b.smallest > 0.0 for b in informed)
+    text = f"λ predicted from accelerations alone, over {data.t[-1] - data.t[0]:.0f} s: {listed}."
+    if len(informed) < len(data.bands):
+        text += (
+            " Accelerations do not show the force along the surface normal, as H Aᵀ = 0; with a zero mean "
+            "nothing else does, so only models with the analytical mean (eq. 25) can predict λ."
+        )
+    return Finding("Multiplier", agrees, text) if data.bands else None
