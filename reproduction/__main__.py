@@ -44,12 +44,6 @@ def reproduce(
     python -m reproduction --profile quick --out out/quick
 
     python -m reproduction --profile paper --out out/paper --seed 1
-
-    python -m reproduction --profile paper-exact --out out/paper-exact
-
-    python -m reproduction --profile large --out out/large
-
-    python -m reproduction --profile real-contact --out out/real-contact
     """
     from reproduction.real_contact_page import run_real_contact
     from reproduction.stages import MOST_PROCESSES, available_processors
@@ -63,10 +57,10 @@ def reproduce(
             advance(done, total)
 
         if profile == "real-contact":
-            made = run_real_contact(out, seed=seed, processes=processes, say=say)
+            numbers = run_real_contact(out, seed=seed, processes=processes, say=say)
         else:
-            made = run(profile, out, seed=seed, processes=processes, say=say)
-    show(made.summary(), as_json)
+            numbers = run(profile, out, seed=seed, processes=processes, say=say).summary()
+    show(numbers, as_json)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from forcegp import report
 from forcegp.data import Dataset
 from forcegp.files import Header
 from forcegp.forces.priors.base import CONSTRAINT
@@ -19,7 +20,6 @@ from forcegp.gp.structured_covariance import Block as Rows
 from forcegp.gp.structured_covariance import cross_gram
 from forcegp.models.load import load_model
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.report import Block, Picture, Series, as_tensor, draw, matrix, series
 from reproduction.fits import MODEL
 from reproduction.stages import write_data
 from reproduction.task import Task
@@ -50,11 +50,11 @@ class CovarianceData(Header):
     VERSION: ClassVar[int] = 1
 
     model: str
-    t: Series
+    t: report.Series
     nq: int
-    operators: list[list[Series]]
-    force: list[Series]
-    acceleration: list[Series]
+    operators: list[list[report.Series]]
+    force: list[report.Series]
+    acceleration: list[report.Series]
     rank: int
 
 
@@ -88,40 +88,39 @@ def covariance_blocks(model: StructuredGP, data: Dataset, name: str) -> Covarian
     eigenvalues = torch.linalg.eigvalsh(k_qdd)
     return CovarianceData(
         model=name,
-        t=series(data.t),
+        t=report.series(data.t),
         nq=system.robot.nq,
-        operators=[matrix(H) for H in at.eom.H],
-        force=matrix(k_Q),
-        acceleration=matrix(k_qdd),
+        operators=[report.matrix(H) for H in at.eom.H],
+        force=report.matrix(k_Q),
+        acceleration=report.matrix(k_qdd),
         rank=int((eigenvalues > RANK_TOLERANCE * eigenvalues[-1]).sum()),
     )
 
 
-def covariance_block(data: CovarianceData) -> Block:
+def covariance_block(data: CovarianceData) -> report.Block:
     """Figure 1 under its caption."""
     n, rows = len(data.t), len(data.acceleration)
     panels = (
-        ("Operators H(xᵢ)", torch.block_diag(*map(as_tensor, data.operators)),
+        ("Operators H(xᵢ)", torch.block_diag(*map(report.as_tensor, data.operators)),
          f"Block-diagonal matrix of the operators H at {n} states, {data.nq} by {data.nq} each."),
-        ("Force prior k_Q(xᵢ, xⱼ)", as_tensor(data.force),
+        ("Force prior k_Q(xᵢ, xⱼ)", report.as_tensor(data.force),
          "Covariance of the forces: every block is diagonal, one process per joint."),
-        ("Result H k_Q Hᵀ", as_tensor(data.acceleration),
+        ("Result H k_Q Hᵀ", report.as_tensor(data.acceleration),
          f"Covariance of the accelerations: every block is full; {rows} rows and columns, rank {data.rank}."),
     )  # fmt: skip
-    return Block(
+    return report.Block(
         "Figure 1: structured covariance",
         f"H k_Q Hᵀ block by block, for {n} training points, with the learned hyperparameters of the "
-        f"zero-mean "
-        "S-GP. Left: the operators H(xᵢ), given by the known mechanics. Middle: the prior on the forces, one "
-        "independent process per joint, so every block is diagonal. Right: the covariance of accelerations, "
-        "full in every block and without the direction that the surface forbids: rank "
+        "zero-mean S-GP. Left: the operators H(xᵢ), given by the known mechanics. Middle: the prior on the "
+        "forces, one independent process per joint, so every block is diagonal. Right: the covariance of "
+        "accelerations, full in every block and without the direction that the surface forbids: rank "
         f"{data.rank} of {rows}. Logarithmic colour scale.",
         tuple(_draw(values, data, title, alt) for title, values, alt in panels),
         "stages/figures/covariance/data.json",
     )
 
 
-def _draw(values: Tensor, data: CovarianceData, title: str, alt: str) -> Picture:
+def _draw(values: Tensor, data: CovarianceData, title: str, alt: str) -> report.Picture:
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         largest = float(values.abs().max())
@@ -132,7 +131,7 @@ def _draw(values: Tensor, data: CovarianceData, title: str, alt: str) -> Picture
         bar.set_ticks([-largest, 0.0, largest], labels=[f"{-largest:.2g}", "0", f"{largest:.2g}"])
         bar.minorticks_off()
 
-    return draw(paint, (WIDTH, 4.5), alt, title)
+    return report.draw(paint, (WIDTH, 4.5), alt, title)
 
 
 def _grid(axes: Axes, states: int, nq: int) -> None:

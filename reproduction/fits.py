@@ -39,9 +39,6 @@ EXACT_LEARNING = LearningOptions(
     hyperpriors=False,
 )
 """How the paper learns them; it says "until convergence", and states neither the start nor a tolerance."""
-STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-RESET_PEAK = "5"
-"""What the kernel takes as the request to forget the peak so far (man 5 proc)."""
 
 
 @dataclass(frozen=True)
@@ -175,19 +172,15 @@ def exact_model(name: str, task: Task) -> Model:
 
 
 def reset_peak() -> bool:
-    """Forget the process's peak memory; false where the system cannot."""
+    """Forget the process's peak memory; false where the system cannot (man 5 proc)."""
     try:
-        CLEAR.write_text(RESET_PEAK)
+        Path("/proc/self/clear_refs").write_text("5")
     except OSError:
         return False
     return True
 
 
-def peak_memory() -> int | None:
-    """Peak resident memory of the process since the last reset [byte], `None` where it is not known."""
-    try:
-        lines = STATUS.read_text().splitlines()
-    except OSError:
-        return None
-    sizes = [line.split()[1] for line in lines if line.startswith("VmHWM:")]
-    return int(sizes[0]) * 1024 if sizes else None
+def peak_memory() -> int:
+    """Peak resident memory of the process since the last reset [byte]."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
+from forcegp import report
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.files import Header
@@ -19,20 +20,6 @@ from forcegp.forces.priors.default import contact_priors
 from forcegp.gp.optimise import LearningOptions, minimise
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
-from forcegp.report import (
-    AXES,
-    INK,
-    Block,
-    Finding,
-    Part,
-    Picture,
-    Series,
-    colour,
-    columns,
-    draw,
-    label,
-    series,
-)
 from forcegp.robot.model import RobotModel
 from reproduction.stages import write_data
 from reproduction.task import Task
@@ -76,7 +63,7 @@ def wrong_parameters(robot: RobotModel) -> LastLink:
     return LastLink(robot.replace(mass=mass, placement_position=position))
 
 
-class IdentificationRun(Part):
+class IdentificationRun(report.Part):
     """Analytical parameters over the iterations of one model.
 
     Attributes:
@@ -88,8 +75,8 @@ class IdentificationRun(Part):
 
     model: str
     seed: int
-    mass: Series
-    offset: list[Series]
+    mass: report.Series
+    offset: list[report.Series]
 
     def off(self, i: int, true_mass: float) -> tuple[float, float]:
         """Errors of mass [kg] and offset (largest axis) [m] at an evaluation."""
@@ -137,8 +124,8 @@ class Trace:
     def run(self, truth: RobotModel, model: str, seed: int) -> IdentificationRun:
         """The parameters over the evaluations, beside the truth."""
         mass, position = (torch.stack(values) for values in zip(*self.best, strict=True))
-        offset = columns(position - truth.placement_position[-1])
-        return IdentificationRun(model=model, seed=seed, mass=series(mass), offset=offset)
+        offset = report.columns(position - truth.placement_position[-1])
+        return IdentificationRun(model=model, seed=seed, mass=report.series(mass), offset=offset)
 
 
 def make_identification(folder: Path, run: Path, rows: Path, *, points: int, evaluations: int) -> None:
@@ -210,40 +197,39 @@ def _options(evaluations: int) -> LearningOptions:
     return dataclasses.replace(WITH_PARAMETERS, max_evaluations=evaluations)
 
 
-def identification_block(data: IdentificationData) -> Block:
+def identification_block(data: IdentificationData) -> report.Block:
     """The figure under its caption."""
-    return Block(
+    return report.Block(
         "Identification (main paper)",
-        f"Mass of the last link, started at {WRONG_MASS} kg, and error of the last joint's position, started "
-        f"{WRONG_OFFSET} m off along each axis, learned from {data.points} points together with the unknown "
-        "friction; beside them the analytical model alone, which cannot represent the friction. Each curve "
-        "shows "
-        f"the best parameters so far; masses further than {MASS_RANGE:g} kg from the truth are cut off. The "
-        "dotted line marks 1 mm.",
+        f"Mass of the last link, started at {WRONG_MASS} kg, and error of the last joint's position, "
+        f"started {WRONG_OFFSET} m off along each axis, learned from {data.points} points together with the "
+        "unknown friction; beside them the analytical model alone, which cannot represent the friction. "
+        f"Each curve shows the best parameters so far; masses further than {MASS_RANGE:g} kg from the truth "
+        "are cut off. The dotted line marks 1 mm.",
         (draw_mass(data), draw_offset(data)),
         "stages/figures/identification/",
     )
 
 
-def draw_mass(data: IdentificationData) -> Picture:
+def draw_mass(data: IdentificationData) -> report.Picture:
     """The last link's mass over the evaluations."""
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
-        axes.axhline(data.true_mass, color=INK, linewidth=0.9, linestyle=":", label="true")
+        axes.axhline(data.true_mass, color=report.INK, linewidth=0.9, linestyle=":", label="true")
         for run in data.runs:
-            axes.plot(run.mass, color=colour(run.model), label=label(run.model))
+            axes.plot(run.mass, color=report.colour(run.model), label=report.label(run.model))
         axes.set_xlabel("evaluation")
         axes.set_ylabel("mass of the last link [kg]")
         axes.set_ylim(data.true_mass - MASS_RANGE, data.true_mass + MASS_RANGE)
         _legend(figure, axes, columns=2)
 
-    ends = "; ".join(f"{label(run.model)} {run.mass[-1]:.3f} kg" for run in data.runs)
+    ends = "; ".join(f"{report.label(run.model)} {run.mass[-1]:.3f} kg" for run in data.runs)
     alt = f"Mass over evaluations, true {data.true_mass:g} kg; last: {ends}."
-    return draw(paint, (WIDTH, 4.1), alt, "Mass")
+    return report.draw(paint, (WIDTH, 4.1), alt, "Mass")
 
 
-def draw_offset(data: IdentificationData) -> Picture:
+def draw_offset(data: IdentificationData) -> report.Picture:
     """The error of the last joint's offset over the evaluations, by axis."""
     names = list(dict.fromkeys(run.model for run in data.runs))
 
@@ -252,17 +238,17 @@ def draw_offset(data: IdentificationData) -> Picture:
         for axes, name in zip(rows, names, strict=True):
             for run in (r for r in data.runs if r.model == name):
                 for axis, letter in enumerate("xyz"):
-                    axes.plot([1e3 * abs(v) for v in run.offset[axis]], color=AXES[axis], label=letter)
-            axes.axhline(1.0, color=INK, linewidth=0.7, linestyle=":")
+                    axes.plot([1e3 * abs(v) for v in run.offset[axis]], color=report.AXES[axis], label=letter)
+            axes.axhline(1.0, color=report.INK, linewidth=0.7, linestyle=":")
             axes.set_yscale("log")
-            axes.set_title(label(name), loc="left")
+            axes.set_title(report.label(name), loc="left")
             axes.set_ylabel("|error| [mm]")
         rows[-1].set_xlabel("evaluation")
         _legend(figure, rows[0], columns=3)
 
-    ends = (f"{label(run.model)} {1e3 * run.off(-1, data.true_mass)[1]:.2g} mm" for run in data.runs)
+    ends = (f"{report.label(run.model)} {1e3 * run.off(-1, data.true_mass)[1]:.2g} mm" for run in data.runs)
     alt = f"Error of the offset by axis; largest at the end: {'; '.join(ends)}."
-    return draw(paint, (WIDTH, 4.1), alt, "Offset")
+    return report.draw(paint, (WIDTH, 4.1), alt, "Offset")
 
 
 def _legend(figure: Figure, axes: Axes, columns: int) -> None:
@@ -270,7 +256,7 @@ def _legend(figure: Figure, axes: Axes, columns: int) -> None:
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=min(columns, len(unique)))
 
 
-def identification_finding(data: IdentificationData) -> Finding | None:
+def identification_finding(data: IdentificationData) -> report.Finding | None:
     """Whether mass and offset are found."""
     words, good = [], []
     for model in dict.fromkeys(run.model for run in data.runs):
@@ -279,11 +265,11 @@ def identification_finding(data: IdentificationData) -> Finding | None:
         ok = mass <= MASS_TOLERANCE and offset <= OFFSET_TOLERANCE
         good += [ok] if model != "analytical" else []
         words.append(
-            f"{label(model)}: mass off by {mass:.4f} kg, offset by {1e3 * offset:.2f} mm"
+            f"{report.label(model)}: mass off by {mass:.4f} kg, offset by {1e3 * offset:.2f} mm"
             + (f", within tolerance from evaluation {max(_settled(r, data) for r in runs)} on" if ok else "")
         )
     text = f"After learning from {data.points} points without knowing the friction (worst seed): "
-    return Finding("Identification", all(good), text + "; ".join(words) + ".") if data.runs else None
+    return report.Finding("Identification", all(good), text + "; ".join(words) + ".") if data.runs else None
 
 
 def _settled(run: IdentificationRun, data: IdentificationData) -> int:

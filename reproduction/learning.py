@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from forcegp.report import INK, MARKERS, NONE, Block, Finding, Picture, Table, colour, draw, label, number
+from forcegp import report
 from reproduction.results import GP_MODELS, PAPER_KERNELS, SPLITS, PaperNumbers, Results, like
 
 WIDTH = 4.6
@@ -26,10 +26,9 @@ WIDE = 5000
 """Training points from which they are drawn on a logarithmic axis."""
 TASK = (
     "The paper does not state its rectangle, travel times, pressing force or test window, so the two tasks "
-    "are "
-    "not identical: slower or smaller motion than the paper's lowers our errors, faster or wider motion "
-    "raises "
-    "them. Like is compared with like: the paper's curves with its own kernel, not with our default kernels."
+    "are not identical: slower or smaller motion than the paper's lowers our errors, faster or wider "
+    "motion raises them. Like is compared with like: the paper's curves with its own kernel, not with our "
+    "default kernels."
 )
 """What `UNKNOWN` means, said once on every page."""
 
@@ -48,7 +47,7 @@ def about_task(results: Results) -> str:
     return f"{TASK} {EXACT}" if results.exact else TASK
 
 
-def learning_block(results: Results, paper: PaperNumbers) -> Block:
+def learning_block(results: Results, paper: PaperNumbers) -> report.Block:
     """The learning curves under their caption."""
     pictures = [
         draw_learning_curve(results, paper, split, kind) for kind in ("noisy", "clean") for split in SPLITS
@@ -58,18 +57,17 @@ def learning_block(results: Results, paper: PaperNumbers) -> Block:
         ours = "Solid: the paper's models, learned here."
     seeds = len(results.seeds)
     spread = f" Lines are means over {seeds} seeds, bands their range." if seeds > 1 else ""
-    return Block(
+    return report.Block(
         "Learning curves (main paper, error over N)",
-        "Mean absolute error over the number of training points, and the mean constraint residual. "
-        f"{ours} Short dashes: the paper's curves, read off "
-        "its plots, where they are comparable: noisy accelerations on its own split, and the residual. "
-        f"Dotted: the mean magnitude of the noise.{spread}",
+        f"Mean absolute error over the number of training points, and the mean constraint residual. {ours} "
+        "Short dashes: the paper's curves, read off its plots, where they are comparable: noisy "
+        f"accelerations on its own split, and the residual. Dotted: the mean magnitude of the noise.{spread}",
         (*pictures, draw_residual(results, paper, "stretches")),
         "results.json",
     )
 
 
-def draw_learning_curve(results: Results, paper: PaperNumbers, split: str, kind: str) -> Picture:
+def draw_learning_curve(results: Results, paper: PaperNumbers, split: str, kind: str) -> report.Picture:
     """Error against training points.
 
     Args:
@@ -84,19 +82,21 @@ def draw_learning_curve(results: Results, paper: PaperNumbers, split: str, kind:
         _curves(axes, results, split, f"{kind}_mae")
         if kind == "noisy" and split == "selection":
             for model, values in paper.noisy_mae.items():
-                axes.plot(paper.points, values, color=colour(model), linestyle=PAPER_LINE, linewidth=1.0)
-            axes.plot([], [], color=INK, linestyle=PAPER_LINE, linewidth=1.0, label="paper")
+                axes.plot(
+                    paper.points, values, color=report.colour(model), linestyle=PAPER_LINE, linewidth=1.0
+                )
+            axes.plot([], [], color=report.INK, linestyle=PAPER_LINE, linewidth=1.0, label="paper")
         if kind == "noisy":
             floor = FLOOR * results.noise_std
-            axes.axhline(floor, color=INK, linewidth=0.8, linestyle=":", label="noise alone")
+            axes.axhline(floor, color=report.INK, linewidth=0.8, linestyle=":", label="noise alone")
         _finish(figure, axes, f"error against {kind} acceleration [rad/s²]")
 
     alt = f"Mean absolute error against {kind} accelerations over training points, {SPLITS[split]}: "
     title = f"{SPLITS[split].capitalize()}, {kind} accelerations"
-    return draw(paint, (WIDTH, 4.1), alt + _ends(results, split, f"{kind}_mae"), title)
+    return report.draw(paint, (WIDTH, 4.1), alt + _ends(results, split, f"{kind}_mae"), title)
 
 
-def draw_residual(results: Results, paper: PaperNumbers, split: str) -> Picture:
+def draw_residual(results: Results, paper: PaperNumbers, split: str) -> report.Picture:
     """Mean |A q̈ − b| of the predicted accelerations against training points."""
 
     def paint(figure: Figure) -> None:
@@ -104,24 +104,29 @@ def draw_residual(results: Results, paper: PaperNumbers, split: str) -> Picture:
         _curves(axes, results, split, "residual")
         for model, values in paper.residual.items():
             ends = [paper.points[0], paper.points[-1]]
-            axes.plot(ends, values, color=colour(model), linestyle=PAPER_LINE, linewidth=1.0)
-        axes.plot([], [], color=INK, linestyle=PAPER_LINE, linewidth=1.0, label="paper")
+            axes.plot(ends, values, color=report.colour(model), linestyle=PAPER_LINE, linewidth=1.0)
+        axes.plot([], [], color=report.INK, linestyle=PAPER_LINE, linewidth=1.0, label="paper")
         _finish(figure, axes, "mean |A q̈ − b| [m/s²]")
 
     alt = "Mean constraint residual over the number of training points: " + _ends(results, split, "residual")
-    return draw(paint, (WIDTH, 3.6), alt, "Constraint residual")
+    return report.draw(paint, (WIDTH, 3.6), alt, "Constraint residual")
 
 
 def _curves(axes: Axes, results: Results, split: str, measure: str) -> None:
     """Mean and range over seeds of every GP model, with the paper's kernel dashed in the same colour."""
     for model in GP_MODELS:
-        style = {"color": colour(model), "marker": MARKERS[model], "markersize": 4.0, "label": label(model)}
+        style = {
+            "color": report.colour(model),
+            "marker": report.MARKERS[model],
+            "markersize": 4.0,
+            "label": report.label(model),
+        }
         _curve(axes, results, model, split, measure, style)
         if model in PAPER_KERNELS:
-            style = {"color": colour(model), "linestyle": KERNEL_LINE, "linewidth": 1.0}
+            style = {"color": report.colour(model), "linestyle": KERNEL_LINE, "linewidth": 1.0}
             _curve(axes, results, PAPER_KERNELS[model], split, measure, style)
     if set(PAPER_KERNELS.values()) & set(results.models):
-        axes.plot([], [], color=INK, linestyle=KERNEL_LINE, linewidth=1.0, label="paper's kernel")
+        axes.plot([], [], color=report.INK, linestyle=KERNEL_LINE, linewidth=1.0, label="paper's kernel")
 
 
 def _curve(axes: Axes, results: Results, model: str, split: str, measure: str, style: dict[str, Any]) -> None:
@@ -150,46 +155,49 @@ def _finish(figure: Figure, axes: Axes, name: str) -> None:
 def _ends(results: Results, split: str, measure: str) -> str:
     """The last point of every curve, in words."""
     last = {m: (max(results.sizes(m), default=0), results.mean(m, split, None, measure)) for m in GP_MODELS}
-    return "; ".join(f"{label(m)} {v:.2g} at N = {n}" for m, (n, v) in last.items() if v is not None) + "."
+    return (
+        "; ".join(f"{report.label(m)} {v:.2g} at N = {n}" for m, (n, v) in last.items() if v is not None)
+        + "."
+    )
 
 
-def curve_table(results: Results, paper: PaperNumbers, kind: str) -> Table:
+def curve_table(results: Results, paper: PaperNumbers, kind: str) -> report.Table:
     """Error over training points: ours on both splits, and the paper's for noisy accelerations."""
     sizes = sorted({n for model in GP_MODELS for n in results.sizes(model)})
     rows = []
     for model in (m for m in (*GP_MODELS, *PAPER_KERNELS.values()) if m in results.models):
         for split in SPLITS:
-            values = [number(results.values(model, split, n, f"{kind}_mae"), 4) for n in sizes]
-            rows.append((f"{label(model)}, {SPLITS[split]}", *values))
+            values = [report.number(results.values(model, split, n, f"{kind}_mae"), 4) for n in sizes]
+            rows.append((f"{report.label(model)}, {SPLITS[split]}", *values))
         theirs = paper.beside(results, model) if kind == "noisy" else None
         if theirs is not None:
-            rows.append((f"{label(theirs)}, paper", *(paper_value(paper, theirs, n) for n in sizes)))
+            rows.append((f"{report.label(theirs)}, paper", *(paper_value(paper, theirs, n) for n in sizes)))
     caption = f"Mean absolute error against {kind} accelerations over training points [rad/s²]"
-    return Table(caption, ("N", *(str(n) for n in sizes)), tuple(rows))
+    return report.Table(caption, ("N", *(str(n) for n in sizes)), tuple(rows))
 
 
 def paper_value(paper: PaperNumbers, model: str | None, points: int) -> str:
     """The paper's error for a model, if it gives one for that many points."""
     value = None if model is None else paper.error(model, points)
-    return NONE if value is None else f"{value:g}"
+    return report.NONE if value is None else f"{value:g}"
 
 
-def residual_table(results: Results, paper: PaperNumbers) -> Table:
+def residual_table(results: Results, paper: PaperNumbers) -> report.Table:
     """Constraint residual at the fewest and most training points, beside the paper's."""
     rows = []
     for model in (m for m in GP_MODELS if m in results.models):
         ends = results.sizes(model)[0], results.sizes(model)[-1]
-        ours = [number(results.values(model, "stretches", n, "residual")) for n in ends]
-        theirs = [f"{v:.0e}" for v in paper.residual.get(model, ())] or [NONE, NONE]
-        rows.append((label(model), f"{ends[0]}, {ends[1]}", " to ".join(ours), " to ".join(theirs)))
-    return Table(
+        ours = [report.number(results.values(model, "stretches", n, "residual")) for n in ends]
+        theirs = [f"{v:.0e}" for v in paper.residual.get(model, ())] or [report.NONE, report.NONE]
+        rows.append((report.label(model), f"{ends[0]}, {ends[1]}", " to ".join(ours), " to ".join(theirs)))
+    return report.Table(
         "Mean |A q̈ − b| of the predicted mean [m/s²], held-out stretches",
         ("model", "N", "ours", f"paper, N = {paper.points[0]} to {paper.points[-1]}"),
         tuple(rows),
     )
 
 
-def against_paper(results: Results, paper: PaperNumbers, model: str) -> Finding | None:
+def against_paper(results: Results, paper: PaperNumbers, model: str) -> report.Finding | None:
     """Our error on the paper's split against the paper's at every N, with the paper's kernel first."""
     same = like(results, model)
     pairs = {
@@ -205,16 +213,16 @@ def against_paper(results: Results, paper: PaperNumbers, model: str) -> Finding 
         if above
         else "At or below the paper's error at every N. "
     )
-    text += f"{label(same)}: " + "; ".join(
+    text += f"{report.label(same)}: " + "; ".join(
         f"N = {n}: {ours:.3f}, paper {theirs:g}" for n, (ours, theirs) in pairs.items()
     )
     if same != model:
         n, best = max(results.sizes(model)), results.mean(model, "selection", None, "noisy_mae")
         text += "" if best is None else f". With our default kernels {best:.3f} at N = {n}"
-    return Finding(f"{label(model)} against the paper", not above, f"{text}. {UNKNOWN}")
+    return report.Finding(f"{report.label(model)} against the paper", not above, f"{text}. {UNKNOWN}")
 
 
-def efficiency(results: Results, paper: PaperNumbers) -> Finding | None:
+def efficiency(results: Results, paper: PaperNumbers) -> report.Finding | None:
     """How many points the zero-mean structured model needs to reach the paper's best error."""
     target, words, reached = paper.noisy_mae["sgp-zero"][-1], [], []
     for model in (m for m in (PAPER_KERNELS["sgp-zero"], "sgp-zero") if m in results.models):
@@ -222,16 +230,14 @@ def efficiency(results: Results, paper: PaperNumbers) -> Finding | None:
         errors = {n: results.mean(model, "selection", n, "noisy_mae") for n in sizes}
         least = [n for n, e in errors.items() if e is not None and e <= target]
         found = f"with N = {least[0]}" if least else f"with none of N = {', '.join(map(str, sizes))}"
-        words.append(f"{label(model)} {found}")
+        words.append(f"{report.label(model)} {found}")
         reached.append(bool(least) and least[0] <= paper.points[1])
     if not words:
         return None
     text = (
         f"Training points needed for the paper's error at N = {paper.points[-1]} ({target:g} rad/s²) on the "
         f"paper's split: {'; '.join(words)}. The lower bound of this metric is the mean magnitude of the "
-        f"noise, "
-        f"{FLOOR * results.noise_std:.4f} rad/s²; close to it, only the error against noise-free "
-        f"accelerations "
-        f"separates models. {UNKNOWN}"
+        f"noise, {FLOOR * results.noise_std:.4f} rad/s²; close to it, only the error against noise-free "
+        f"accelerations separates models. {UNKNOWN}"
     )
-    return Finding("Points needed", reached[0], text)
+    return report.Finding("Points needed", reached[0], text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,24 +9,9 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forcegp.data import Dataset
+from forcegp import report
 from forcegp.files import Header
-from forcegp.models.base import Model
 from forcegp.models.load import load_model
-from forcegp.report import (
-    INK,
-    Block,
-    Finding,
-    Part,
-    Picture,
-    Series,
-    as_tensor,
-    colour,
-    draw,
-    label,
-    series,
-    shade,
-)
 from reproduction.fits import MODEL
 from reproduction.stages import write_data
 from reproduction.task import Task, motion_of
@@ -41,7 +25,7 @@ INSIDE = 0.90
 WIDTH = 4.6
 
 
-class MultiplierBand(Part):
+class MultiplierBand(report.Part):
     """The multiplier as one model predicts it.
 
     Attributes:
@@ -54,12 +38,29 @@ class MultiplierBand(Part):
     """
 
     model: str
-    mean: Series
-    std: Series
+    mean: report.Series
+    std: report.Series
     inside: float
     inside_held_out: float | None
     mean_error: float
     smallest: float
+
+    @classmethod
+    def of(
+        cls, model: str, mean: Tensor, std: Tensor, simulated: Tensor, judged: Tensor, held_out: Tensor
+    ) -> MultiplierBand:
+        """The band of a prediction `(n,)`, judged by the simulator's value on the samples marked."""
+        error = (mean - simulated).abs()
+        inside = (error <= BAND * std).double()
+        return cls(
+            model=model,
+            mean=report.series(mean),
+            std=report.series(std),
+            inside=float(inside[judged].mean()),
+            inside_held_out=float(inside[held_out].mean()) if bool(held_out.any()) else None,
+            mean_error=float(error[judged].mean()),
+            smallest=float(mean[judged].min()),
+        )
 
 
 class MultiplierData(Header):
@@ -76,66 +77,41 @@ class MultiplierData(Header):
     FORMAT: ClassVar[str] = "forcegp-multiplier"
     VERSION: ClassVar[int] = 2
 
-    t: Series
-    c: Series
-    simulated: Series
+    t: report.Series
+    c: report.Series
+    simulated: report.Series
     held_out: list[tuple[float, float]]
     bands: list[MultiplierBand]
 
 
+@torch.no_grad()
 def make_multiplier(
     folder: Path, run: Path, rows: Path, *fits: Path, models: list[str], seconds: float
 ) -> None:
-    """Write the figure's data: some seconds around the first held-out stretch, by several models."""
+    """Write the first contact's multiplier around the first held-out stretch, by several models.
+
+    They are conditioned on accelerations alone (eq. 25).
+    """
     task = Task.read(run, rows)
-    shown = task.around(seconds, STEP)
-    held = torch.zeros(len(task.data), dtype=torch.bool)
+    shown, contact = task.around(seconds, STEP), task.system.contact_names[0]
+    data, held = task.data[shown], torch.zeros(len(task.data), dtype=torch.bool)
     for first, last in task.stretches():
         held[first:last] = True
-    loaded = {name: load_model(fit / MODEL) for name, fit in zip(models, fits, strict=True)}
-    c = motion_of(run)["c"][shown, 0]
-    write_data(folder, predicted_multiplier(loaded, task.data[shown], c, held[shown]))
-
-
-@torch.no_grad()
-def predicted_multiplier(
-    models: Mapping[str, Model], data: Dataset, c: Tensor, held_out: Tensor
-) -> MultiplierData:
-    """The first contact's multiplier by several models, conditioned on accelerations alone (eq. 25).
-
-    Args:
-        models: fitted structured models by name.
-        data: the states, sorted by time, with the simulator's multiplier.
-        c: `(n,)` constraint error of that contact [m].
-        held_out: `(n,)` bool, samples in stretches without training points.
-    """
-    contact = next(iter(models.values())).system.contact_names[0]
-    simulated = data.contact_extras["multiplier"][contact]
-    return MultiplierData(
-        t=series(data.t),
-        c=series(c),
-        simulated=series(simulated),
-        held_out=spans(data.t, held_out),
-        bands=[_band(name, model, data, simulated, held_out) for name, model in models.items()],
+    held, simulated, bands = held[shown], data.contact_extras["multiplier"][contact], []
+    active, everywhere = data.active(task.system.contact_names), torch.ones_like(held)
+    for name, fit in zip(models, fits, strict=True):
+        found = load_model(fit / MODEL).predict(data.q, data.qd, data.tau, "multiplier", active=active)
+        assert found.std is not None
+        mean, std = found.mean[:, 0], found.std[:, 0]
+        bands.append(MultiplierBand.of(name, mean, std, simulated, everywhere, held))
+    made = MultiplierData(
+        t=report.series(data.t),
+        c=report.series(motion_of(run)["c"][shown, 0]),
+        simulated=report.series(simulated),
+        held_out=spans(data.t, held),
+        bands=bands,
     )
-
-
-def _band(name: str, model: Model, data: Dataset, simulated: Tensor, held_out: Tensor) -> MultiplierBand:
-    active = data.active(model.system.contact_names)
-    predicted = model.predict(data.q, data.qd, data.tau, "multiplier", active=active)
-    assert predicted.std is not None
-    mean, std = predicted.mean[:, 0], predicted.std[:, 0]
-    error = (mean - simulated).abs()
-    inside = error <= BAND * std
-    return MultiplierBand(
-        model=name,
-        mean=series(mean),
-        std=series(std),
-        inside=float(inside.double().mean()),
-        inside_held_out=float(inside[held_out].double().mean()) if bool(held_out.any()) else None,
-        mean_error=float(error.mean()),
-        smallest=float(mean.min()),
-    )
+    write_data(folder, made)
 
 
 def spans(t: Tensor, marked: Tensor) -> list[tuple[float, float]]:
@@ -146,47 +122,46 @@ def spans(t: Tensor, marked: Tensor) -> list[tuple[float, float]]:
     return [(float(t[i]), float(t[j])) for i, j in zip(begins, ends, strict=True)]
 
 
-def multiplier_block(data: MultiplierData) -> Block:
+def multiplier_block(data: MultiplierData) -> report.Block:
     """Figure 2 under its caption."""
-    return Block(
+    return report.Block(
         "Figure 2: surface error and multiplier",
         "The error of the surface equation in simulation, and the Lagrange multiplier λ (the normal force) "
         "predicted from accelerations alone, beside the simulator's own. The shaded time contains no "
-        "training "
-        "point. The lower panels show the same relative to the simulator's value. Bands are ±2σ.",
+        "training point. The lower panels show the same relative to the simulator's value. Bands are ±2σ.",
         (draw_constraint(data), *(draw_multiplier(data, band) for band in data.bands)),
         "stages/figures/multiplier/data.json",
     )
 
 
-def draw_constraint(data: MultiplierData) -> Picture:
+def draw_constraint(data: MultiplierData) -> report.Picture:
     """Constraint error in simulation (top)."""
-    error = as_tensor(data.c)
+    error = report.as_tensor(data.c)
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
-        axes.plot(data.t, 1e6 * error, color=INK)
+        axes.plot(data.t, 1e6 * error, color=report.INK)
         axes.set_xlabel("time [s]")
         axes.set_ylabel("surface error c(q) [µm]")
         axes.margins(x=0.0)
 
     largest = 1e6 * float(error.abs().max())
     alt = f"Surface error over {data.t[-1] - data.t[0]:.3g} s, at most {largest:.2g} micrometres."
-    return draw(paint, (WIDTH, 2.1), alt, "Surface error c(q) in simulation")
+    return report.draw(paint, (WIDTH, 2.1), alt, "Surface error c(q) in simulation")
 
 
-def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> Picture:
+def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> report.Picture:
     """The multiplier predicted from accelerations beside the simulator's (bottom)."""
-    mean, simulated = as_tensor(band.mean), as_tensor(data.simulated)
-    spread, shown = BAND * as_tensor(band.std), colour(band.model)
+    mean, simulated = report.as_tensor(band.mean), report.as_tensor(data.simulated)
+    spread, shown = BAND * report.as_tensor(band.std), report.colour(band.model)
 
     def paint(figure: Figure) -> None:
         both, error = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         filled: dict[str, Any] = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ"}
         for axes, centre in ((both, torch.zeros_like(mean)), (error, simulated)):
-            shade(axes, data.held_out)
+            report.shade(axes, data.held_out)
             axes.fill_between(data.t, mean - spread - centre, mean + spread - centre, **filled)
-            axes.plot(data.t, simulated - centre, color=INK, linewidth=1.0, label="simulator")
+            axes.plot(data.t, simulated - centre, color=report.INK, linewidth=1.0, label="simulator")
             axes.plot(data.t, mean - centre, color=shown, linewidth=1.1, label="predicted")
             axes.margins(x=0.0)
         both.set_ylim(bottom=min(0.0, float((mean - spread).min())))
@@ -197,17 +172,16 @@ def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> Picture:
         figure.legend(*both.get_legend_handles_labels(), loc="outside upper center", ncols=3)
 
     alt = (
-        f"{label(band.model)}: multiplier over {data.t[-1] - data.t[0]:.3g} s, predicted with its band "
-        f"beside "
-        f"the simulator's; mean error {band.mean_error:.2g} N, coverage {100 * band.inside:.0f} %."
+        f"{report.label(band.model)}: multiplier over {data.t[-1] - data.t[0]:.3g} s, predicted with its "
+        f"band beside the simulator's; mean error {band.mean_error:.2g} N, coverage {band.inside:.0%}."
     )
-    return draw(paint, (WIDTH, 4.2), alt, label(band.model))
+    return report.draw(paint, (WIDTH, 4.2), alt, report.label(band.model))
 
 
-def multiplier_finding(data: MultiplierData) -> Finding | None:
+def multiplier_finding(data: MultiplierData) -> report.Finding | None:
     """Whether the multiplier is positive and within its band."""
     listed = "; ".join(
-        f"{label(b.model)}: ±2σ coverage {100 * b.inside:.0f} %"
+        f"{report.label(b.model)}: ±2σ coverage {100 * b.inside:.0f} %"
         + ("" if b.inside_held_out is None else f" ({100 * b.inside_held_out:.0f} % of held-out samples)")
         + f", mean error {b.mean_error:.2f} N, minimum {b.smallest:.1f} N"
         for b in data.bands
@@ -220,4 +194,4 @@ def multiplier_finding(data: MultiplierData) -> Finding | None:
             " Accelerations do not show the force along the surface normal, as H Aᵀ = 0; with a zero mean "
             "nothing else does, so only models with the analytical mean (eq. 25) can predict λ."
         )
-    return Finding("Multiplier", agrees, text) if data.bands else None
+    return report.Finding("Multiplier", agrees, text) if data.bands else None

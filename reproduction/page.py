@@ -5,43 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from forcegp.report import (
-    Block,
-    Finding,
-    RolloutData,
-    Table,
-    WindowData,
-    cell,
-    common_limit,
-    draw_errors,
-    draw_predictions,
-    label,
-    render,
-    rollout_section,
-    rollout_table,
-)
+from forcegp import report
+from reproduction import learning, scores
 from reproduction.covariance import CovarianceData, covariance_block
 from reproduction.identification import IdentificationData, identification_block, identification_finding
-from reproduction.learning import (
-    about_task,
-    against_paper,
-    curve_table,
-    draw_learning_curve,
-    efficiency,
-    learning_block,
-    residual_table,
-)
 from reproduction.multiplier import MultiplierData, draw_multiplier, multiplier_block, multiplier_finding
 from reproduction.results import PaperNumbers, Results, paper_numbers
-from reproduction.scores import (
-    calibration,
-    constraint,
-    error_table,
-    order,
-    overview_table,
-    quality_table,
-    splits,
-)
 from reproduction.task_space import TaskSpaceData, task_space_block
 from reproduction.trajectories import bands, tip_error
 
@@ -59,16 +28,21 @@ class FigureData:
     covariance: CovarianceData
     multiplier: MultiplierData
     task_space: TaskSpaceData
-    windows: list[WindowData]
+    windows: list[report.WindowData]
     identification: IdentificationData
-    rollouts: RolloutData
+    rollouts: report.RolloutData
 
 
-def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list[Finding]:
+def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list[report.Finding]:
     """All findings that the results allow."""
-    found = [against_paper(results, paper, model) for model in paper.noisy_mae]
-    found += [order(results), efficiency(results, paper), splits(results), calibration(results)]
-    found += [constraint(results), multiplier_finding(figures.multiplier)]
+    found = [learning.against_paper(results, paper, model) for model in paper.noisy_mae]
+    found += [
+        scores.order(results),
+        learning.efficiency(results, paper),
+        scores.splits(results),
+        scores.calibration(results),
+    ]
+    found += [scores.constraint(results), multiplier_finding(figures.multiplier)]
     found += [identification_finding(figures.identification)]
     found += [tip_error(figures.rollouts), bands(figures.rollouts)]
     return [finding for finding in found if finding is not None]
@@ -77,17 +51,17 @@ def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list
 def render_page(results: Results, figures: FigureData, view: str | None = None) -> str:
     """The page of a reproduction as HTML; `view` is the file with the motion in three dimensions."""
     paper = paper_numbers()
-    return render(
+    return report.render(
         "page.html.j2",
         package="reproduction",
         results=results,
         paper=paper,
         view=view,
-        task=about_task(results),
+        task=learning.about_task(results),
         opening=_opening(results, paper, figures),
         tables=_tables(results, paper),
         findings=findings(results, paper, figures),
-        learning=learning_block(results, paper),
+        learning=learning.learning_block(results, paper),
         blocks=(
             covariance_block(figures.covariance),
             multiplier_block(figures.multiplier),
@@ -95,75 +69,74 @@ def render_page(results: Results, figures: FigureData, view: str | None = None) 
             *prediction_blocks(figures.windows),
             identification_block(figures.identification),
         ),
-        trajectories=rollout_section(figures.rollouts, ROLLOUTS),
+        trajectories=report.rollout_section(figures.rollouts, ROLLOUTS),
     )
 
 
-def _opening(results: Results, paper: PaperNumbers, figures: FigureData) -> Block:
+def _opening(results: Results, paper: PaperNumbers, figures: FigureData) -> report.Block:
     """What the page shows first: how error falls with data, and the contact force with its band."""
-    drawn = {"Error over training points": draw_learning_curve(results, paper, "stretches", "clean")}
+    drawn = {"Error over training points": learning.draw_learning_curve(results, paper, "stretches", "clean")}
     band = next((b for b in figures.multiplier.bands if b.model == OPENING), None)
     if band is not None:
-        drawn[f"Contact force ({label(OPENING)})"] = draw_multiplier(figures.multiplier, band)
+        drawn[f"Contact force ({report.label(OPENING)})"] = draw_multiplier(figures.multiplier, band)
     pictures = tuple(dataclasses.replace(picture, title=title) for title, picture in drawn.items())
     caption = (
         "Error of predicted accelerations on motion without training points, and the contact force predicted "
         "from accelerations alone; the shaded time contains no training point."
     )
-    return Block("In short", caption, pictures, "results.json")
+    return report.Block("In short", caption, pictures, "results.json")
 
 
-def _tables(results: Results, paper: PaperNumbers) -> dict[str, Table]:
+def _tables(results: Results, paper: PaperNumbers) -> dict[str, report.Table]:
     return {
-        "overview": overview_table(results),
-        "errors": error_table(results, paper),
-        "quality": quality_table(results),
-        "noisy": curve_table(results, paper, "noisy"),
-        "clean": curve_table(results, paper, "clean"),
-        "residual": residual_table(results, paper),
+        "overview": scores.overview_table(results),
+        "errors": scores.error_table(results, paper),
+        "quality": scores.quality_table(results),
+        "noisy": learning.curve_table(results, paper, "noisy"),
+        "clean": learning.curve_table(results, paper, "clean"),
+        "residual": learning.residual_table(results, paper),
         "simulation": simulation_table(results),
         "settings": settings_table(results),
     }
 
 
-def prediction_blocks(windows: Sequence[WindowData]) -> tuple[Block, Block]:
+def prediction_blocks(windows: Sequence[report.WindowData]) -> tuple[report.Block, report.Block]:
     """Both figures under their captions."""
-    seconds, limit = f"{windows[0].seconds:.1f} s" if windows else "", common_limit(windows)
-    predictions = Block(
+    seconds, limit = f"{windows[0].seconds:.1f} s" if windows else "", report.common_limit(windows)
+    predictions = report.Block(
         "Figure 4: predictions",
         f"Accelerations of all joints over the same {seconds} of held-out motion without training points: "
-        f"noisy "
-        "measurements in black, predicted mean in colour, with the ±2σ band of models that give one.",
-        tuple(draw_predictions(window) for window in windows),
+        "noisy measurements in black, predicted mean in colour, with the ±2σ band of models that give one.",
+        tuple(report.draw_predictions(window) for window in windows),
         WINDOWS,
     )
-    errors = Block(
+    errors = report.Block(
         "Figure 5: errors of the predictions",
         "The same window less the predicted mean: noise-free acceleration in black, noisy in grey, the "
         "model's "
         f"band in colour. All models at the same scale of ±{limit:.2g} rad/s²; larger values are cut off.",
-        tuple(draw_errors(window, limit) for window in windows),
+        tuple(report.draw_errors(window, limit) for window in windows),
         WINDOWS,
     )
     return predictions, errors
 
 
-def simulation_table(results: Results) -> Table:
+def simulation_table(results: Results) -> report.Table:
     """Numbers on each simulated run, with the comparison of the physics engine and our equations."""
     seeds = list(results.simulations)
     names = dict.fromkeys(name for run in results.simulations.values() for name in run)
     runs = results.simulations.values()
-    rows = [(name.replace("_", " "), *(cell(run.get(name)) for run in runs)) for name in names]
-    return Table("The simulated runs", ("quantity", *(f"seed {s}" for s in seeds)), tuple(rows))
+    rows = [(name.replace("_", " "), *(report.cell(run.get(name)) for run in runs)) for name in names]
+    return report.Table("The simulated runs", ("quantity", *(f"seed {s}" for s in seeds)), tuple(rows))
 
 
-def settings_table(results: Results) -> Table:
+def settings_table(results: Results) -> report.Table:
     """Settings and versions."""
     rows = [(name.replace("_", " "), value) for name, value in results.settings.items()]
     rows += [("seeds", ", ".join(str(s) for s in results.seeds))]
     rows += [(f"version of {name}", value) for name, value in results.versions.items()]
     rows += [("computer", results.machine), ("computing time", f"{results.seconds:.0f} s")]
-    return Table("Settings, seeds and versions", ("setting", "value"), tuple(rows))
+    return report.Table("Settings, seeds and versions", ("setting", "value"), tuple(rows))
 
 
 def render_markdown(results: Results, figures: FigureData) -> str:
@@ -174,7 +147,7 @@ def render_markdown(results: Results, figures: FigureData) -> str:
     parts = [
         "# Results",
         f"Written by `python -m reproduction --profile {results.profile}`; do not edit. {paper.source} "
-        f"{about_task(results)}",
+        f"{learning.about_task(results)}",
         tables["overview"],
         "## Findings",
         "\n".join(f"- **{f.topic}**{VERDICT[f.agrees]}. {f.text}" for f in said),
@@ -183,7 +156,7 @@ def render_markdown(results: Results, figures: FigureData) -> str:
         "## Uncertainty, constraint, cost",
         *(tables[name] for name in ("quality", "residual")),
         "## Trajectories",
-        rollout_table(figures.rollouts).markdown(),
+        report.rollout_table(figures.rollouts).markdown(),
         "## Runs and settings",
         *(tables[name] for name in ("simulation", "settings")),
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from forcegp.errors import UnknownNameError
 
@@ -59,60 +59,35 @@ class Profile:
     exact: bool = False
 
 
-PROFILES = {
-    "quick": Profile(
-        "quick",
-        60.0,
-        1,
-        (50, 100, 200),
-        200,
-        200,
-        5000,
-        ("nn",),
-        paper_split_baselines=False,
-        identification_points=100,
-        rollout_seconds=1.0,
-        rollout_starts=8,
-        rollout_samples=20,
-    ),
-    "paper": Profile(
-        "paper",
-        600.0,
-        3,
-        (100, 200, 400, 600, 800, 1000),
-        400,
-        1000,
-        10_000,
-        ("nn", "nn-30-20", "nn-200x4"),
-    ),
-    "paper-exact": Profile(
-        "paper-exact",
-        600.0,
-        1,
-        (100, 200, 400, 600, 800, 1000),
-        0,
-        1000,
-        10_000,
-        ("nn", "nn-30-20", "nn-200x4"),
-        exact=True,
-    ),
-    "large": Profile(
-        "large",
-        600.0,
-        1,
-        (100, 400, 1000),
-        0,
-        1000,
-        5000,
-        ("nn",),
-        paper_split_baselines=False,
-        identification_points=100,
-        rollout_seconds=1.0,
-        rollout_starts=8,
-        rollout_samples=20,
-        sparse_sizes=(4000, 20_000, 115_200),
-    ),
-}
+QUICK = Profile(
+    name="quick",
+    duration=60.0,
+    seeds=1,
+    sizes=(50, 100, 200),
+    paper_kernels_up_to=200,
+    main=200,
+    baseline_points=5000,
+    networks=("nn",),
+    paper_split_baselines=False,
+    identification_points=100,
+    rollout_seconds=1.0,
+    rollout_starts=8,
+    rollout_samples=20,
+)
+PAPER = Profile(
+    name="paper",
+    duration=600.0,
+    seeds=3,
+    sizes=(100, 200, 400, 600, 800, 1000),
+    paper_kernels_up_to=400,
+    main=1000,
+    baseline_points=10_000,
+    networks=("nn", "nn-30-20", "nn-200x4"),
+)
+EXACT = replace(PAPER, name="paper-exact", seeds=1, paper_kernels_up_to=0, exact=True)
+WHOLE = {"sizes": (100, 400, 1000), "sparse_sizes": (4000, 20_000, 115_200)}
+LARGE = replace(QUICK, name="large", duration=600.0, paper_kernels_up_to=0, main=1000, **WHOLE)
+PROFILES = {profile.name: profile for profile in (QUICK, PAPER, EXACT, LARGE)}
 
 
 def profile_of(name: str) -> Profile:

@@ -12,19 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from forcegp import kinematics
+from benchmarks.foreign_log import mapping_of, rows_right, selected, surface_error, write_foreign_log
 from forcegp.checks import Report, check
 from forcegp.checks import read_log as read_checked
-from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
-from forcegp.data import Dataset, complement, split_by_stretches, without_marked_impacts
-from forcegp.errors import DataError
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
 from forcegp.evaluation import evaluate
 from forcegp.files import write_json, write_text
 from forcegp.logs import import_log
-from forcegp.logs.surface_fit import fit_surface
 from forcegp.models.base import Predictor
 from forcegp.models.load import load_model
 from forcegp.models.registry import create
@@ -33,7 +30,6 @@ from forcegp.models.structured_gp import StructuredGP
 from forcegp.report import write_check
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
-from reproduction.foreign_log import mapping_of, write_foreign_log
 from reproduction.stages import Stage
 
 SCENES = ("ur5_wiping", "panda_sphere")
@@ -44,8 +40,6 @@ RUN, LOG, IMPORTED, EVALUATED = "run.parquet", "log.parquet", "import.json", "ev
 VARIANTS = ("file", "torques", "sensor")
 """The robot file alone; fitted to accelerations; and to the wrist sensor's force too, which is then also a
 measurement at the states that are predicted."""
-MATCHED = 1e-6
-"""Rounding of the exported positions [rad]."""
 
 
 @dataclass(frozen=True)
@@ -64,22 +58,17 @@ class Line:
     log: Stage
     fits: dict[str, Stage]
 
-    @classmethod
-    def of(cls, root: Path, scene: str, duration: float, seed: int) -> Line:
-        """The stages of a scene, for a run of some seconds."""
-        settings: dict[str, Any] = {"scene": scene}
-        timed = settings | {"duration": duration, "seed": seed}
-        run = Stage(root, f"{scene}/simulate", make_run, timed)
-        log = Stage(root, f"{scene}/import", make_log, settings, (run,))
-        fits = {
-            variant: Stage(root, f"{scene}/{variant}", make_fit, settings | {"variant": variant}, (run, log))
-            for variant in VARIANTS
-        }
-        return cls(scene, run, log, fits)
 
-    def stages(self) -> list[Stage]:
-        """All of them."""
-        return [self.run, self.log, *self.fits.values()]
+def line_of(root: Path, scene: str, duration: float, seed: int) -> Line:
+    """The stages of a scene, for a run of some seconds."""
+    settings: dict[str, Any] = {"scene": scene}
+    run = Stage(root, f"{scene}/simulate", make_run, settings | {"duration": duration, "seed": seed})
+    log = Stage(root, f"{scene}/import", make_log, settings, (run,))
+
+    def fit(variant: str) -> Stage:
+        return Stage(root, f"{scene}/{variant}", make_fit, settings | {"variant": variant}, (run, log))
+
+    return Line(scene, run, log, {variant: fit(variant) for variant in VARIANTS})
 
 
 def make_run(folder: Path, *, scene: str, duration: float, seed: int) -> None:
@@ -112,55 +101,6 @@ def _checked(folder: Path, scene: str, system: ConstrainedSystem) -> Report:
     report = check(system, log)
     write_check(folder / "check.html", f"log.parquet on {scene}", report, system, log)
     return report
-
-
-def rows_right(log: Dataset, truth: Dataset, system: ConstrainedSystem) -> float:
-    """Share of the imported rows whose contact is the simulator's."""
-    name, rows = system.contact_names[0], rows_of(log, truth)
-    return float((log.contact[name] == truth.contact[name][rows]).double().mean())
-
-
-def rows_of(log: Dataset, truth: Dataset) -> torch.Tensor:
-    """The simulated row of each imported one.
-
-    Raises:
-        DataError: the positions are not those of the simulation.
-    """
-    first = int((truth.q - log.q[0]).abs().amax(-1).argmin())
-    since = (log.t - log.t[0]) / truth.t.diff().median()
-    rows = first + since.round().long()
-    if int(rows[-1]) >= len(truth) or float((truth.q[rows] - log.q).abs().max()) > MATCHED:
-        raise DataError("the imported rows are not those of the simulation")
-    return rows
-
-
-def surface_error(log: Dataset, system: ConstrainedSystem) -> dict[str, float]:
-    """How far the surface fitted to the tip's path is from the scene's, along the path [mm] and [degrees]."""
-    (contact,) = system.contacts
-    assert isinstance(contact, SurfaceContact)
-    fit = fit_surface(log, system, contact.name, "plane" if isinstance(contact.surface, Plane) else "sphere")
-    q = log.q[log.contact[contact.name]]
-    point = kinematics.point_position(system.robot, q, contact.frame, tuple(contact.point))
-    normal = contact.surface.gradient(point)
-    touching = point - contact.center_surface.value(point)[:, None] * normal - contact.radius * normal
-    turned = torch.linalg.cross(fit.surface.gradient(touching), normal).norm(dim=-1)
-    return {
-        "offset_mm": 1e3 * float(fit.surface.value(touching).abs().mean()),
-        "tilt_degrees": float(np.degrees(turned.max())),
-    }
-
-
-def selected(log: Dataset, truth: Dataset, system: ConstrainedSystem) -> tuple[Dataset, Dataset]:
-    """The log but for held-out stretches, and these with the simulator's normal force.
-
-    Rows at impacts are left out, as by `forcegp select`: no smooth acceleration describes them.
-    """
-    log = without_marked_impacts(log)
-    split = split_by_stretches(log, 1)
-    name, rows = system.contact_names[0], rows_of(log, truth)
-    force = {name: truth.contact_extras["multiplier"][name][rows]}
-    known = log.replace(contact_extras={**log.contact_extras, "multiplier": force})
-    return log[complement(split.test, len(log))], known[split.test]
 
 
 def make_fit(folder: Path, run: Path, log: Path, *, scene: str, variant: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from forcegp.report import Finding, Table, label, number
+from forcegp import report
 from reproduction.learning import paper_value
 from reproduction.results import GP_MODELS, SPLITS, PaperNumbers, Results
 
@@ -17,60 +17,62 @@ CLOSE = 0.15
 MEGABYTE = 1e6
 
 
-def error_table(results: Results, paper: PaperNumbers) -> Table:
+def error_table(results: Results, paper: PaperNumbers) -> report.Table:
     """Errors of every model with its most training points, on both splits, beside the paper's."""
     rows = []
     for model in results.models:
         points = results.sizes(model)[-1]
         cells = [
-            number(results.values(model, split, points, f"{kind}_mae"), 4)
+            report.number(results.values(model, split, points, f"{kind}_mae"), 4)
             for split in SPLITS
             for kind in ("noisy", "clean")
         ]
         theirs = paper_value(paper, paper.beside(results, model), points)
-        rows.append((label(model), str(points), *cells, theirs))
+        rows.append((report.label(model), str(points), *cells, theirs))
     ours = [f"{kind}, {split}" for split in ("held out", "paper's split") for kind in ("noisy", "clean")]
     head = ("model", "N", *ours, "noisy, paper")
-    return Table("Mean absolute error of predicted accelerations [rad/s²]", head, tuple(rows))
+    return report.Table("Mean absolute error of predicted accelerations [rad/s²]", head, tuple(rows))
 
 
-def overview_table(results: Results) -> Table:
+def overview_table(results: Results) -> report.Table:
     """The few numbers that the page opens with."""
     rows = []
     for model in (m for m in results.models if m not in ("nn-30-20", "nn-200x4") and not m.endswith("-se")):
         points = results.sizes(model)[-1]
         measures = (("clean_mae", 4), ("coverage_noisy", 3), ("residual", 3))
-        cells = [number(results.values(model, "stretches", points, m), digits) for m, digits in measures]
-        rows.append((label(model), str(points), *cells))
-    return Table(
+        cells = [
+            report.number(results.values(model, "stretches", points, m), digits) for m, digits in measures
+        ]
+        rows.append((report.label(model), str(points), *cells))
+    return report.Table(
         "Motion without training points: error against noise-free q̈, coverage of noisy q̈",
         ("model", "N", "error [rad/s²]", "±2σ coverage", "|A q̈ − b| [m/s²]"),
         tuple(rows),
     )
 
 
-def quality_table(results: Results) -> Table:
+def quality_table(results: Results) -> report.Table:
     """Coverage, density, constraint residual and cost of every model on held-out stretches."""
     rows = []
     for model in results.models:
         points = results.sizes(model)[-1]
         own = [s for s in results.scores if (s.model, s.split, s.points) == (model, "stretches", points)]
         measures = ("coverage_noisy", "coverage_clean", "nlpd", "residual")
-        cells = [number(results.values(model, "stretches", points, name)) for name in measures]
+        cells = [report.number(results.values(model, "stretches", points, name)) for name in measures]
         memory = [None if s.peak_memory is None else s.peak_memory / MEGABYTE for s in own]
         cost = [
-            number([s.fit_seconds for s in own], 1),
-            number([1e3 * s.predict_seconds / s.test_samples for s in own], 2),
-            number(memory, 0),
+            report.number([s.fit_seconds for s in own], 1),
+            report.number([1e3 * s.predict_seconds / s.test_samples for s in own], 2),
+            report.number(memory, 0),
         ]
-        rows.append((label(model), str(points), *cells, *cost))
+        rows.append((report.label(model), str(points), *cells, *cost))
     coverage = ("±2σ coverage (noisy)", "±2σ coverage (clean)")
     cost = ("fit [s]", "predict [ms/sample]", "peak memory [MB]")
     head = ("model", "N", *coverage, "NLPD [nats]", "mean |A q̈ − b| [m/s²]", *cost)
-    return Table("Uncertainty, constraint and cost, held-out stretches", head, tuple(rows))
+    return report.Table("Uncertainty, constraint and cost, held-out stretches", head, tuple(rows))
 
 
-def order(results: Results) -> Finding | None:
+def order(results: Results) -> report.Finding | None:
     """The models by their error on held-out stretches, beside the paper's order."""
     errors = {m: results.mean(m, "stretches", None, "noisy_mae") for m in results.models}
     known = {m: e for m, e in errors.items() if e is not None}
@@ -79,7 +81,7 @@ def order(results: Results) -> Finding | None:
         return None
     most = {m: results.sizes(m)[-1] for m in known}
     ranked = sorted(known, key=lambda m: -known[m])
-    listed = ", ".join(f"{label(m)} ({most[m]} points) {known[m]:.3f}" for m in ranked)
+    listed = ", ".join(f"{report.label(m)} ({most[m]} points) {known[m]:.3f}" for m in ranked)
     text = f"From the largest to the smallest error on held-out stretches [rad/s²]: {listed}."
     networks = [m for m in known if m.startswith("nn")]
     if networks and "gp" in known:
@@ -88,9 +90,8 @@ def order(results: Results) -> Finding | None:
         apart = "better than" if ratio < 1.0 else "worse than"
         close = "about as good as" if abs(ratio - 1.0) <= CLOSE else apart
         text += (
-            f" The best network ({label(best)}, {most[best]} points) is {close} the GP with {most['gp']} "
-            f"points; "
-            "in the paper they are about the same with 10,000 and 1,000."
+            f" The best network ({report.label(best)}, {most[best]} points) is {close} the GP with "
+            f"{most['gp']} points; in the paper they are about the same with 10,000 and 1,000."
         )
     if "analytical" in known and "gp" in known:
         worse = known["analytical"] > known["gp"]
@@ -99,40 +100,39 @@ def order(results: Results) -> Finding | None:
             if worse
             else "better than the GP averaged over the joints; its error is in the last joints."
         )
-    return Finding("Order of the models", all(known[a] >= known[b] for a, b in pairwise(paper)), text)
+    return report.Finding("Order of the models", all(known[a] >= known[b] for a, b in pairwise(paper)), text)
 
 
-def splits(results: Results) -> Finding | None:
+def splits(results: Results) -> report.Finding | None:
     """How much the paper's split flatters."""
     rows = []
     for model in (m for m in GP_MODELS if m in results.models):
         held, papers = (results.mean(model, split, None, "clean_mae") for split in SPLITS)
-        rows += [f"{label(model)} {held:.4f} against {papers:.4f}"] if held and papers else []
+        rows += [f"{report.label(model)} {held:.4f} against {papers:.4f}"] if held and papers else []
     text = (
         "Clean error on stretches of motion without any training point, against the paper's split, whose "
-        "test "
-        f"samples lie next to training points: {'; '.join(rows)} rad/s²."
+        f"test samples lie next to training points: {'; '.join(rows)} rad/s²."
     )
-    return Finding("Held-out stretches", None, text) if rows else None
+    return report.Finding("Held-out stretches", None, text) if rows else None
 
 
-def calibration(results: Results) -> Finding | None:
+def calibration(results: Results) -> report.Finding | None:
     """Whether the ±2σ bands have the right coverage."""
     models = (m for m in GP_MODELS if m in results.models)
     found = {m: results.mean(m, "stretches", None, "coverage_noisy") for m in models}
     shares = {m: share for m, share in found.items() if share is not None}
-    outside = [label(m) for m, share in shares.items() if not COVERAGE[0] <= share <= COVERAGE[1]]
-    listed = ", ".join(f"{label(m)} {share:.3f}" for m, share in shares.items())
+    outside = [report.label(m) for m, share in shares.items() if not COVERAGE[0] <= share <= COVERAGE[1]]
+    listed = ", ".join(f"{report.label(m)} {share:.3f}" for m, share in shares.items())
     verdict = f"not calibrated: {', '.join(outside)}" if outside else "all are calibrated"
     text = f"±2σ coverage of noisy accelerations (nominal 0.954): {listed}; {verdict}."
-    return Finding("Uncertainty", not outside, text) if shares else None
+    return report.Finding("Uncertainty", not outside, text) if shares else None
 
 
-def constraint(results: Results) -> Finding | None:
+def constraint(results: Results) -> report.Finding | None:
     """Whether predictions obey the constraint."""
     found = {m: [s.residual for s in results.scores if s.model == m and s.residual] for m in GP_MODELS}
     worst = {m: max(values) for m, values in found.items() if values}
-    listed = ", ".join(f"{label(m)} {value:.1e}" for m, value in worst.items())
+    listed = ", ".join(f"{report.label(m)} {value:.1e}" for m, value in worst.items())
     agrees = all(value <= RESIDUAL for m, value in worst.items() if m != "gp")
     verdict = (
         "structured models obey the constraint to rounding"
@@ -140,4 +140,4 @@ def constraint(results: Results) -> Finding | None:
         else f"a structured model is above {RESIDUAL:.0e}, which should not happen"
     )
     text = f"Largest mean |A q̈ − b| over all fits: {listed} m/s²; {verdict}."
-    return Finding("Constraint", agrees, text) if worst else None
+    return report.Finding("Constraint", agrees, text) if worst else None

@@ -36,8 +36,9 @@ from forcegp.errors import DataError, ForceGPError
 from forcegp.files import Header, write_text
 
 STAGE_FILE, DATA = "stage.json", "data.json"
-SOURCES = (Path(str(forcegp.__file__)).parent, Path(__file__).parent)
-"""Folders whose code decides results."""
+STUDY = Path(__file__).parent
+SOURCES = (Path(str(forcegp.__file__)).parent, STUDY, STUDY.parent / "benchmarks" / "foreign_log.py")
+"""Folders and files whose code decides results."""
 LIBRARIES = ("torch", "numpy", "scipy", "pybullet", "mujoco")
 """Libraries whose versions go into the keys."""
 PRESENTATION = ("cli/", "report/templates/", "templates/", "page.py", "real_contact_page.py", "__main__.py")
@@ -238,13 +239,13 @@ def code_digest(package: Path) -> str:
     """Hash of the sources and data files below a folder, without those that only present results.
 
     Args:
-        package: folder of a package.
+        package: folder of a package, or a single file.
 
     Returns:
         Hexadecimal SHA-256 over the relative paths and contents.
     """
     digest = hashlib.sha256()
-    for path in sorted(package.rglob("*")):
+    for path in sorted(package.rglob("*")) or [package]:
         name = path.relative_to(package).as_posix()
         if "__pycache__" in name or name.startswith(PRESENTATION) or not path.is_file():
             continue

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import torch
 
+from forcegp import report
 from forcegp.destination import check_destination
 from forcegp.files import write_text
 from forcegp.gp.likelihood import MATRICES_TO_LEARN
 from forcegp.models.load import load_model
-from forcegp.report import RolloutData, WindowData, predicted_window, together
 from forcegp.resources import announce_memory, free_memory
 from forcegp.scene import load_scene
 from forcegp.view.motion import of_log, sampled_rollout, with_rollout
@@ -111,9 +111,9 @@ class Plan:
             covariance=self.covariance.data(CovarianceData),
             multiplier=self.multiplier.data(MultiplierData),
             task_space=self.task_space.data(TaskSpaceData),
-            windows=[stage.data(WindowData) for stage in self.windows],
+            windows=[stage.data(report.WindowData) for stage in self.windows],
             identification=together_of,
-            rollouts=together([stage.data(RolloutData) for stage in self.rollouts]),
+            rollouts=report.together([stage.data(report.RolloutData) for stage in self.rollouts]),
         )
 
 
@@ -244,7 +244,9 @@ def viewed(fits: Sequence[Fit]) -> list[Fit]:
 
 def make_window(folder: Path, run: Path, rows: Path, fit: Path, *, model: str) -> None:
     """Write the predictions of a model over the first held-out stretch."""
-    write_data(folder, predicted_window(load_model(fit / MODEL), Task.read(run, rows).held_out(), model))
+    write_data(
+        folder, report.predicted_window(load_model(fit / MODEL), Task.read(run, rows).held_out(), model)
+    )
 
 
 def make_view(folder: Path, run: Path, rows: Path, fit: Path) -> None:

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
+from forcegp import report
 from forcegp.files import Header
-from forcegp.report import AXES, INK, Block, Picture, Series, columns, draw, matrix, series
 from reproduction.stages import write_data
 from reproduction.task import Task, motion_of
 
@@ -30,14 +30,14 @@ class TaskSpaceData(Header):
     FORMAT: ClassVar[str] = "forcegp-task-space"
     VERSION: ClassVar[int] = 1
 
-    t: Series
-    planned_position: list[Series]
-    planned_velocity: list[Series]
-    planned_acceleration: list[Series]
-    position: list[Series]
-    velocity: list[Series]
-    acceleration: list[Series]
-    waypoints: list[Series]
+    t: report.Series
+    planned_position: list[report.Series]
+    planned_velocity: list[report.Series]
+    planned_acceleration: list[report.Series]
+    position: list[report.Series]
+    velocity: list[report.Series]
+    acceleration: list[report.Series]
+    waypoints: list[report.Series]
 
 
 def make_task_space(folder: Path, run: Path, rows: Path, *, seconds: float) -> None:
@@ -57,61 +57,62 @@ def task_space_motion(t: Tensor, motion: Mapping[str, Tensor], rows: Tensor) -> 
     first, last = int(motion["segment"][rows].min()), int(motion["segment"][rows].max())
     vectors = [prefix + name for prefix in ("planned_", "") for name in UNITS]
     return TaskSpaceData(
-        t=series(t[rows]),
-        waypoints=matrix(motion["waypoints"][torch.arange(first + 1, last + 1)]),
-        **{name: columns(motion[name][rows]) for name in vectors},
+        t=report.series(t[rows]),
+        waypoints=report.matrix(motion["waypoints"][torch.arange(first + 1, last + 1)]),
+        **{name: report.columns(motion[name][rows]) for name in vectors},
     )
 
 
-def task_space_block(data: TaskSpaceData) -> Block:
+def task_space_block(data: TaskSpaceData) -> report.Block:
     """Figure 3 under its caption."""
-    return Block(
+    return report.Block(
         "Figure 3: task-space motion",
-        "The tool moves along straight lines between random points on the surface, with a trapezoidal speed "
-        "profile and a stop at every point; dashed: planned, wide: executed under torque control with "
-        "contact "
-        "and friction.",
+        "The tool moves along straight lines between random points on the surface, with a trapezoidal "
+        "speed profile and a stop at every point; dashed: planned, wide: executed under torque control "
+        "with contact and friction.",
         (draw_motion(data), draw_path(data)),
         "stages/figures/task-space/data.json",
     )
 
 
-def draw_motion(data: TaskSpaceData) -> Picture:
+def draw_motion(data: TaskSpaceData) -> report.Picture:
     """Planned and executed position, velocity and acceleration of the tool by axis."""
 
     def paint(figure: Figure) -> None:
         for axes, (name, unit) in zip(figure.subplots(3, 1, sharex=True), UNITS.items(), strict=True):
-            for axis, shown in enumerate(AXES):
+            for axis, shown in enumerate(report.AXES):
                 axes.plot(data.t, getattr(data, name)[axis], color=shown, **EXECUTED)
                 axes.plot(data.t, getattr(data, "planned_" + name)[axis], color=shown, **PLANNED)
             axes.set_ylabel(f"{name} [{unit}]")
             axes.margins(x=0.0)
         figure.axes[-1].set_xlabel("time [s]")
         figure.align_ylabels()
-        styles = [Line2D([], [], color=shown, label=name) for shown, name in zip(AXES, "xyz", strict=True)]
-        styles += [Line2D([], [], color=INK, label="planned", **PLANNED)]
-        styles += [Line2D([], [], color=INK, label="executed", **EXECUTED)]
+        styles = [
+            Line2D([], [], color=shown, label=name) for shown, name in zip(report.AXES, "xyz", strict=True)
+        ]
+        styles += [Line2D([], [], color=report.INK, label="planned", **PLANNED)]
+        styles += [Line2D([], [], color=report.INK, label="executed", **EXECUTED)]
         figure.legend(handles=styles, loc="outside upper center", ncols=5)
 
     alt = (
         f"Position, velocity and acceleration of the tool over {data.t[-1] - data.t[0]:.3g} s by axis: "
         "straight lines with trapezoidal speed, planned and executed nearly identical."
     )
-    return draw(paint, (WIDTH, 5.2), alt, "Over time")
+    return report.draw(paint, (WIDTH, 5.2), alt, "Over time")
 
 
-def draw_path(data: TaskSpaceData) -> Picture:
+def draw_path(data: TaskSpaceData) -> report.Picture:
     """The path of the tool over the surface, seen from above, with its waypoints."""
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
-        axes.plot(data.position[0], data.position[1], color=AXES[0], linewidth=0.8, label="executed")
+        axes.plot(data.position[0], data.position[1], color=report.AXES[0], linewidth=0.8, label="executed")
         points = [[p[0] for p in data.waypoints], [p[1] for p in data.waypoints]]
-        axes.plot(*points, linestyle="", marker="o", markersize=3.0, color=AXES[1], label="waypoints")
+        axes.plot(*points, linestyle="", marker="o", markersize=3.0, color=report.AXES[1], label="waypoints")
         axes.set_aspect("equal")
         axes.set_xlabel("x [m]")
         axes.set_ylabel("y [m]")
         figure.legend(loc="outside upper center", ncols=2)
 
     alt = f"Path of the tool seen from above: straight lines between {len(data.waypoints)} random points."
-    return draw(paint, (WIDTH, 5.2), alt, "From above")
+    return report.draw(paint, (WIDTH, 5.2), alt, "From above")

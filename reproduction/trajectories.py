@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
+from forcegp import report
 from forcegp.data import Dataset
 from forcegp.models.load import load_model
-from forcegp.report import Finding, RolloutData, label, rollout_data, with_bands
 from forcegp.rollout import compare
 from reproduction.fits import MODEL
 from reproduction.stages import write_data
@@ -57,14 +57,14 @@ def make_rollouts(
         stretch: duration of the held-out stretches that bands are calibrated on [s].
     """
     models, task, data = {model: load_model(fit / MODEL)}, Task.read(run, rows), Dataset.read(unseen / LOG)
-    found = rollout_data(compare(models, data, seconds, starts, system=task.system))
+    found = report.rollout_data(compare(models, data, seconds, starts, system=task.system))
     if models[model].has_function_samples:
         seconds = min(BAND_SECONDS, seconds)
         bands = compare(models, data, seconds, starts, samples, system=task.system)
         seconds = min(seconds, stretch)
         chosen = _calibration_starts(task, seconds, CALIBRATION_STARTS * starts)
         calibration = compare(models, task.data, seconds, chosen, samples, system=task.system)
-        found = with_bands(found, rollout_data(bands, calibration))
+        found = report.with_bands(found, report.rollout_data(bands, calibration))
     write_data(folder, found)
 
 
@@ -82,7 +82,7 @@ def _calibration_starts(task: Task, seconds: float, most: int) -> torch.Tensor:
     return torch.tensor(rows)
 
 
-def tip_error(data: RolloutData) -> Finding | None:
+def tip_error(data: report.RolloutData) -> report.Finding | None:
     """The S-GP with analytical mean against models that do not learn forces, one second ahead."""
     if HORIZON not in data.horizons:
         return None
@@ -93,18 +93,19 @@ def tip_error(data: RolloutData) -> Finding | None:
         return None
     ours = errors[OURS]
     ratios = {m: ours / e if math.isfinite(ours) else math.inf for m, e in others.items()}
-    listed = "; ".join(f"{label(m)} {_millimetres(e)}, ratio {ratios[m]:.2g}" for m, e in others.items())
-    structured = (m for m in errors if m.startswith("sgp") and m != OURS)
-    beside = "".join(f"; {label(m)} {_millimetres(errors[m])}" for m in structured)
-    text = (
-        f"Open loop, median over {data.starts} starts, {HORIZON:g} s ahead: {label(OURS)} "
-        f"{_millimetres(ours)} "
-        f"(target: at most a fifth of each of the following); {listed}{beside}."
+    listed = "; ".join(
+        f"{report.label(m)} {_millimetres(e)}, ratio {ratios[m]:.2g}" for m, e in others.items()
     )
-    return Finding("Tip error of trajectories", all(ratio <= FIFTH for ratio in ratios.values()), text)
+    structured = (m for m in errors if m.startswith("sgp") and m != OURS)
+    beside = "".join(f"; {report.label(m)} {_millimetres(errors[m])}" for m in structured)
+    text = (
+        f"Open loop, median over {data.starts} starts, {HORIZON:g} s ahead: {report.label(OURS)} "
+        f"{_millimetres(ours)} (target: at most a fifth of each of the following); {listed}{beside}."
+    )
+    return report.Finding("Tip error of trajectories", all(ratio <= FIFTH for ratio in ratios.values()), text)
 
 
-def bands(data: RolloutData) -> Finding | None:
+def bands(data: report.RolloutData) -> report.Finding | None:
     """Whether bands over function samples have the right coverage of the simulated motion."""
     sampled = [path for path in data.models if path.coverage is not None]
     if not sampled:
@@ -112,12 +113,12 @@ def bands(data: RolloutData) -> Finding | None:
     calibrated = all(path.calibrated_coverage is not None for path in sampled)
     listed = []
     for path in sampled:
-        text = f"{label(path.model)} {path.coverage:.3f}"
+        text = f"{report.label(path.model)} {path.coverage:.3f}"
         if path.calibrated_coverage is not None:
             text += f", widened by {path.inflation:.2f} {path.calibrated_coverage:.3f}"
         listed.append(text)
     shares = {p.model: p.calibrated_coverage if calibrated else p.coverage for p in sampled}
-    outside = [label(m) for m, s in shares.items() if s is None or not HELD[0] <= s <= HELD[1]]
+    outside = [report.label(m) for m, s in shares.items() if s is None or not HELD[0] <= s <= HELD[1]]
     text = (
         f"Share of simulated tip positions inside the {data.level:.0%} bands over function samples, "
         f"{data.band_starts} starts, {data.band_seconds:.3g} s (target: {HELD[0]:.2f} to {HELD[1]:.2f}), "
@@ -125,7 +126,7 @@ def bands(data: RolloutData) -> Finding | None:
         + "; ".join(listed)
         + (f"; outside: {', '.join(outside)}." if outside else ".")
     )
-    return Finding("Bands of trajectories", not outside, text)
+    return report.Finding("Bands of trajectories", not outside, text)
 
 
 def _millimetres(error: float) -> str:

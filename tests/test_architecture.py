@@ -122,6 +122,8 @@ def test_the_study_is_not_part_of_the_library_and_uses_the_exports_of_the_report
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("forcegp.report"):
                 assert node.module == "forcegp.report", f"{path.name} imports {node.module}"
                 used.update(alias.name for alias in node.names)
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "report":
+                used.add(node.attr)
     assert used == set(importlib.import_module("forcegp.report").__all__)
     for name, path in modules().items():
         assert "reproduction" not in re.findall(r"(?:from|import) (\w+)", path.read_text("utf-8")), name

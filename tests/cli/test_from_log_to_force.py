@@ -10,12 +10,11 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from benchmarks.foreign_log import mapping_of, rows_of, write_foreign_log
 from forcegp.cli import app
 from forcegp.data import Dataset
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
-from reproduction.foreign_log import mapping_of, write_foreign_log
-from reproduction.real_contact import rows_of
 
 pytest.importorskip("mujoco")
 

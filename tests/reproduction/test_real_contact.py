@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.foreign_log import mapping_of, rows_of, rows_right, surface_error, write_foreign_log
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
@@ -22,8 +23,6 @@ from forcegp.models.sensed import force_from_sensor, sensed_force, sensor_noise_
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
-from reproduction.foreign_log import mapping_of, write_foreign_log
-from reproduction.real_contact import rows_of, rows_right, surface_error
 from reproduction.real_contact_page import findings, tables
 
 pytest.importorskip("mujoco")
