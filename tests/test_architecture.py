@@ -182,6 +182,6 @@ def test_public_names_exist_and_are_documented() -> None:
     for name in forcegp.__all__:
         thing = getattr(forcegp, name)
         assert inspect.getdoc(thing), f"forcegp.{name} has no docstring"
-    with pytest.raises(AttributeError, match="no attribute 'StructuredGp'"):
+    with pytest.raises(AttributeError, match="No forcegp attribute StructuredGp"):
         forcegp.StructuredGp  # noqa: B018
     assert importlib.import_module("forcegp.gp")
