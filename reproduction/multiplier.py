@@ -173,7 +173,8 @@ def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> report.Pictur
 
     alt = (
         f"{report.label(band.model)}: multiplier over {data.t[-1] - data.t[0]:.3g} s, predicted with its "
-        f"band beside the simulator's; mean error {band.mean_error:.2g} N, coverage {band.inside:.0%}."
+        f"band beside the simulator's; mean error {band.mean_error:.2g} N, "
+        f"coverage {100 * band.inside:.0f} %."
     )
     return report.draw(paint, (WIDTH, 4.2), alt, report.label(band.model))
 
