@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,6 +10,9 @@ import typer
 
 from forcegp.cli import main
 from forcegp.cli.common import AsJson, progress_bar, show
+
+INTERRUPTED = 130
+"""Exit code after an interrupt."""
 
 app = typer.Typer(
     pretty_exceptions_enable=False,
@@ -64,4 +68,9 @@ def reproduce(
 
 
 if __name__ == "__main__":
-    main(app)
+    try:
+        main(app)
+    except SystemExit as ended:
+        if ended.code == INTERRUPTED:
+            os._exit(INTERRUPTED)  # the workers are gone, and to take PyTorch down takes longer than that
+        raise
