@@ -26,7 +26,7 @@ $(READY): pyproject.toml constraints.txt
 	@echo "[setup] done"
 
 reproduce: $(READY)  ## the main job: simulate, select, train, report
-	$(BIN)/forcegp reproduce --profile $(PROFILE) --out $(OUT)/$(PROFILE)
+	$(BIN)/python -m reproduction --profile $(PROFILE) --out $(OUT)/$(PROFILE)
 	@echo "[reproduce] open $(OUT)/$(PROFILE)/report.html"
 
 test: lint types $(READY)  ## lint, types and tests

@@ -17,13 +17,14 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from foreign_log import mapping_of, rows_right, surface_error, write_foreign_log
+
 from forcegp.errors import DataError
 from forcegp.logs import import_log
-from forcegp.paper.foreign_log import mapping_of, write_foreign_log
-from forcegp.paper.real_contact import SCENES, rows_right, surface_error
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 
+SCENES = ("ur5_wiping", "panda_sphere")
 SOURCES = ("distance", "wrench", "multiplier")
 
 

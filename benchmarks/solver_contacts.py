@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
+from foreign_log import mapping_of, rows_right, selected, write_foreign_log
 from results_page import table
 
 from forcegp.constraints import ConstrainedSystem
@@ -28,10 +29,10 @@ from forcegp.files import write_text
 from forcegp.logs import import_log
 from forcegp.models.registry import create
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.paper.foreign_log import mapping_of, write_foreign_log
-from forcegp.paper.real_contact import MODEL, rows_right, selected
 from forcegp.scene import load_scene
 from forcegp.simulate import Sensors, simulate
+
+MODEL = "sgp-real"
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from forcegp.paper.covariance import CovarianceData
-from forcegp.paper.figures import FigureData
-from forcegp.paper.identification import IdentificationData, IdentificationRun
-from forcegp.paper.multiplier import MultiplierBand, MultiplierData
-from forcegp.paper.results import Results, Score
-from forcegp.paper.task_space import TaskSpaceData
 from forcegp.report.rollout_data import Band, Film, ModelPath, RolloutData
 from forcegp.report.window import WindowData
+from reproduction.covariance import CovarianceData
+from reproduction.identification import IdentificationData, IdentificationRun
+from reproduction.multiplier import MultiplierBand, MultiplierData
+from reproduction.page import FigureData
+from reproduction.results import Results, Score
+from reproduction.task_space import TaskSpaceData
 
 T = [i / 240 for i in range(72)]
 JOINTS = [f"joint_{i}" for i in range(1, 8)]

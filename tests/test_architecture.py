@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -48,7 +49,6 @@ LAYERS = (
     ("evaluation",),
     ("view",),
     ("report", "sweep"),
-    ("paper",),
     ("cli",),
     ("__main__",),
 )
@@ -114,6 +114,21 @@ def test_hidden_imports_are_found(tmp_path: Path) -> None:
     assert imports(path) == {"data", "robot.tree", "robot.model"}
 
 
+def test_the_study_is_not_part_of_the_library_and_uses_the_exports_of_the_report() -> None:
+    study = Path(__file__).parents[1] / "reproduction"
+    used: set[str] = set()
+    for path in study.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("forcegp.report"):
+                assert node.module == "forcegp.report", f"{path.name} imports {node.module}"
+                used.update(alias.name for alias in node.names)
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "report":
+                used.add(node.attr)
+    assert used == set(importlib.import_module("forcegp.report").__all__)
+    for name, path in modules().items():
+        assert "reproduction" not in re.findall(r"(?:from|import) (\w+)", path.read_text("utf-8")), name
+
+
 def public_definitions(path: Path) -> list[ast.ClassDef | ast.FunctionDef]:
     """Public classes and functions of a module, with the public methods that classes define."""
     found: list[ast.ClassDef | ast.FunctionDef] = []
@@ -167,6 +182,6 @@ def test_public_names_exist_and_are_documented() -> None:
     for name in forcegp.__all__:
         thing = getattr(forcegp, name)
         assert inspect.getdoc(thing), f"forcegp.{name} has no docstring"
-    with pytest.raises(AttributeError, match="no attribute 'StructuredGp'"):
+    with pytest.raises(AttributeError, match="No forcegp attribute StructuredGp"):
         forcegp.StructuredGp  # noqa: B018
     assert importlib.import_module("forcegp.gp")

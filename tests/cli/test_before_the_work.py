@@ -19,6 +19,7 @@ from forcegp.data import Dataset
 from forcegp.errors import DataError, DestinationError, ForceGPError, MemoryLimitError
 from forcegp.gp import likelihood
 from forcegp.resources import MemoryNeedWarning
+from reproduction.__main__ import app as study
 
 PLENTY = 1 << 60
 
@@ -31,7 +32,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*arguments: object) -> None:
-    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    program, given = (study, arguments[1:]) if arguments[0] == "reproduce" else (app, arguments)
+    done = CliRunner().invoke(program, [str(argument) for argument in given])
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
 

@@ -16,7 +16,7 @@ from forcegp.cli import app, main
 from forcegp.data import Dataset
 from logs import JOINTS, random_log
 
-COMMANDS = ("reproduce", "simulate", "select", "fit", "predict", "evaluate", "rollout", "import")
+COMMANDS = ("simulate", "select", "fit", "predict", "evaluate", "rollout", "import")
 
 
 def run(*arguments: object) -> str:

@@ -10,10 +10,9 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from benchmarks.foreign_log import mapping_of, rows_of, write_foreign_log
 from forcegp.cli import app
 from forcegp.data import Dataset
-from forcegp.paper.foreign_log import mapping_of, write_foreign_log
-from forcegp.paper.real_contact import rows_of
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 

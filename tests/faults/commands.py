@@ -13,12 +13,13 @@ import torch
 from safetensors.torch import load_file
 
 import forcegp
-from forcegp.cli import main
+from forcegp.cli import app, main
 from forcegp.data import Dataset
-from forcegp.paper import profiles
-from forcegp.paper.profiles import Profile
-from forcegp.paper.stages import STAGE_FILE
 from forcegp.storage import checkpoint
+from reproduction import profiles
+from reproduction.__main__ import app as study
+from reproduction.profiles import Profile
+from reproduction.stages import STAGE_FILE
 
 SCENE = """
 [robot]
@@ -139,9 +140,10 @@ def execute(name: str, inputs: Path, out: Path) -> None:
     """Run a command in this process; every evaluation of a fit is recorded at once."""
     checkpoint.INTERVAL = 0.0
     profiles.PROFILES["quick"] = SMALL
-    sys.argv = ["forcegp", name, *map(str, COMMANDS[name].arguments(inputs, out))]
+    program, names = (study, ["reproduction"]) if name == "reproduce" else (app, ["forcegp", name])
+    sys.argv = [*names, *map(str, COMMANDS[name].arguments(inputs, out))]
     try:
-        main()
+        main(program)
     except SystemExit as ended:
         if ended.code:
             raise

@@ -22,7 +22,7 @@ from faults.commands import COMMANDS, Command, child, numbers, prepare, stages
 
 KILLS = 50 if os.environ.get("FORCEGP_ATTACK") else 3
 PRELOADED = [
-    *("faults.commands", "forcegp.simulate", "forcegp.logs", "forcegp.paper.reproduce"),
+    *("faults.commands", "forcegp.simulate", "forcegp.logs", "reproduction.study"),
     *("forcegp.report.rollouts", "scipy.signal", "matplotlib.pyplot", "pybullet"),
 ]
 """What the commands import on their way; a module that is not installed is passed over."""

@@ -12,7 +12,6 @@ from forcegp.cli.evaluate import evaluate
 from forcegp.cli.fit import fit
 from forcegp.cli.import_ import import_
 from forcegp.cli.predict import predict
-from forcegp.cli.reproduce import reproduce
 from forcegp.cli.rollout import rollout
 from forcegp.cli.select import select
 from forcegp.cli.simulate import simulate
@@ -31,7 +30,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (reproduce, simulate, check, select, fit, predict, evaluate, rollout, sweep, view):
+for command in (simulate, check, select, fit, predict, evaluate, rollout, sweep, view):
     app.command()(command)
 app.command("import")(import_)
 
@@ -54,12 +53,12 @@ def _options(
     """Options of the program as a whole."""
 
 
-def main() -> None:
-    """Run the command line; errors that a user can cause end in one message and exit code 2."""
+def main(program: typer.Typer = app) -> None:
+    """Run a command line; errors that a user can cause end in one message and exit code 2."""
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
-            app()
+            program()
         except ForceGPError as error:
             _fail(str(error))
         except OSError as error:

@@ -1,0 +1,101 @@
+"""Sizes of a reproduction: a few minutes, those of the paper, or all samples of the log; and the models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from forcegp.errors import UnknownNameError
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Sizes of a reproduction.
+
+    Attributes:
+        name: of the profile.
+        duration: simulated motion [s].
+        seeds: number of simulated runs, each with its own split.
+        sizes: training points of the GP models.
+        paper_kernels_up_to: largest size at which the paper's kernel alone is fitted too.
+        main: training points of the GP models in the figures over time.
+        baseline_points: training points of the analytical model and the neural networks.
+        networks: which networks are trained.
+        paper_split_seeds: simulated runs that are scored on the paper's split too.
+        paper_split_baselines: whether analytical model and networks are scored on the paper's split too.
+        stretch: duration of a held-out stretch, and of the window of figures 4 and 5 [s].
+        test_samples: maximum number of test samples that are predicted for the scores.
+        multiplier_seconds: length of figure 2 [s].
+        identification_points: training points of the identification.
+        identification_evaluations: iterations of the identification.
+        rollout_seconds: length of the trajectories that are predicted in open loop [s].
+        rollout_starts: states of a further simulated run that they start from.
+        rollout_samples: function samples of their bands.
+        sparse_sizes: training points of the structured models beyond those of the other GP models: rows
+            evenly spaced over all that are not held out.
+        exact: whether the GP models are the paper's in every respect that it states: its kernel alone, inputs
+            in their units, the marginal likelihood without priors on hyperparameters, and ADAM with the
+            learning rate 0.2; otherwise ours, with the paper's kernel beside them.
+    """
+
+    name: str
+    duration: float
+    seeds: int
+    sizes: tuple[int, ...]
+    paper_kernels_up_to: int
+    main: int
+    baseline_points: int
+    networks: tuple[str, ...]
+    paper_split_seeds: int = 1
+    paper_split_baselines: bool = True
+    stretch: float = 3.0
+    test_samples: int = 2000
+    multiplier_seconds: float = 10.0
+    identification_points: int = 200
+    identification_evaluations: int = 150
+    rollout_seconds: float = 10.0
+    rollout_starts: int = 16
+    rollout_samples: int = 100
+    sparse_sizes: tuple[int, ...] = ()
+    exact: bool = False
+
+
+QUICK = Profile(
+    name="quick",
+    duration=60.0,
+    seeds=1,
+    sizes=(50, 100, 200),
+    paper_kernels_up_to=200,
+    main=200,
+    baseline_points=5000,
+    networks=("nn",),
+    paper_split_baselines=False,
+    identification_points=100,
+    rollout_seconds=1.0,
+    rollout_starts=8,
+    rollout_samples=20,
+)
+PAPER = Profile(
+    name="paper",
+    duration=600.0,
+    seeds=3,
+    sizes=(100, 200, 400, 600, 800, 1000),
+    paper_kernels_up_to=400,
+    main=1000,
+    baseline_points=10_000,
+    networks=("nn", "nn-30-20", "nn-200x4"),
+)
+EXACT = replace(PAPER, name="paper-exact", seeds=1, paper_kernels_up_to=0, exact=True)
+WHOLE = {"sizes": (100, 400, 1000), "sparse_sizes": (4000, 20_000, 115_200)}
+LARGE = replace(QUICK, name="large", duration=600.0, paper_kernels_up_to=0, main=1000, **WHOLE)
+PROFILES = {profile.name: profile for profile in (QUICK, PAPER, EXACT, LARGE)}
+
+
+def profile_of(name: str) -> Profile:
+    """A profile by name.
+
+    Raises:
+        UnknownNameError: no such profile.
+    """
+    if name not in PROFILES:
+        raise UnknownNameError("profile", name, PROFILES)
+    return PROFILES[name]

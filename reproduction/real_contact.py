@@ -1,0 +1,140 @@
+"""From a foreign log to a contact force: the whole line on scenes whose contact MuJoCo's solver makes.
+
+Simulate, export as CSV in degrees and milliseconds, import, check, select, fit, evaluate: each step as a user
+takes it on the command line. Models never see the simulator's forces, which only judge them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.foreign_log import mapping_of, rows_right, selected, surface_error, write_foreign_log
+from forcegp.checks import Report, check
+from forcegp.checks import read_log as read_checked
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
+from forcegp.evaluation import evaluate
+from forcegp.files import write_json, write_text
+from forcegp.logs import import_log
+from forcegp.models.base import Predictor
+from forcegp.models.load import load_model
+from forcegp.models.registry import create
+from forcegp.models.sensed import force_from_sensor, sensor_noise_std, with_sensor
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.report import write_check
+from forcegp.scene import load_scene
+from forcegp.simulate import simulate
+from reproduction.stages import Stage
+
+SCENES = ("ur5_wiping", "panda_sphere")
+SOURCES = ("distance", "wrench")
+"""What contact is detected from; the first is what the models are fitted with."""
+MODEL = "sgp-real"
+RUN, LOG, IMPORTED, EVALUATED = "run.parquet", "log.parquet", "import.json", "evaluation.json"
+VARIANTS = ("file", "torques", "sensor")
+"""The robot file alone; fitted to accelerations; and to the wrist sensor's force too, which is then also a
+measurement at the states that are predicted."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """The stages of one scene.
+
+    Attributes:
+        scene: its name.
+        run: the simulated log.
+        log: the log exported as CSV and imported, with the check's page.
+        fits: a model and its scores on held-out stretches, by variant.
+    """
+
+    scene: str
+    run: Stage
+    log: Stage
+    fits: dict[str, Stage]
+
+
+def line_of(root: Path, scene: str, duration: float, seed: int) -> Line:
+    """The stages of a scene, for a run of some seconds."""
+    settings: dict[str, Any] = {"scene": scene}
+    run = Stage(root, f"{scene}/simulate", make_run, settings | {"duration": duration, "seed": seed})
+    log = Stage(root, f"{scene}/import", make_log, settings, (run,))
+
+    def fit(variant: str) -> Stage:
+        return Stage(root, f"{scene}/{variant}", make_fit, settings | {"variant": variant}, (run, log))
+
+    return Line(scene, run, log, {variant: fit(variant) for variant in VARIANTS})
+
+
+def make_run(folder: Path, *, scene: str, duration: float, seed: int) -> None:
+    """Write the simulated log `run.parquet`."""
+    read = load_scene(scene)
+    config = dataclasses.replace(read.simulation, duration=duration, seed=seed)
+    simulate(read.system(), config).data.write(folder / RUN)
+
+
+def make_log(folder: Path, run: Path, *, scene: str) -> None:
+    """Write the log as CSV (`run.csv`) and imported (`log.parquet`), the check's page, and their numbers."""
+    system, truth = load_scene(scene).system(), Dataset.read(run / RUN)
+    write_foreign_log(folder / "run.csv", truth, system)
+    logs: dict[str, Dataset] = {}
+    for source in SOURCES:
+        write_text(folder / f"{source}.toml", mapping_of(system, source))
+        logs[source] = import_log(folder / "run.csv", system, folder / f"{source}.toml").data
+    log = logs[SOURCES[0]]
+    log.write(folder / LOG)
+    numbers = {
+        "rows_right": {source: rows_right(log, truth, system) for source, log in logs.items()},
+        "surface": surface_error(log, system),
+        "check": _checked(folder, scene, system).to_dict(),
+    }
+    write_json(folder / IMPORTED, numbers)
+
+
+def _checked(folder: Path, scene: str, system: ConstrainedSystem) -> Report:
+    log = read_checked(folder / LOG)
+    report = check(system, log)
+    write_check(folder / "check.html", f"log.parquet on {scene}", report, system, log)
+    return report
+
+
+def make_fit(folder: Path, run: Path, log: Path, *, scene: str, variant: str) -> None:
+    """Write a model, and its scores on held-out stretches (`evaluation.json`)."""
+    system = load_scene(scene).system()
+    train, test = selected(Dataset.read(log / LOG), Dataset.read(run / RUN), system)
+    model = _model(variant, system, train)
+    model.save(folder / "model")
+    write_json(folder / EVALUATED, evaluate(model, test, train=train).to_dict())
+
+
+def _model(variant: str, system: ConstrainedSystem, train: Dataset) -> Predictor:
+    if variant == "file":
+        return create("analytical", system)
+    model = create(MODEL, system)
+    assert isinstance(model, StructuredGP)
+    if variant == "sensor":
+        return model.fit(with_sensor(train, system, sensor_noise_std(train, system)))
+    return model.fit(train)
+
+
+def force_of(stage: Stage, test: Dataset) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean and standard deviation of the normal force of a fitted model at states, `(n,)` each [N]."""
+    model = load_model(stage.folder / "model")
+    assert isinstance(model, StructuredGP)
+    fit, active = model.fitted, test.active(model.system.contact_names)
+    if "multiplier" in fit.noise:
+        return force_from_sensor(fit, test)
+    states = test.q, test.qd, test.tau
+    found = fit.predict(*states, "multiplier", active=active, noise=True)
+    assert found.std is not None
+    return found.mean[:, 0], found.std[:, 0]
+
+
+def numbers_of(stage: Stage, name: str) -> dict[str, Any]:
+    """The numbers that a stage wrote."""
+    return json.loads((stage.folder / name).read_text(encoding="utf-8"))
