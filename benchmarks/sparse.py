@@ -183,7 +183,8 @@ def markdown(machine: str, bounds: Sequence[Bound]) -> str:
     """The section of the page of results."""
     text = (
         "`python benchmarks/sparse.py --docs benchmarks/notes/speed.md` measures it again: one thread, "
-        f"float64, {machine}. Synthetic rows are seven per sample; ten-minute logs are those of the paper's task."
+        f"float64, {machine}. "
+        "Synthetic rows are seven per sample; ten-minute logs are those of the paper's task."
     )
     rows = table(["what", "measured", "bound", "unit", "met"], [bound.row() for bound in bounds])
     return f"## Sparse posterior\n\n{text}\n\n{rows}"
