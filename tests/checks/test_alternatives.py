@@ -9,7 +9,7 @@ import pytest
 
 import forcegp
 from forcegp.checks import KINDS, Finding, Report
-from forcegp.checks.alternatives import TESTS, alternatives_of, with_alternatives
+from forcegp.checks.explain import TESTS, alternatives_of, with_alternatives
 from forcegp.checks.fit import BLOCKS, Fit
 from forcegp.checks.hypotheses import Hypothesis, unchanged
 from forcegp.constraints import ConstrainedSystem

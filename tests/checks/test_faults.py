@@ -11,7 +11,8 @@ import pytest
 import torch
 
 import forcegp
-from forcegp.checks import Report, check, log_of, visibility
+from forcegp.checks import Report, check, log_of
+from forcegp.checks import excitation
 from forcegp.constraints import ConstrainedSystem
 from forcegp.scene import load_scene
 from forcegp.simulate import make_engine, simulate

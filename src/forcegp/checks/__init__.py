@@ -1,7 +1,6 @@
 """Checks of a log against a scene before a model is fitted to it."""
 
-from forcegp.checks.finding import Finding, Report
-from forcegp.checks.kinds import KINDS
+from forcegp.checks.finding import KINDS, Finding, Report
 from forcegp.checks.log import Log, log_of, read_log
 from forcegp.checks.run import check
 

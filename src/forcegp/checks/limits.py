@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
-from forcegp.checks.log import Log
-from forcegp.checks.statistics import Array, any_row, describe, intervals
+from forcegp.checks.log import Array, Log, Outcome, any_row, describe, intervals
 from forcegp.constraints import ConstrainedSystem
 
 DEGREE = np.pi / 180.0

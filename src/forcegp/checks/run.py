@@ -9,23 +9,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from forcegp.checks import (
-    clock,
-    contact,
-    excitation,
-    force,
-    jumps,
-    kinematics,
-    limits,
-    mechanics,
-    noise,
-    placement,
-    values,
-)
-from forcegp.checks.clock import Outcome
-from forcegp.checks.finding import SEVERITIES, Finding, NotJudgedError, Report
-from forcegp.checks.kinds import KINDS
-from forcegp.checks.log import Log, log_of, of_robot
+from forcegp.checks import contact, excitation, kinematics, limits, mechanics, placement, values
+from forcegp.checks.finding import KINDS, SEVERITIES, Finding, NotJudgedError, Report
+from forcegp.checks.log import Log, Outcome, log_of, of_robot
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.dataset import Dataset
 from forcegp.resources import announce_memory
@@ -49,30 +35,30 @@ def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
 
 CHECKS: tuple[tuple[str, Check], ...] = (
     ("finite values", values.check_finite),
-    ("order of time", clock.check_order),
+    ("order of time", values.check_order),
     ("robot", check_robot),
     ("held rows", values.check_held),
-    ("gaps", clock.check_gaps),
-    ("jitter", clock.check_jitter),
+    ("gaps", values.check_gaps),
+    ("jitter", values.check_jitter),
     ("degrees", limits.check_degrees),
     ("unit of time", kinematics.check_clock_unit),
-    ("sampling period", clock.check_period),
+    ("sampling period", values.check_period),
     ("spikes", values.check_spikes),
     ("standing channels", values.check_stuck),
-    ("jumps", jumps.check_jumps),
+    ("jumps", values.check_jumps),
     ("velocity", kinematics.check_velocity),
     ("acceleration", kinematics.check_acceleration),
-    ("impacts", jumps.check_impacts),
+    ("impacts", values.check_impacts),
     ("resolution", values.check_resolution),
     ("limits", limits.check_limits),
     ("saturation", limits.check_saturation),
     ("length", excitation.check_length),
     ("motion", excitation.check_motion),
-    ("noise", noise.check_noise),
+    ("noise", kinematics.check_noise),
     ("placement of the tip", placement.check_placement),
     ("dynamics", mechanics.check_dynamics),
     ("contact", contact.check_contacts),
-    ("contact force", force.check_forces),
+    ("contact force", contact.check_forces),
     ("excitation", excitation.check_excitation),
 )
 """Every check in the order in which they run; each sees the log as those before it have corrected it."""

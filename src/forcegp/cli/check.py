@@ -76,7 +76,7 @@ def _print(report: Report) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from forcegp.checks.statistics import describe
+    from forcegp.checks.log import describe
 
     if report.findings:
         table = Table(box=None, pad_edge=False)
