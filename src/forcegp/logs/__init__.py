@@ -2,13 +2,13 @@
 
 from forcegp.logs.importing import Imported, import_log, read_log
 from forcegp.logs.mapping import Mapping, load_mapping, parse_mapping
-from forcegp.logs.report import Finding, Report
+from forcegp.logs.signals import ImportFinding, ImportReport
 
 __all__ = [
-    "Finding",
+    "ImportFinding",
+    "ImportReport",
     "Imported",
     "Mapping",
-    "Report",
     "import_log",
     "load_mapping",
     "parse_mapping",

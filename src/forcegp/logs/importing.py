@@ -12,13 +12,12 @@ import torch
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import DataHeader, Dataset
 from forcegp.errors import DataError
-from forcegp.logs import clock, smoothing, wrench
-from forcegp.logs.contact import Evidence, detect
-from forcegp.logs.defaults import default_mapping
+from forcegp.logs.clock import usual_step
+from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.gather import gather
-from forcegp.logs.mapping import Mapping, load_mapping
-from forcegp.logs.report import Report
-from forcegp.logs.signals import Signals
+from forcegp.logs.mapping import Mapping, default_mapping, load_mapping
+from forcegp.logs.signals import ImportReport, Signals
+from forcegp.logs.smoothing import add_derivatives, even_clock, impact_mask
 from forcegp.resources import announce_memory
 from forcegp.robot import RobotModel
 from forcegp.scene import Scene, load_scene
@@ -38,7 +37,7 @@ class Imported:
     """
 
     data: Dataset
-    report: Report
+    report: ImportReport
     contacts: tuple[Evidence, ...] = ()
 
 
@@ -104,14 +103,14 @@ def import_log(
         known = default_mapping(path, system)
     else:
         known = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
-    report = Report(str(path))
+    report = ImportReport(str(path))
     report.did(f"read {Path(path).name} by mapping {Path(known.source).name}")
     try:
         signals = gather(path, known, robot.joint_names, report, progress)
         announce_memory(_bytes(signals), f"importing {len(signals):,} rows")
-        smoothing.even_clock(signals, known.sections.time.period, report)
+        even_clock(signals, known.sections.time.period, report)
         found = _contacts(signals, system, known, report)
-        std = smoothing.complete(signals, known.sections.derivatives, report)
+        std = add_derivatives(signals, known.sections.derivatives, report)
         data = _dataset(signals, std, known, system, report)
     except DataError as error:
         raise error if str(path) in error.message else DataError.at(str(path), error) from None
@@ -132,14 +131,14 @@ def _bytes(signals: Signals) -> int:
 
 
 def _contacts(
-    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: Report
+    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
 ) -> list[Evidence]:
     """Find the state of each contact; λ needs accelerations, which are first computed across the switches."""
     if not any(section.source == "multiplier" for section in mapping.sections.contact.values()):
         return detect(signals, system, mapping, report)
     copies = {name: value.copy() for name, value in signals.vectors.items()}
     trial = replace(signals, vectors=copies, contact={}, row=np.arange(len(signals)))
-    smoothing.complete(trial, mapping.sections.derivatives, Report(report.source))
+    add_derivatives(trial, mapping.sections.derivatives, ImportReport(report.source))
     kept = np.zeros(len(signals), dtype=bool)
     kept[trial.row] = True
     signals.keep(kept)
@@ -150,20 +149,24 @@ def _contacts(
 
 
 def _dataset(
-    signals: Signals, std: np.ndarray | None, mapping: Mapping, system: ConstrainedSystem, report: Report
+    signals: Signals,
+    std: np.ndarray | None,
+    mapping: Mapping,
+    system: ConstrainedSystem,
+    report: ImportReport,
 ) -> Dataset:
     """The data set of finished signals."""
     robot = system.robot
     settings = mapping.sections.derivatives
-    dt = clock.usual_step(signals.t)
+    dt = usual_step(signals.t)
     margin = settings.impact_margin if settings.impact_margin is not None else 0.5 * settings.window * dt
     extras = {} if std is None else {"qdd_std": _tensor(std)}
-    masks = smoothing.impact_mask(signals, margin)
+    masks = impact_mask(signals, margin)
     contact = {name: torch.from_numpy(value) for name, value in signals.contact.items()}
     impact = {name: torch.from_numpy(value.astype(np.float64)) for name, value in masks.items()}
     contact_extras = {"impact": impact} if impact else {}
     if "wrench" in signals.vectors and contact:
-        sensed = wrench.per_contact(signals, system, mapping)
+        sensed = per_contact(signals, system, mapping)
         contact_extras |= {
             name: {key: _tensor(value) for key, value in group.items()} for name, group in sensed.items()
         }

@@ -1,4 +1,4 @@
-"""Joint states and wrenches of ROS messages as columns, whichever bag they come from.
+"""ROS 1 and ROS 2 bags and MCAP files: joint states and wrenches as columns, without a ROS installation.
 
 Columns of a joint state: `position.<joint>`, `velocity.<joint>`, `effort.<joint>`. Of a wrench:
 `force.x` to `torque.z`. Of both: `header`, the stamp that the driver gave [s], and `receive`, the time of
@@ -9,16 +9,17 @@ The layouts are those of the ROS distributions; definitions that a bag carries a
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import bounds
-from forcegp.logs.table import Column, LogTable, Stream, Wanted
+from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, check_count, foreign
 from forcegp.optional import optional_module
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -81,7 +82,7 @@ class Collector:
         Raises:
             DataError: it is too large, or its arrays do not fit its joint names.
         """
-        bounds.check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
+        check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
         names, values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
         # One stream for a set of joints, in the order of its first message, whatever the order of the others.
@@ -95,8 +96,8 @@ class Collector:
         self._stamps.setdefault(key, []).append((stamp.sec * 10**9 + stamp.nanosec, receive_ns))
         self._numbers += len(values)
         self._messages += 1
-        bounds.check_count(self.source, "numbers", self._numbers, limits.LOG_VALUES)
-        bounds.check_count(self.source, "streams", len(self._rows), limits.LOG_STREAMS)
+        check_count(self.source, "numbers", self._numbers, limits.LOG_VALUES)
+        check_count(self.source, "streams", len(self._rows), limits.LOG_STREAMS)
 
     @property
     def rows(self) -> int:
@@ -188,3 +189,109 @@ def _reordered(values: list[float], names: tuple[str, ...], order: tuple[str, ..
 def _wrench(message: Any) -> tuple[tuple[str, ...], list[float]]:
     force, torque = message.wrench.force, message.wrench.torque
     return (), [force.x, force.y, force.z, torque.x, torque.y, torque.z]
+
+
+def read_rosbag1(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of a bag.
+
+    Raises:
+        DataError: the bag is damaged or too large, or has no message of these types.
+        MissingDependencyError: `rosbags` is not installed.
+    """
+    package = optional_module("rosbags.rosbag1", "Reading ROS 1 bags", "import")
+    return read_bag(path, package.Reader, "rosbag1", wanted, rows, progress)
+
+
+def read_bag(
+    path: Path,
+    open_bag: Callable[[Path], Any],
+    format_: str,
+    wanted: Wanted,
+    rows: int | None,
+    progress: Progress | None,
+) -> LogTable:
+    """Read what a reader of the package `rosbags`, made by `open_bag`, finds in a bag."""
+    encoding = "ros1" if format_ == "rosbag1" else "cdr"
+    collector = Collector(str(path))
+    with foreign(str(path), "a bag"), open_bag(path) as bag:
+        check_count(str(path), "topics", len(bag.connections), limits.LOG_STREAMS)
+        check_count(str(path), "messages", bag.message_count, limits.LOG_MESSAGES)
+        topics = {c.topic: c.msgtype for c in bag.connections}
+        used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
+        decoders = {c.msgtype: decoder(canonical(c.msgtype), encoding) for c in used}
+        total = sum(c.msgcount for c in used)
+        for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else []):
+            kind = canonical(connection.msgtype)
+            collector.add(connection.topic, kind, stamp, raw, decoders[connection.msgtype])
+            if progress is not None and done % 1024 == 0:
+                progress(done, total)
+            if rows is not None and collector.rows >= rows:
+                break
+        return collector.table(format_, topics, wanted)
+
+
+def read_rosbag2(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of a bag.
+
+    Raises:
+        DataError: the bag is damaged, compressed or too large, or has no message of these types.
+        MissingDependencyError: `rosbags` is not installed.
+    """
+    package = optional_module("rosbags.rosbag2", "Reading ROS 2 bags", "import")
+    if path.is_dir():
+        _check_metadata(path)
+    elif path.suffix != ".db3":
+        raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
+    return read_bag(path, package.Reader, "rosbag2", wanted, rows, progress)
+
+
+def _check_metadata(path: Path) -> None:
+    """Refuse a bag whose unpacked size nobody knows."""
+    file = path / "metadata.yaml"
+    check_count(str(file), "bytes", file.stat().st_size, 8 << 20)
+    text = file.read_text(encoding="utf-8", errors="replace")
+    found = re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE)
+    if found:
+        raise DataError(
+            f"{path}: the bag is compressed by {found[1].lower()}",
+            expected="a bag without compression, or MCAP with compressed chunks",
+            hint="unpack it with `ros2 bag convert`",
+        )
+
+
+RECORD_BYTES = 256 << 20
+"""Largest record, packed, that is loaded."""
+
+
+def read_mcap(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of an MCAP file, also of one that was cut off and has no index.
+
+    Raises:
+        DataError: the file is damaged or too large, or has no message of these types.
+        MissingDependencyError: `mcap` or `rosbags` is not installed.
+    """
+    package = optional_module("mcap.reader", "Reading MCAP files", "import")
+    collector = Collector(str(path))
+    decoders: dict[int, Decode | None] = {}
+    topics: dict[str, str] = {}
+    with foreign(str(path), "MCAP"), path.open("rb") as file:
+        reader = package.SeekingReader(file, record_size_limit=RECORD_BYTES)
+        summary = reader.get_summary()
+        statistics = summary.statistics if summary is not None else None
+        total = statistics.message_count if statistics is not None else 0
+        check_count(str(path), "messages", total, limits.LOG_MESSAGES)
+        for schema, channel, message in reader.iter_messages():
+            if channel.id not in decoders:
+                kind = canonical(schema.name) if schema is not None else ""
+                topics[channel.topic] = kind or channel.message_encoding
+                check_count(str(path), "topics", len(decoders), limits.LOG_STREAMS)
+                known = kind in KINDS and channel.message_encoding in ("cdr", "ros1")
+                decoders[channel.id] = decoder(kind, channel.message_encoding) if known else None
+            decode = decoders[channel.id]
+            if decode is not None:
+                collector.add(channel.topic, topics[channel.topic], message.log_time, message.data, decode)
+                if progress is not None and collector.rows % 1024 == 0:
+                    progress(collector.rows, max(total, collector.rows))
+                if rows is not None and collector.rows >= rows:
+                    break
+        return collector.table("mcap", topics, wanted)
