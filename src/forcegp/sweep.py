@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from forcegp.data import split_by_stretches
-from forcegp.data.split import complement
+from forcegp.data.selection import complement
 from forcegp.evaluation import evaluate
 from forcegp.files import atomic_directory, write_json
 from forcegp.models.configured import configured

@@ -36,7 +36,7 @@ def test_a_step_back_within_a_trajectory_is_an_error_with_its_rows() -> None:
     t = np.arange(60) * 0.01
     t[40], t[50:52] = t[38], t[45]
     with pytest.raises(DataError, match=r"goes back in rows 40, 50(?s:.*)0.39 s in row 40(?s:.*)0.38 s"):
-        split_trajectories(signals(t))
+        split(signals(t))
 
 
 def test_gaps_begin_a_trajectory() -> None:
@@ -46,7 +46,7 @@ def test_gaps_begin_a_trajectory() -> None:
     s = signals(t)
     assert split(s).findings[0].rows == ((40, 40),) and s.segment.max() == 1
     s = signals(t)
-    split_trajectories(s, gap=0.02)
+    split(s, gap=0.02)
     assert s.segment.max() == 2
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 import forcegp
-from forcegp.data.header import DataHeader
+from forcegp.data.fields import DataHeader
 from forcegp.forces.observations import Observation
 from forcegp.paper.separation import judge, separate, unfitted
 from random_data import NOISE_STD, random_data, table_system

@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.checks.finding import Finding
+from forcegp.data.checks import check_joints
 from forcegp.data.columns import parse
-from forcegp.data.compatible import check_joints
 from forcegp.data.dataset import Dataset
 from forcegp.data.derivative import SavitzkyGolay, differentiate
-from forcegp.data.fields import JOINT_VECTORS
-from forcegp.data.header import DataHeader
+from forcegp.data.fields import JOINT_VECTORS, DataHeader
 from forcegp.data.table import read_table
 from forcegp.errors import DataError
 from forcegp.robot.model import RobotModel

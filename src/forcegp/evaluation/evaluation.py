@@ -11,12 +11,27 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError
-from forcegp.evaluation.baselines import FEWEST, as_torque, baselines
-from forcegp.evaluation.multiplier import MultiplierScore, multiplier_scores, sensed_scores
-from forcegp.evaluation.predicted import CHUNK_STATES, Predicted, Progress, predict_all
-from forcegp.evaluation.scores import Errors, JointErrors, moving_joints
-from forcegp.evaluation.uncertainty import Uncertainty, nlpd
-from forcegp.evaluation.verdict import PredictorScores, Verdict, sentence, verdicts
+from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines
+from forcegp.evaluation.predicted import (
+    CHUNK_STATES,
+    MultiplierScore,
+    Predicted,
+    Progress,
+    multiplier_scores,
+    predict_all,
+    sensed_scores,
+)
+from forcegp.evaluation.scores import (
+    Errors,
+    JointErrors,
+    PredictorScores,
+    Uncertainty,
+    Verdict,
+    moving_joints,
+    nlpd,
+    sentence,
+    verdicts,
+)
 from forcegp.models.base import Predictor
 
 
@@ -217,7 +232,7 @@ def _trivial(
     parts = [(train, data)] if train is not None else [(data[half:], data[:half]), (data[:half], data[half:])]
     found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
     for known, new in parts:
-        if len(known) < FEWEST:
+        if len(known) < FEWEST_TRAINING:
             return {}
         for baseline in baselines(system, known):
             error = baseline.predict(new) - new.qdd

@@ -18,7 +18,7 @@ from typing import Literal
 from pydantic import Field
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.data.compatible import lock_hint
+from forcegp.data.checks import lock_hint
 from forcegp.errors import MappingError
 from forcegp.logs import units
 from forcegp.logs.readers import read

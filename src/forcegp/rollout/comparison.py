@@ -1,8 +1,12 @@
-"""Comparison of predicted and logged trajectories: tip error over time, drift, coverage of the bands."""
+"""Comparison of predicted and logged trajectories: tip error over time, drift, coverage of the bands.
+
+Split-conformal widening is the factor by which bands must grow to cover as much as they claim.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,11 +17,39 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
-from forcegp.rollout.conformal import widening
 from forcegp.rollout.forward import RolloutOptions, rollout_model
 from forcegp.rollout.integrate import Progress
 from forcegp.rollout.law import ForwardModel
 from forcegp.rollout.trajectory import Bands, Rollout
+
+
+def widening(values: Tensor, band: Bands, level: float) -> float:
+    """Factor on the half-widths of bands so that they cover a share `level` of values like these.
+
+    The ⌈(n + 1) level⌉-th smallest of the n ratios |value − median| / (half-width on that side). Bands of
+    exchangeable values, widened by it (`Bands.widened`), have that coverage, however wrong the model is.
+
+    Args:
+        values: observed values, any shape, NaN where there is none.
+        band: the band of each value.
+        level: wanted coverage, between 0 and 1.
+
+    Returns:
+        The factor; infinite where too few samples are left for a band.
+
+    Source: Lei, G'Sell, Rinaldo, Tibshirani, Wasserman, *Distribution-free predictive inference for
+    regression* (JASA 113, 2018), section 2.2.
+
+    Example:
+        >>> bands = Bands(torch.tensor([-1.0]), torch.tensor([1.0]), torch.tensor([0.0]))
+        >>> widening(torch.tensor([0.5, -3.0, 2.0]), bands, 0.5)
+        2.0
+    """
+    apart = values - band.median
+    half = torch.where(apart < 0.0, band.median - band.lower, band.upper - band.median)
+    ratio = (apart.abs() / half).nan_to_num(torch.inf).flatten().sort().values
+    return float(ratio[min(math.ceil((len(ratio) + 1) * level), len(ratio)) - 1])
+
 
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Times at which tip errors are reported [s]."""

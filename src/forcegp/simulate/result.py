@@ -14,9 +14,9 @@ from forcegp.control.plan import Plan
 from forcegp.control.task_space import tool_motion
 from forcegp.control.trajectory import Reference
 from forcegp.data.dataset import Dataset
-from forcegp.data.header import DataHeader
-from forcegp.simulate.check import acceleration_mismatch
+from forcegp.data.fields import DataHeader
 from forcegp.simulate.config import SimulationConfig
+from forcegp.simulate.engine import acceleration_mismatch
 
 
 @dataclass(frozen=True)
