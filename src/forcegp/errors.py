@@ -71,6 +71,12 @@ def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[
     return get_close_matches(text, list(compared), n=1, cutoff=cutoff)
 
 
+def did_you_mean(name: object, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
+    """A hint that names the valid name nearest to a misspelt one, if there is one."""
+    near = near_names(name, valid, cutoff)
+    return f"did you mean {near[0]!r}?" if near else None
+
+
 class RobotFileError(ForceGPError, ValueError):
     """A robot file that cannot be read, or that describes no valid robot."""
 
@@ -92,11 +98,10 @@ class UnknownNameError(ForceGPError, LookupError):
 
     def __init__(self, kind: str, name: object, valid: Iterable[str]) -> None:
         names = list(valid)
-        near = near_names(name, names)
         super().__init__(
             f"unknown {kind} {_shortened(repr(name), NAME_COMPARED)}",
             expected="one of " + _listed(names) if names else "none are defined",
-            hint=f"did you mean {near[0]!r}?" if near else None,
+            hint=did_you_mean(name, names),
         )
 
 

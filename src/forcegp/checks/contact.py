@@ -13,7 +13,7 @@ import torch
 from forcegp import kinematics
 from forcegp.checks.finding import Finding, Intervals
 from forcegp.checks.fit import CHUNK, blocks_of, residual, tensors
-from forcegp.checks.log import Array, Log, Outcome, describe, intervals
+from forcegp.checks.log import Array, Log, Outcome, describe, evenly, intervals
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.robust import robust_std
 
@@ -259,7 +259,7 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
         if isinstance(contact, SurfaceContact) and contact.name in log.contact:
             path = tip_path(system, contact, log)
             rows = np.flatnonzero(log.contact[contact.name] & log.usable)
-            rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(FORCE_ROWS, len(rows))).astype(np.int64))]
+            rows = evenly(rows, FORCE_ROWS)
             if len(rows) >= LEAST_ROWS:
                 found += _directions(contact, path, log)
                 force = _force(replace(system, contacts=[contact]), log, rows, path)

@@ -57,7 +57,7 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     """Joints that do not move, or hardly ever change direction."""
     still, found = still_joints(log), []
     if still.any():
-        joints = tuple(log.joint_names[j] for j in np.flatnonzero(still))
+        joints = log.named(still)
         verb, whose = ("moves", "its") if len(joints) == 1 else ("move", "their")
         unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
         least = f"{', '.join(joints)} {verb} by less than {STILL} {unit}"
@@ -74,7 +74,7 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
             turns[j] += int((np.diff(direction) != 0).sum())
     few = (turns < REVERSALS) & ~still
     if few.any():
-        joints = tuple(log.joint_names[j] for j in np.flatnonzero(few))
+        joints = log.named(few)
         why = "friction looks like an offset"
         verb = "changes" if len(joints) == 1 else "change"
         text = f"{', '.join(joints)} {verb} direction fewer than {REVERSALS} times: {why}"

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import Fit, Problem, cross_validate, gain_of, pooled_gain_of, score_of
+from forcegp.checks.fit import TorqueFit, TorqueProblem, cross_validate, gain_of, pooled_gain_of, score_of
 from forcegp.checks.hypotheses import (
     LAGS,
     ROBOT,
@@ -75,11 +75,11 @@ class Explanation:
     findings: list[Finding]
     log: Log
     repairs: tuple[Callable[[Log], Log], ...]
-    problem: Problem
+    problem: TorqueProblem
     robot: tuple[str, ...]
     columns: Array
     prior: Array
-    fit: Fit
+    fit: TorqueFit
     rows: np.ndarray
 
 
@@ -131,7 +131,12 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
 
 
 def _refined(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem, found: Hypothesis, theta: Array
+    system: ConstrainedSystem,
+    log: Log,
+    rows: np.ndarray,
+    problem: TorqueProblem,
+    found: Hypothesis,
+    theta: Array,
 ) -> Array:
     """An encoder offset after two more Gauss-Newton steps, as its effect on the torque is not linear."""
     for _ in range(2):
@@ -141,7 +146,9 @@ def _refined(
     return theta
 
 
-def _weighed(problem: Problem, columns: Array | None = None, prior: Array | None = None) -> Problem:
+def _weighed(
+    problem: TorqueProblem, columns: Array | None = None, prior: Array | None = None
+) -> TorqueProblem:
     """The problem with joints weighed by the noise that the present explanation leaves."""
     for _ in range(2):
         error = cross_validate(problem, columns, prior).error
@@ -155,7 +162,7 @@ def _best(
     system: ConstrainedSystem,
     log: Log,
     rows: np.ndarray,
-    problem: Problem,
+    problem: TorqueProblem,
     kept: Array,
     prior: Array,
     taken: set,
@@ -192,14 +199,14 @@ def _best(
     return Choice((chosen, fit), tuple(dict.fromkeys(j for joints in alike for j in joints)), others)
 
 
-def _same(fit: Fit, other: Fit) -> bool:
+def _same(fit: TorqueFit, other: TorqueFit) -> bool:
     """Whether two fits leave the same errors but for rounding: those of an arm and of its mirror image."""
     return bool(np.allclose(fit.error, other.error, rtol=SAME, atol=0.0))
 
 
 def _fits(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: Array
-) -> Iterator[tuple[Hypothesis, Fit]]:
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: TorqueProblem, kept: Array, prior: Array
+) -> Iterator[tuple[Hypothesis, TorqueFit]]:
     # Once the robot is at fault and its parameters are free, they bend to any sign and order.
     for hypothesis in _promising(system, log, rows, problem) if not len(prior) else ():
         changed = with_log(problem, system, hypothesis.change(log), rows)
@@ -221,7 +228,9 @@ def _fits(
         yield from _currents(log, rows, problem, kept, prior)
 
 
-def _currents(log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: Array) -> Iterator[Tried]:
+def _currents(
+    log: Log, rows: np.ndarray, problem: TorqueProblem, kept: Array, prior: Array
+) -> Iterator[Tried]:
     """Gains of all joints that the log determines, tried where most torques are scaled wrongly."""
     fit = _fit(problem, current_hypothesis(log, rows, problem, tuple(range(log.nq))), kept, prior)
     gains = 1.0 + fit.theta[: log.nq]
@@ -232,7 +241,7 @@ def _currents(log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: 
         yield hypothesis, _fit(problem, hypothesis, kept, prior)
 
 
-def _fit(problem: Problem, hypothesis: Hypothesis, kept: Array, prior: Array) -> Fit:
+def _fit(problem: TorqueProblem, hypothesis: Hypothesis, kept: Array, prior: Array) -> TorqueFit:
     """A hypothesis with parameters, beside those that the model holds already."""
     assert hypothesis.columns is not None and hypothesis.prior is not None
     columns = np.concatenate([hypothesis.columns, kept], axis=-1)
@@ -256,7 +265,7 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
 
 
 def _promising(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: TorqueProblem
 ) -> Iterator[Hypothesis]:
     """Hypotheses without parameters that lower the error on a part of the rows."""
     few = rows[::SCREENING]
@@ -266,7 +275,7 @@ def _promising(
             yield hypothesis
 
 
-Tried = tuple[Hypothesis, Fit]
+Tried = tuple[Hypothesis, TorqueFit]
 SMALL_MASS = 1e-6
 """Share of the robot's mass below which a mass is zero."""
 ALONE = 2.0
@@ -293,7 +302,7 @@ TESTS = {
 
 
 def alternatives_of(
-    system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: Fit
+    system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
     """The hypotheses that the held-out blocks cannot distinguish from the chosen one.
 
@@ -316,7 +325,7 @@ def _says_the_same(chosen: Hypothesis, other: Hypothesis) -> bool:
     return other.name == chosen.name and (not other.joints or bool({*other.joints} & {*chosen.joints}))
 
 
-def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: Fit) -> bool:
+def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
     """Whether every link keeps a mass that is positive, or zero in the robot file; the fit does not enforce
     it."""
     if hypothesis.name != "masses":

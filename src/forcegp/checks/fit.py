@@ -98,7 +98,7 @@ FLOOR = 0.03
 
 
 @dataclass(frozen=True)
-class Problem:
+class TorqueProblem:
     """Torques to be explained by known columns and by those of a hypothesis.
 
     Attributes:
@@ -117,7 +117,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Fit:
+class TorqueFit:
     """A hypothesis fitted to a log.
 
     Attributes:
@@ -145,12 +145,12 @@ def blocks_of(n: int) -> Array:
 
 
 def cross_validate(
-    problem: Problem,
+    problem: TorqueProblem,
     columns: Array | None = None,
     prior: Array | None = None,
     gains: tuple[int, ...] = (),
     instruments: Array | None = None,
-) -> Fit:
+) -> TorqueFit:
     """Fit the nuisance and the columns of a hypothesis, and test them on held-out blocks.
 
     Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², with P the projector that takes contact forces out.
@@ -177,11 +177,11 @@ def cross_validate(
     relative = error * problem.scale / size
     score = score_of(relative)
     typical = np.median(relative, axis=0)
-    return Fit(error, theta, (spread / unit)[:p], (whole / unit)[p:], typical, relative, score)
+    return TorqueFit(error, theta, (spread / unit)[:p], (whole / unit)[p:], typical, relative, score)
 
 
 def _equations(
-    problem: Problem, columns: Array | None, prior: Array | None
+    problem: TorqueProblem, columns: Array | None, prior: Array | None
 ) -> tuple[Array, Array, Array, Array]:
     """Columns of size one and right-hand side without contact forces, unit and weight of the columns."""
     extra = columns if columns is not None else np.zeros((*problem.r.shape, 0))
@@ -201,7 +201,7 @@ def _equations(
     return A / unit, y, unit, weight
 
 
-def _with_instruments(A: Array, problem: Problem, instruments: Array) -> Array:
+def _with_instruments(A: Array, problem: TorqueProblem, instruments: Array) -> Array:
     """The columns, the leading ones replaced by their instruments, in the same units."""
     Z = instruments / problem.scale[:, None]
     if problem.J.any():
@@ -211,7 +211,7 @@ def _with_instruments(A: Array, problem: Problem, instruments: Array) -> Array:
     return np.concatenate([Z, A[..., Z.shape[-1] :]], axis=-1)
 
 
-def robust_parameters(problem: Problem, columns: Array, prior: Array) -> Array:
+def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
     """Parameters of the columns and of the nuisance that rows with a large residual hardly move.
 
     Huber's weights, min(1, k/|r|) with k twice the median residual (*Robust Statistics*, 1981, ch. 7).
@@ -244,7 +244,7 @@ def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tupl
     return rest, np.stack(thetas), solve(gram, side, weight)
 
 
-def held_out(problem: Problem, columns: Array, prior: Array) -> Array:
+def held_out(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
     """Held-out residual of each row as a share of the torque `(n, nq)`; it is linear in `problem.r`."""
     A, y, _, weight = _equations(problem, columns, prior)
     return _held_out(A, y, weight)[0] * problem.scale / problem.size

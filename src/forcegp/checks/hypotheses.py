@@ -14,7 +14,14 @@ import torch
 
 from forcegp import dynamics, kinematics
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import Fit, Problem, known_contacts, residual, takes_friction_out, tensors
+from forcegp.checks.fit import (
+    TorqueFit,
+    TorqueProblem,
+    known_contacts,
+    residual,
+    takes_friction_out,
+    tensors,
+)
 from forcegp.checks.log import Array, Log, displacement
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.identification import regressor
@@ -60,12 +67,14 @@ class Hypothesis:
     instruments: Array | None = None
 
 
-def problem_of(system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None) -> Problem:
+def problem_of(
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
+) -> TorqueProblem:
     """The torques of some rows, to be explained by joint friction and an offset per joint."""
     left, nuisance = residual(system, log, rows), friction_columns(system, log, rows)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
-    return Problem(left.r, left.J, nuisance, size, size if scale is None else scale)
+    return TorqueProblem(left.r, left.J, nuisance, size, size if scale is None else scale)
 
 
 def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
@@ -105,7 +114,7 @@ def _sliding_columns(system: ConstrainedSystem, contact: SurfaceContact, log: Lo
     return np.stack([np.einsum("nkj,nk->nj", J, closed * f) for f in (v, v / speed)], axis=-1)
 
 
-def with_log(problem: Problem, system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Problem:
+def with_log(problem: TorqueProblem, system: ConstrainedSystem, log: Log, rows: np.ndarray) -> TorqueProblem:
     """The same problem on a log that a hypothesis has changed."""
     return problem_of(system, log, rows, problem.scale)
 
@@ -179,7 +188,9 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
     return Hypothesis("gains", len(joints), unchanged, columns, np.full(len(joints), 100.0), joints)
 
 
-def current_hypothesis(log: Log, rows: np.ndarray, problem: Problem, joints: tuple[int, ...]) -> Hypothesis:
+def current_hypothesis(
+    log: Log, rows: np.ndarray, problem: TorqueProblem, joints: tuple[int, ...]
+) -> Hypothesis:
     """Gains of joints by instrumental variables; the instrument is the torque that the motion needs.
 
     The logged torque of a light joint is mostly friction that the robot file does not describe. Used as a
@@ -264,7 +275,7 @@ SMALL_GRAVITY = 0.05
 """Share of gravity below which a change of its size is an error of the masses."""
 
 
-def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: Fit) -> bool:
+def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
     """Whether the parameters are what a hypothesis says: a tool has a mass, an offset is not a trifle."""
     if hypothesis.name == "encoder-offset":
         return bool(abs(fit.theta[0]) > max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0]))
@@ -298,7 +309,11 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
 
 
 def finding_of(
-    system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit, alike: tuple[int, ...] = ()
+    system: ConstrainedSystem,
+    log: Log,
+    hypothesis: Hypothesis,
+    fit: TorqueFit,
+    alike: tuple[int, ...] = (),
 ) -> Finding:
     """The finding that a hypothesis stands for; `alike` are the joints of those that explain the same."""
     names = tuple(log.joint_names[j] for j in hypothesis.joints)
@@ -317,7 +332,7 @@ def finding_of(
     return _PARAMETRIC[hypothesis.name](system, log, hypothesis, fit)
 
 
-def _delay(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+def _delay(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
     seconds = abs(hypothesis.shift) * log.dt
     word = "after" if hypothesis.shift > 0 else "before"
     text = (
@@ -328,7 +343,7 @@ def _delay(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit
     )
 
 
-def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
     gains = 1.0 + fit.theta[: len(hypothesis.joints)]
     names = tuple(log.joint_names[j] for j in hypothesis.joints)
     evidence = {f"factor {name}": gain for name, gain in zip(names, gains, strict=True)}
@@ -348,14 +363,14 @@ def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit
     )
 
 
-def _encoder(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+def _encoder(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
     name, offset = log.joint_names[hypothesis.joints[0]], float(fit.theta[0])
     added = displacement(system.robot, hypothesis.joints[0], offset)
     text = f"{name} fits with {added} added to its position, ± {fit.spread[0]:.4f}"
     return Finding("encoder-offset", text, log.all_rows, (name,), evidence={"add_rad": offset})
 
 
-def _gravity(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+def _gravity(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
     assumed = system.robot.gravity.numpy()
     found = assumed + fit.theta[:3]
     given = float(np.linalg.norm(assumed))
@@ -377,14 +392,14 @@ def _turn(assumed: Array, found: Array) -> tuple[float, float]:
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), lengths[1] / max(lengths[0], 1e-12)
 
 
-def _payload(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+def _payload(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
     mass = float(fit.theta[0])
     text = f"the torque fits with {mass:.3g} ± {fit.spread[0]:.2g} kg more on the last link"
     evidence = {"mass_kg": mass, "spread_kg": fit.spread[0]}
     return Finding("payload-missing", text, log.all_rows, (log.joint_names[-1],), evidence=evidence)
 
 
-def _masses(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: Fit) -> Finding:
+def _masses(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
     text = "the torque fits better with other masses and centres of mass than those of the robot file"
     worst = int(np.argmax(np.abs(fit.theta[: 10 * log.nq].reshape(log.nq, 10)[:, 0])))
     evidence = {"largest_mass_change_kg": fit.theta[10 * worst]}

@@ -197,14 +197,14 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
         hit = left & level.right(slope) & (np.abs(level.correlation) >= RELATED)
         if not hit.any():
             continue
-        joints = tuple(log.joint_names[j] for j in np.flatnonzero(hit))
+        joints = log.named(hit)
         evidence = {"slope": float(np.median(level.low[hit]))}
         what = {-1.0: "runs against", 1.0 / DEGREE: "is 1/57 of", DEGREE: "is 57 times"}[slope]
         text = f"qd of {', '.join(joints)} {what} the rate of change of q"
         found.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
         factor[hit], left = slope, left & ~hit
     if left.any():
-        joints = tuple(log.joint_names[j] for j in np.flatnonzero(left))
+        joints = log.named(left)
         j = int(np.flatnonzero(left)[0])
         text = (
             f"qd of {', '.join(joints)} is not the rate of change of q: slope {level.low[j]:.3g}, "
@@ -301,7 +301,7 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))
     if not wrong.any():
         return [], log
-    joints = tuple(log.joint_names[j] for j in np.flatnonzero(wrong))
+    joints = log.named(wrong)
     j = int(np.flatnonzero(wrong)[0])
     text = (
         f"qdd of {', '.join(joints)} is not the rate of change of qd: slope {level.low[j]:.3g}, "
@@ -359,7 +359,7 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
         filtered &= top < stated / NOISE_FACTOR
         weight = "warning"
     if filtered.mean() > 0.5 and not log.header.filtered:
-        joints = tuple(log.joint_names[j] for j in np.flatnonzero(filtered))
+        joints = log.named(filtered)
         text = (
             f"the acceleration is filtered: at the highest frequencies it holds "
             f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them, "
@@ -376,7 +376,7 @@ def _stated(log: Log, found: Array, stated: float, evidence: dict[str, float]) -
     result = []
     for kind, wrong in kinds.items():
         if wrong.any():
-            joints = tuple(log.joint_names[j] for j in np.flatnonzero(wrong))
+            joints = log.named(wrong)
             worst = found[wrong].max() if kind == "noise-understated" else found[wrong].min()
             place = f"{worst:.3g} rad/s² at {', '.join(joints)}"
             text = f"the noise of qdd is {place}, and the header states {stated:.3g}"

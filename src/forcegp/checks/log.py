@@ -50,6 +50,11 @@ def intervals(mask: NDArray[np.bool_], join: int = 0) -> tuple[tuple[int, int], 
     return tuple(joined)
 
 
+def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Up to `most` of some rows, evenly spread."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]
+
+
 def any_row(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """`(n,)` bool, rows of `(n, d)` in which any column is true."""
     return np.asarray(mask.any(axis=1))
@@ -157,6 +162,10 @@ class Log:
         """The whole log as one interval."""
         return ((0, len(self)),)
 
+    def named(self, joints: NDArray[np.bool_]) -> tuple[str, ...]:
+        """Names of the joints that a mask picks."""
+        return tuple(self.joint_names[j] for j in np.flatnonzero(joints))
+
     def replace(self, **fields: Any) -> Log:
         """The log with some fields changed."""
         return dataclasses.replace(self, **fields)
@@ -207,7 +216,7 @@ class Log:
         inner = [np.arange(s.start + margin, s.stop - margin) for s in self.stretches]
         index = np.concatenate([np.empty(0, np.int64), *inner])
         index = index if self.header.ordered else np.flatnonzero(self.usable)
-        return index[np.unique(np.linspace(0, len(index) - 1, min(most, len(index))).astype(np.int64))]
+        return evenly(index, most)
 
 
 Outcome = tuple[list[Finding], Log]

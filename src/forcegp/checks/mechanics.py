@@ -87,7 +87,7 @@ def _without_torque(log: Log) -> list[Finding]:
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
     if not still.any():
         return []
-    joints = tuple(log.joint_names[j] for j in np.flatnonzero(still))
+    joints = log.named(still)
     word = "zero" if zero[still].all() else "constant"
     # One passive joint is a design; an arm without any torque is a missing column.
     weight = "error" if still.all() else "warning"

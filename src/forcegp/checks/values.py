@@ -373,7 +373,7 @@ def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
     if not jumps.any():
         return [], log
     rows = intervals(any_row(jumps))
-    joints = tuple(log.joint_names[j] for j in np.flatnonzero(jumps.any(axis=0)))
+    joints = log.named(jumps.any(axis=0))
     text = f"the position of {', '.join(joints)} jumps at {describe(rows)}"
     segment = log.segment + np.cumsum(any_row(jumps))
     return [Finding("position-jump", text, rows, joints)], log.replace(segment=segment)
@@ -387,7 +387,7 @@ def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
     if not jumps.any():
         return [], log
     rows = intervals(any_row(jumps))
-    joints = tuple(log.joint_names[j] for j in np.flatnonzero(jumps.any(axis=0)))
+    joints = log.named(jumps.any(axis=0))
     text = f"the velocity jumps, as at an impact, at {describe(rows)}"
     around = any_row(jumps)
     around[:-1] |= around[1:]

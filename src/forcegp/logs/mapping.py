@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -19,7 +18,7 @@ from pydantic import Field
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.checks import lock_hint
-from forcegp.errors import MappingError
+from forcegp.errors import MappingError, did_you_mean
 from forcegp.logs import units
 from forcegp.logs.readers import read
 from forcegp.logs.table import LogTable
@@ -199,13 +198,11 @@ class Mapping:
     def _check_joints(self, key: Key, named: Iterable[str], joints: Sequence[str]) -> None:
         for joint in named:
             if joint not in joints:
-                near = get_close_matches(joint, joints, n=1)
-                hint = f"did you mean {near[0]!r}?" if near else None
                 raise self.error(
                     (*key, joint),
                     f"{joint!r} is not a joint of the robot",
                     expected=", ".join(joints),
-                    hint=hint,
+                    hint=did_you_mean(joint, joints),
                 )
 
 
@@ -224,11 +221,10 @@ def load_mapping(source: str | Path) -> Mapping:
     bundled = str(source) in BUNDLED
     path = Path(str(files("forcegp.logs") / "bundled" / f"{source}.toml")) if bundled else Path(source)
     if not path.is_file():
-        near = get_close_matches(str(source), BUNDLED, n=1)
         raise MappingError(
             f"{path}: no such mapping",
             expected=f"a TOML file, or one of {', '.join(BUNDLED)}",
-            hint=f"did you mean {near[0]!r}?" if near else "write one with --guess",
+            hint=did_you_mean(source, BUNDLED) or "write one with --guess",
         )
     return parse_mapping(path.read_bytes(), str(path))
 

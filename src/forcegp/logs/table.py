@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
-from forcegp.errors import DataError, ForceGPError
+from forcegp.errors import DataError, ForceGPError, did_you_mean
 from forcegp.resources import announce_memory
 
 COPIES = 2
@@ -165,12 +164,11 @@ class Growing:
 
 def missing(source: str, kind: str, name: str, known: list[str]) -> DataError:
     """The error for a stream or column that a log does not hold."""
-    near = get_close_matches(name, known, n=1, cutoff=0.5)
     shown = ", ".join(repr(k) for k in known[:16]) + (f", … ({len(known)})" if len(known) > 16 else "")
     return DataError(
         f"{source}: the log has no {kind} {name!r}",
         expected=f"one of {shown}" if known else "a log with columns of numbers",
-        hint=f"did you mean {near[0]!r}?" if near else None,
+        hint=did_you_mean(name, known, 0.5),
     )
 
 

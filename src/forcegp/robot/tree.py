@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from typing import Literal
 
 import numpy as np
 import scipy
 
-from forcegp.errors import InertiaError, RobotFileError, UnknownNameError, UnsupportedRobotError
+from forcegp.errors import InertiaError, RobotFileError, UnknownNameError, UnsupportedRobotError, did_you_mean
 
 JointKind = Literal["revolute", "prismatic", "fixed"]
 
@@ -257,11 +256,10 @@ def _check_names(tree: Tree) -> None:
     for joint in tree.joints:
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
-                near = get_close_matches(link, links, n=1)
                 raise RobotFileError(
                     f"{tree.label}: joint {joint.name!r} has an unknown {role} link {link!r}",
                     expected="one of " + _shown([link.name for link in tree.links]),
-                    hint=f"did you mean {near[0]!r}?" if near else None,
+                    hint=did_you_mean(link, links),
                 )
     for name, count in Counter(joint.child for joint in tree.joints).items():
         if count > 1:

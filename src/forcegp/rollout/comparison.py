@@ -17,7 +17,7 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
-from forcegp.rollout.forward import RolloutOptions, rollout_model
+from forcegp.rollout.forward import RolloutOptions, rollout_model, share_of
 from forcegp.rollout.integrate import Progress
 from forcegp.rollout.law import ForwardModel
 from forcegp.rollout.trajectory import Bands, Rollout
@@ -203,7 +203,7 @@ def compare(
             drawn,
             active=data.active(system.contact_names)[first],
             options=options,
-            progress=_part(progress, i, len(models)),
+            progress=share_of(progress, i, len(models)),
         )
     return _beside(system, data, rows, dt, predicted)
 
@@ -252,9 +252,3 @@ def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
     if not isinstance(starts, int):
         return starts
     return fits[torch.linspace(0, len(fits) - 1, count).round().long()]
-
-
-def _part(progress: Progress | None, part: int, parts: int) -> Progress | None:
-    if progress is None:
-        return None
-    return lambda done, total: progress(part * total + done, parts * total)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.constraints.unilateral import impact_velocity, pulling, reached, rows_of
 from forcegp.errors import ModelError
-from forcegp.rollout.law import Evaluation, ForwardModel, Problem, State, Step
+from forcegp.rollout.law import ForwardModel, Instant, RolloutProblem, State, Step
 
 MAX_EVENTS = 8
 """Events within one step; a contact that bounces to rest within a step has infinitely many."""
@@ -40,7 +40,7 @@ class ContactEvent(NamedTuple):
     closed: bool
 
 
-def _signal(problem: Problem, state: State, now: Evaluation) -> tuple[Tensor, Tensor]:
+def _signal(problem: RolloutProblem, state: State, now: Instant) -> tuple[Tensor, Tensor]:
     """`(n, n_contacts)`: what crosses zero at the next event, and whether it has."""
     system, active = problem.system, state.active
     crossed = pulling(system, active, now.multiplier) | reached(system, active, now.c, now.cd)
@@ -49,7 +49,7 @@ def _signal(problem: Problem, state: State, now: Evaluation) -> tuple[Tensor, Te
     return signal[:, first.to(signal.device)], crossed
 
 
-def switch(problem: Problem, state: State, crossed: Tensor) -> State:
+def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
     """Open and close the contacts that crossed `(n, n_contacts)`, with the impacts of those that close."""
     active = state.active ^ crossed
     landing = (crossed & active).any(-1)
@@ -60,7 +60,7 @@ def switch(problem: Problem, state: State, crossed: Tensor) -> State:
     return State(state.t, state.q, qd, active)
 
 
-def settle(problem: Problem, state: State, end: Tensor) -> tuple[State, Evaluation, list[ContactEvent]]:
+def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, Instant, list[ContactEvent]]:
     """The state at the start of a step, after contacts that pull have opened and those reached have closed.
 
     The torque may jump there, and λ with it.
@@ -78,7 +78,7 @@ def settle(problem: Problem, state: State, end: Tensor) -> tuple[State, Evaluati
 
 
 def advance(
-    problem: Problem, step: Step, state: State, first: Evaluation, h: Tensor
+    problem: RolloutProblem, step: Step, state: State, first: Instant, h: Tensor
 ) -> tuple[State, list[ContactEvent]]:
     """One step of the batch, stopping each trajectory at its events on the way.
 
@@ -111,10 +111,10 @@ def advance(
 
 @torch.no_grad()
 def _locate(
-    problem: Problem,
+    problem: RolloutProblem,
     step: Step,
     state: State,
-    first: Evaluation,
+    first: Instant,
     h: Tensor,
     signal: Tensor,
     crossed: Tensor,
@@ -146,7 +146,7 @@ def _locate(
     return fraction
 
 
-def _listed(problem: Problem, state: State, crossed: Tensor) -> list[ContactEvent]:
+def _listed(problem: RolloutProblem, state: State, crossed: Tensor) -> list[ContactEvent]:
     names = problem.system.contact_names
     return [
         ContactEvent(float(state.t[row, 0]), row, names[k], bool(state.active[row, k]))

@@ -22,7 +22,7 @@ from forcegp.constraints.gauss import Equations
 from forcegp.constraints.system import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError, NumericalError
 from forcegp.rollout.events import ContactEvent, advance, settle
-from forcegp.rollout.law import Evaluation, Problem, State, Step
+from forcegp.rollout.law import Instant, RolloutProblem, State, Step
 from forcegp.rollout.trajectory import Divergence, Rollout
 from forcegp.types import ActiveContacts, JointVector
 
@@ -88,13 +88,13 @@ ABSOLUTE_TOLERANCE = 1e-11
 """Error of an adaptive step in position [rad] and velocity [rad/s]: well below any model's own error."""
 
 
-def semi_implicit_euler(problem: Problem, state: State, first: Evaluation, h: Tensor) -> State:
+def semi_implicit_euler(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
     """q̇⁺ = q̇ + h q̈, q⁺ = q + h q̇⁺, the step of the simulators; of first order."""
     qd = state.qd + h * first.qdd
     return State(state.t + h, state.q + h * qd, qd, state.active)
 
 
-def runge_kutta_4(problem: Problem, state: State, first: Evaluation, h: Tensor) -> State:
+def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
     """The classical Runge-Kutta method, of fourth order."""
     t, q, qd, active = state
     end, half = t + h, 0.5 * h
@@ -116,7 +116,7 @@ def adaptive(method: str) -> Step:
     steps differ, as after an event, are solved together.
     """
 
-    def step(problem: Problem, state: State, first: Evaluation, h: Tensor) -> State:
+    def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
         _refuse_gradients(first, method)
         end, shape = state.t + h, (2, *state.q.shape)
 
@@ -138,7 +138,7 @@ def adaptive(method: str) -> Step:
     return step
 
 
-def _refuse_gradients(first: Evaluation, method: str) -> None:
+def _refuse_gradients(first: Instant, method: str) -> None:
     if first.qdd.requires_grad:
         raise ModelError(
             f"{method} has no gradients",
@@ -161,15 +161,15 @@ class _Record:
     """States at output times, as they are reached."""
 
     states: list[State] = field(default_factory=list)
-    motions: list[Evaluation] = field(default_factory=list)
+    motions: list[Instant] = field(default_factory=list)
     events: list[ContactEvent] = field(default_factory=list)
     diverged: list[Divergence] = field(default_factory=list)
 
-    def write(self, state: State, now: Evaluation, alive: Tensor) -> None:
+    def write(self, state: State, now: Instant, alive: Tensor) -> None:
         """Keep a state; NaN in the rows `(n,)` that were dropped."""
         if not bool(alive.all()):
             rows = alive[:, None]
-            now = Evaluation(*(torch.where(rows, x, torch.nan) for x in now[:-1]))  # pyright: ignore[reportArgumentType]
+            now = Instant(*(torch.where(rows, x, torch.nan) for x in now[:-1]))  # pyright: ignore[reportArgumentType]
             state = state._replace(
                 q=torch.where(rows, state.q, torch.nan), qd=torch.where(rows, state.qd, torch.nan)
             )
@@ -182,7 +182,7 @@ class _Record:
 
 
 def integrate(
-    problem: Problem,
+    problem: RolloutProblem,
     step: Step,
     start: State,
     dt: float,
@@ -238,7 +238,7 @@ def integrate(
 
 
 def _stepped(
-    problem: Problem, step: Step, state: State, now: Evaluation, h: Tensor, record: _Record, alive: Tensor
+    problem: RolloutProblem, step: Step, state: State, now: Instant, h: Tensor, record: _Record, alive: Tensor
 ) -> State:
     """The state one step later, with the contacts that open and close on the way."""
     if not problem.unilateral:
@@ -251,7 +251,7 @@ def _stepped(
 def _stopping(step: Step) -> Step:
     """The method, with joints at rest that dry friction stops within the step, up to its error."""
 
-    def stopped(problem: Problem, state: State, first: Evaluation, h: Tensor) -> State:
+    def stopped(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
         reached = step(problem, state, first, h)
         if first.held is None:
             return reached
@@ -280,7 +280,7 @@ def _give_up(record: _Record, state: State, rows: Tensor, reason: str) -> None:
         record.diverged.append(Divergence(t, row, q, qd, reason))
 
 
-def _result(problem: Problem, record: _Record, dt: float) -> Rollout:
+def _result(problem: RolloutProblem, record: _Record, dt: float) -> Rollout:
     states, motions = record.states, record.motions
     if not motions:
         raise ForceGPError(

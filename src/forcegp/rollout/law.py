@@ -229,7 +229,7 @@ class ForwardModel(Protocol):
         ...
 
 
-class Motion(NamedTuple):
+class LawMotion(NamedTuple):
     """What a law gives at a state.
 
     Attributes:
@@ -247,7 +247,7 @@ class Law(ABC):
     has_multiplier: bool
 
     @abstractmethod
-    def motion(self, system: ConstrainedSystem, at: States) -> Motion:
+    def motion(self, system: ConstrainedSystem, at: States) -> LawMotion:
         """Acceleration and multiplier at states."""
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
@@ -262,8 +262,8 @@ class ForceLaw(Law):
     force: ForceField
     has_multiplier: bool = True
 
-    def motion(self, system: ConstrainedSystem, at: States) -> Motion:
-        return Motion(*at.eom.motion_under(self.force(system, at)))
+    def motion(self, system: ConstrainedSystem, at: States) -> LawMotion:
+        return LawMotion(*at.eom.motion_under(self.force(system, at)))
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
         force = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
@@ -282,9 +282,9 @@ class AccelerationLaw(Law):
     model: ForwardModel
     has_multiplier: bool = False
 
-    def motion(self, system: ConstrainedSystem, at: States) -> Motion:
+    def motion(self, system: ConstrainedSystem, at: States) -> LawMotion:
         qdd = self.model.predict(at.q, at.qd, at.tau, "qdd", active=at.active, covariance=False).mean
-        return Motion(qdd, torch.full_like(at.eom.c, torch.nan))
+        return LawMotion(qdd, torch.full_like(at.eom.c, torch.nan))
 
 
 def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
@@ -330,7 +330,7 @@ class State(NamedTuple):
         return State(*(torch.where(rows[:, None], a, b) for a, b in zip(self, other, strict=True)))
 
 
-class Evaluation(NamedTuple):
+class Instant(NamedTuple):
     """The motion at a state.
 
     Attributes:
@@ -349,7 +349,7 @@ class Evaluation(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Problem:
+class RolloutProblem:
     """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system.
 
     Args:
@@ -371,14 +371,14 @@ class Problem:
         """Dry friction that can hold joints at rest, told apart from other forces; `None` without any."""
         return self.law.dry_friction(self.system) if self.sticking else None
 
-    def evaluate(self, state: State, end: Tensor) -> Evaluation:
+    def evaluate(self, state: State, end: Tensor) -> Instant:
         """The motion at a state, within a step that ends at `end` `(n, 1)`."""
         eom = self.system.equations(state.q, state.qd, state.active)
         tau = self.inputs.torque(state.t, end, Reached(self.system, eom, state.q, state.qd))
         at = States(state.q, state.qd, tau, state.active, eom)
         if self.dry_friction is None:
             qdd, multiplier = self.law.motion(self.system, at)
-            return Evaluation(tau, qdd, multiplier, eom.c, eom.cd)
+            return Instant(tau, qdd, multiplier, eom.c, eom.cd)
         dry = self.dry_friction(at)
         free, h = eom.acceleration(dry.Q_bar), end - state.t
         G = eom.H if dry.response is None else eom.H @ dry.response
@@ -391,8 +391,8 @@ class Problem:
         impressed = force if dry.response is None else (dry.response @ force[..., None])[..., 0]
         qdd, multiplier = eom.motion_under(dry.Q_bar + impressed)
         qdd = torch.where(held, stopping, qdd)  # the same but for rounding
-        return Evaluation(tau, qdd, multiplier, eom.c, eom.cd, held)
+        return Instant(tau, qdd, multiplier, eom.c, eom.cd, held)
 
 
-Step = Callable[[Problem, State, Evaluation, Tensor], State]
+Step = Callable[[RolloutProblem, State, Instant, Tensor], State]
 """Advance a state, whose motion is known, by steps h `(n, 1)` [s]."""

@@ -24,7 +24,7 @@ from forcegp.simulate.config import Sensors, SimulationConfig
 from forcegp.simulate.contact_solver import NO_FORCE, ContactSolverEngine
 from forcegp.simulate.engine import Engine, make_engine
 from forcegp.simulate.mechanics import Mechanics
-from forcegp.simulate.result import Log, SimulationResult, make_result
+from forcegp.simulate.result import RunLog, SimulationResult, make_result
 
 RUNAWAY_SPEED = 50.0
 """A joint faster than this [rad/s] has left any planned motion."""
@@ -73,7 +73,7 @@ def follow_with_solver(
     engine: ContactSolverEngine,
     generator: torch.Generator,
     progress: Progress | None,
-) -> Log:
+) -> RunLog:
     """Step the engine through the plan; the controller sees what the sensors measure.
 
     Args:
@@ -87,7 +87,7 @@ def follow_with_solver(
     Returns:
         The log: true motion and forces, and what was measured where sensors are not perfect.
     """
-    log, mechanics, sensors = Log.empty(config.steps, system), Mechanics(system, plan), config.sensors
+    log, mechanics, sensors = RunLog.empty(config.steps, system), Mechanics(system, plan), config.sensors
     rows, limit, targets = log.arrays(), torque_limit(system, config).numpy(), plan.arrays()
     measured = {"q": torch.zeros_like(log.q), "qd": torch.zeros_like(log.qd)}
     F_I, F_z = (log.q.new_zeros(config.steps, len(system.contacts), 3) for _ in range(2))
@@ -196,9 +196,9 @@ def _follow(
     plan: Plan,
     engine: Engine,
     progress: Progress | None,
-) -> Log:
+) -> RunLog:
     """Step the engine through the plan."""
-    log, mechanics = Log.empty(config.steps, system), Mechanics(system, plan)
+    log, mechanics = RunLog.empty(config.steps, system), Mechanics(system, plan)
     rows, limit, targets = log.arrays(), torque_limit(system, config).numpy(), plan.arrays()
     closed = _closed_at_start(mechanics, plan.start.numpy())
     engine.reset(plan.start, torch.zeros_like(plan.start))
