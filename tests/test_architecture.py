@@ -26,7 +26,6 @@ LAYERS = (
         "resources",
         "robust",
         "batchlast",
-        "optional",
         "native",
         "notebook",
     ),

@@ -17,10 +17,10 @@ import torch
 
 from forcegp.data import split_by_stretches
 from forcegp.data.selection import complement
+from forcegp.errors import optional_module
 from forcegp.evaluation import evaluate
 from forcegp.files import atomic_directory, write_json
 from forcegp.models.configured import configured
-from forcegp.optional import optional_module
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 

@@ -81,7 +81,7 @@ def test_the_multiplier_is_the_force_along_the_normal(
     pressed: tuple[forcegp.ConstrainedSystem, Signals, np.ndarray],
 ) -> None:
     system, signals, closed = pressed
-    estimate = contact.evidence.multiplier(signals, system, system.contacts[0])  # type: ignore[arg-type]
+    estimate = contact.multiplier(signals, system, system.contacts[0])  # type: ignore[arg-type]
     truth = np.where(closed, 20.0 + 5.0 * np.sin(2.0 * signals.t), 0.0)
     # The noise of the torque, 0.05 N m on levers of about half a metre, is below 1 N.
     assert np.abs(estimate - truth).std() < 1.0 and abs((estimate - truth).mean()) < 0.1

@@ -122,7 +122,7 @@ class Comparison:
         return float(inside.to(self.q.dtype).mean())
 
     def inflation(self, model: str, level: float = LEVEL) -> float:
-        """Factor by which bands must grow to cover a share `level` of tip coordinates (`conformal.py`)."""
+        """Factor by which bands must grow to cover a share `level` of tip coordinates (`widening`)."""
         return widening(*self._tip_along(model, level), level)
 
     def _tip_along(self, model: str, level: float) -> tuple[Tensor, Bands]:

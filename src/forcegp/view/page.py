@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from forcegp import kinematics
 from forcegp.constraints import Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.constraints.surface import Surface
+from forcegp.errors import optional_module
 from forcegp.files import write_text
-from forcegp.optional import optional_module
 from forcegp.robot.model import BASE
 from forcegp.view.motion import LOGGED, MEAN, Force, Motion
 from forcegp.view.shapes import Array, Shape, turn_z

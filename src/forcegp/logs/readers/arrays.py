@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
-from forcegp.errors import DataError
+from forcegp.errors import DataError, optional_module
 from forcegp.logs.readers.matlab5 import Variable, variables
 from forcegp.logs.table import (
     LogTable,
@@ -27,7 +27,6 @@ from forcegp.logs.table import (
     check_expansion,
     foreign,
 )
-from forcegp.optional import optional_module
 
 MAX_ARRAYS = 4096
 """Arrays of one archive."""

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 
 from forcegp import limits
-from forcegp.errors import DataError
+from forcegp.errors import DataError, optional_module
 from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, check_count, foreign
-from forcegp.optional import optional_module
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
