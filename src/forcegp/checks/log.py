@@ -162,7 +162,7 @@ class Log:
         """The whole log as one interval."""
         return ((0, len(self)),)
 
-    def named(self, joints: NDArray[np.bool_]) -> tuple[str, ...]:
+    def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
         """Names of the joints that a mask picks."""
         return tuple(self.joint_names[j] for j in np.flatnonzero(joints))
 
