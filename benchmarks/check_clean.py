@@ -35,7 +35,7 @@ class Clean:
     """A log without a fault.
 
     Attributes:
-        group: kind of log in the table of docs/checking.md.
+        group: kind of log in the table of benchmarks/notes/checking.md.
         scene: bundled scene, or bundled robot that moves freely.
         seed: of the motion and the noise.
         settings: of the simulation, over those of the scene.

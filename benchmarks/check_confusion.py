@@ -1,4 +1,4 @@
-"""Planted faults against findings, on simulated and real logs: the confusion table of docs/checking.md.
+"""Planted faults against findings, on simulated and real logs: the table of benchmarks/notes/checking.md.
 
 Run from the repository root: `PYTHONPATH=tests python benchmarks/check_confusion.py --out confusion.json`.
 """
@@ -38,7 +38,7 @@ TRUE = {
     "real iiwa": {"friction-undeclared", "torque-offset", "joint-still", "disturbance"},
     "real pendulum": {"friction-undeclared", "masses-mismatch", "time-gap"},
 }
-"""Findings on logs as published that are right: see docs/checking.md."""
+"""Findings on logs as published that are right: see benchmarks/notes/checking.md."""
 
 
 def free() -> Case:

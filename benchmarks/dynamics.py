@@ -1,6 +1,6 @@
 """Speed of the dynamics beside Pinocchio, MuJoCo, adam-robotics and differentiable-robot-model.
 
-    python benchmarks/dynamics.py --json result.json --docs docs/benchmarks.md
+    python benchmarks/dynamics.py --json result.json --docs benchmarks/notes/speed.md
 
 Times are the best of several repetitions of one batch, float64, all in this process on the same machine.
 """
@@ -238,7 +238,7 @@ def markdown(result: dict) -> str:
         f"KUKA iiwa, 7 joints, float64, {host['cpu']}, {host['threads']} threads"
         + (f", {host['cuda']}" if host["cuda"] else ", no CUDA device")
         + f"; {packages}. Thousands of states a second, best of several runs;",
-        "`python benchmarks/dynamics.py --json FILE --docs docs/benchmarks.md` measures them again.",
+        "`python benchmarks/dynamics.py --json FILE --docs benchmarks/notes/speed.md` measures them again.",
     ]
     for quantity, title in QUANTITIES.items():
         rows = [row for row in result["rows"] if row["quantity"] == quantity]

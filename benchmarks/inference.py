@@ -211,7 +211,7 @@ def markdown(result: dict) -> str:
             "",
             f"Zero-mean S-GP of the KUKA iiwa on the plane, float64, {result['machine']}, "
             f"{result['threads']} threads; `python benchmarks/inference.py --json FILE --docs "
-            "docs/benchmarks.md` measures it again.",
+            "benchmarks/notes/speed.md` measures it again.",
             "",
             f"One likelihood with gradient at N = {one['samples']}: {one['seconds']:.1f} s and "
             f"{one['peak_mib']:.0f} MiB, against {one['dense_seconds']:.1f} s and "

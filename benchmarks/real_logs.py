@@ -1,7 +1,7 @@
 """Real logs: every model on a KUKA iiwa14 and on a double pendulum, beside the robot file and least squares.
 
     python benchmarks/real_logs.py --json result.json                      # a minute or two
-    python benchmarks/real_logs.py --case iiwa14 --docs docs/real_logs.md
+    python benchmarks/real_logs.py --case iiwa14 --docs benchmarks/notes/real_logs.md
     python benchmarks/real_logs.py --logs path/to/real
 
 Errors are counted on samples in motion of recordings that no model was trained on. The error of a predicted

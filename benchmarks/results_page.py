@@ -1,4 +1,4 @@
-"""The page of benchmark results in the docs: one section a script, written between marks."""
+"""Pages of results in benchmarks/notes: one section a script, written between marks."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Speed, memory and drift of rollouts with a structured GP on the paper's task.
 
-    python benchmarks/rollout.py --json result.json --docs docs/benchmarks.md
+    python benchmarks/rollout.py --json result.json --docs benchmarks/notes/speed.md
 
 Ten seconds at 240 Hz from a simulated state: the mean trajectory, and 100 function samples at once, with a
 model that is conditioned on `--points` simulated points; the same over half the time, which shows how memory
@@ -22,11 +22,11 @@ import torch
 from results_page import table, write_section
 from torch import Tensor
 
-from forcegp.constraints.projection import project_state
 from forcegp.control.plan import make_plan
 from forcegp.data import Dataset, select_points
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.rollout import RolloutOptions, TaskSpaceControl
+from forcegp.rollout.integrate import project_state
 from forcegp.scene import load_scene
 from forcegp.simulate import SimulationConfig, SimulationResult, simulate
 
@@ -132,7 +132,7 @@ def docs_section(result: dict) -> str:
     return "\n\n".join(
         [
             "## Rollouts",
-            f"`python benchmarks/rollout.py --docs docs/benchmarks.md` on {result['machine']}, "
+            f"`python benchmarks/rollout.py --docs benchmarks/notes/speed.md` on {result['machine']}, "
             f"{result['threads']} threads; analytical mean, {result['points']} points, 240 Hz.",
             table(list(heads), speed),
             f"Largest constraint error over {result['seconds']:g} s ({DRIFT_POINTS} points, from a state on "

@@ -182,8 +182,9 @@ SECTIONS = {
 def markdown(machine: str, bounds: Sequence[Bound]) -> str:
     """The section of the page of results."""
     text = (
-        "`python benchmarks/sparse.py --docs docs/benchmarks.md` measures it again: one thread, float64, "
-        f"{machine}. Synthetic rows are seven per sample; ten-minute logs are those of the paper's task."
+        "`python benchmarks/sparse.py --docs benchmarks/notes/speed.md` measures it again: one thread, "
+        f"float64, {machine}. "
+        "Synthetic rows are seven per sample; ten-minute logs are those of the paper's task."
     )
     rows = table(["what", "measured", "bound", "unit", "met"], [bound.row() for bound in bounds])
     return f"## Sparse posterior\n\n{text}\n\n{rows}"

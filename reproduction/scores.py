@@ -111,8 +111,8 @@ def _pair(
     found = "about as good as" if close and alike else "worse than" if one >= two else "better than"
     wanted = "about as good as" if close else "worse than"
     beside = "as in the paper" if found == wanted else f"in the paper {wanted} it"
-    one_text, two_text = f"{report.label(a)} ({n} points) {one:.3f}", f"{report.label(b)} ({m} points) {two:.3f}"
-    text = f"{one_text} is {found} {two_text}, {beside}"
+    ours, other = f"{report.label(a)} ({n} points) {one:.3f}", f"{report.label(b)} ({m} points) {two:.3f}"
+    text = f"{ours} is {found} {other}, {beside}"
     return found == wanted, text
 
 

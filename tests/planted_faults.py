@@ -14,8 +14,7 @@ import torch
 import forcegp
 from forcegp import dynamics
 from forcegp.checks import Finding, Log, Report
-from forcegp.checks.log import derive
-from forcegp.checks.statistics import intervals
+from forcegp.checks.log import derive, intervals
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.data import DataHeader
 from forcegp.errors import RobotFileWarning

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 import forcegp
-from forcegp.data.header import DataHeader
+from forcegp.data.fields import DataHeader
 
 FRICTION = 1.0
 """Viscous friction at the contact [N s/m]."""

@@ -6,6 +6,7 @@ import ast
 import importlib
 import inspect
 import re
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -27,7 +28,6 @@ LAYERS = (
         "resources",
         "robust",
         "batchlast",
-        "optional",
         "native",
         "notebook",
     ),
@@ -57,6 +57,7 @@ LAYERS = (
 RANK = {name: rank for rank, row in enumerate(LAYERS) for name in row}
 
 
+@cache
 def modules() -> dict[str, Path]:
     """Every module but the package itself, whose names are loaded when they are first used."""
     found = {}

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.errors import MissingDependencyError
-from forcegp.optional import optional_module
+from forcegp.errors import MissingDependencyError, optional_module
 
 
 def test_an_installed_module_is_returned() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from importlib import import_module
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -71,6 +72,12 @@ def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[
     return get_close_matches(text, list(compared), n=1, cutoff=cutoff)
 
 
+def did_you_mean(name: object, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
+    """A hint that names the valid name nearest to a misspelt one, if there is one."""
+    near = near_names(name, valid, cutoff)
+    return f"did you mean {near[0]!r}?" if near else None
+
+
 class RobotFileError(ForceGPError, ValueError):
     """A robot file that cannot be read, or that describes no valid robot."""
 
@@ -92,11 +99,10 @@ class UnknownNameError(ForceGPError, LookupError):
 
     def __init__(self, kind: str, name: object, valid: Iterable[str]) -> None:
         names = list(valid)
-        near = near_names(name, names)
         super().__init__(
             f"unknown {kind} {_shortened(repr(name), NAME_COMPARED)}",
             expected="one of " + _listed(names) if names else "none are defined",
-            hint=f"did you mean {near[0]!r}?" if near else None,
+            hint=did_you_mean(name, names),
         )
 
 
@@ -147,3 +153,36 @@ class DestinationError(ForceGPError, OSError):
 
 class MemoryLimitError(ForceGPError, RuntimeError):
     """Work that needs more memory than is free, refused before it starts."""
+
+
+def optional_module(name: str, purpose: str, extra: str | None = None) -> Any:
+    """An optional package.
+
+    Args:
+        name: the module to import.
+        purpose: what needs it, the subject of the message, such as `"Reading MJCF files"`.
+        extra: the extra of this library that installs it; default its own name.
+
+    Returns:
+        The module.
+
+    Raises:
+        MissingDependencyError: the package is not installed; the hint is the command that installs it.
+
+    Example:
+        >>> optional_module("math", "Arithmetic").sqrt(4.0)
+        2.0
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        package = name.partition(".")[0]
+        # A package that is installed but lacks something itself is broken, which is another error.
+        if error.name is None or error.name.partition(".")[0] != package:
+            raise
+        raise MissingDependencyError(
+            f"{purpose} needs the package {package!r}",
+            expected=f"{package} to be installed",
+            got=str(error),
+            hint=f'pip install "forcegp[{extra or package}]"',
+        ) from error

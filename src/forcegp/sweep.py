@@ -16,11 +16,11 @@ from typing import Any
 import torch
 
 from forcegp.data import split_by_stretches
-from forcegp.data.split import complement
+from forcegp.data.selection import complement
+from forcegp.errors import optional_module
 from forcegp.evaluation import evaluate
 from forcegp.files import atomic_directory, write_json
 from forcegp.models.configured import configured
-from forcegp.optional import optional_module
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 
@@ -28,7 +28,7 @@ SCORE, MODEL = "score.json", "model"
 
 
 @dataclass(frozen=True)
-class Fit:
+class SweptFit:
     """One fit of a sweep.
 
     Attributes:
@@ -51,17 +51,17 @@ class Fit:
 
 def fits_of(
     scenes: Sequence[str], models: Sequence[str], seeds: Sequence[int], duration: float | None = None
-) -> list[Fit]:
+) -> list[SweptFit]:
     """Every model on every robot with every seed.
 
     Example:
         >>> [fit.name for fit in fits_of(["kuka_plane"], ["sgp-mean", "gp"], [0])]
         ['kuka_plane/sgp-mean/seed-0', 'kuka_plane/gp/seed-0']
     """
-    return [Fit(*chosen, duration) for chosen in product(scenes, models, seeds)]
+    return [SweptFit(*chosen, duration) for chosen in product(scenes, models, seeds)]
 
 
-def run_fit(fit: Fit, out: str) -> dict[str, Any]:
+def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
     """Simulate, fit and score, unless that has been done; runs on a worker, in one thread.
 
     Args:
@@ -100,7 +100,7 @@ def run_fit(fit: Fit, out: str) -> dict[str, Any]:
 
 
 def sweep(
-    fits: Sequence[Fit],
+    fits: Sequence[SweptFit],
     out: str | Path,
     *,
     processes: int = 2,

@@ -9,8 +9,8 @@ import pytest
 
 import forcegp
 from forcegp.checks import KINDS, Finding, Report
-from forcegp.checks.alternatives import TESTS, alternatives_of, with_alternatives
-from forcegp.checks.fit import BLOCKS, Fit
+from forcegp.checks.explain import TESTS, alternatives_of, with_alternatives
+from forcegp.checks.fit import BLOCKS, TorqueFit
 from forcegp.checks.hypotheses import Hypothesis, unchanged
 from forcegp.constraints import ConstrainedSystem
 
@@ -20,9 +20,9 @@ MASSES = Finding("masses-mismatch", "other masses fit", ROWS, ("shoulder",))
 CURRENT = Finding("torque-current", "currents", ROWS, ("shoulder", "elbow"))
 
 
-def fit(score: np.ndarray, theta: np.ndarray | None = None) -> Fit:
+def fit(score: np.ndarray, theta: np.ndarray | None = None) -> TorqueFit:
     none = np.zeros(0)
-    return Fit(none, none if theta is None else theta, none, none, none, none, score)
+    return TorqueFit(none, none if theta is None else theta, none, none, none, none, score)
 
 
 @pytest.fixture
@@ -36,7 +36,9 @@ CHOSEN = Hypothesis("gains", 1, unchanged, joints=(0,)), fit(np.full(BLOCKS, -1.
 OTHER = Hypothesis("gains", 1, unchanged, joints=(1,))
 
 
-def names(system: ConstrainedSystem, *tried: tuple[Hypothesis, Fit]) -> list[tuple[str, tuple[int, ...]]]:
+def names(
+    system: ConstrainedSystem, *tried: tuple[Hypothesis, TorqueFit]
+) -> list[tuple[str, tuple[int, ...]]]:
     return [(h.name, h.joints) for h, _ in alternatives_of(system, CHOSEN, [CHOSEN, *tried], NULL)]
 
 

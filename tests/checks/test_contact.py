@@ -8,7 +8,7 @@ import pytest
 import forcegp
 from forcegp.checks import Log
 from forcegp.checks.contact import Path, _labels
-from forcegp.data.header import DataHeader
+from forcegp.data.fields import DataHeader
 
 DT, SLIDES, LEAVES = 1 / 240, 240, 48
 """Sampling period, rows that slide, and rows after them that take off or go on sliding."""

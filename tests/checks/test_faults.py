@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import forcegp
-from forcegp.checks import Report, check, log_of, visibility
+from forcegp.checks import Report, check, excitation, log_of
 from forcegp.constraints import ConstrainedSystem
 from forcegp.scene import load_scene
 from forcegp.simulate import make_engine, simulate
@@ -174,10 +174,10 @@ def test_a_joint_that_turns_more_than_once_is_not_in_degrees() -> None:
 def test_what_no_fault_can_reach_is_not_given_as_a_size(free: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     """An encoder off by more than half a turn, or a base on its head, is no size to wait for."""
     sizes = {"encoder-offset": 4.0, "base-tilted": 181.0}
-    monkeypatch.setattr(visibility, "visible_size", lambda told, fault: sizes.get(fault.kind, 0.0))
+    monkeypatch.setattr(excitation, "visible_size", lambda told, fault: sizes.get(fault.kind, 0.0))
     (note,) = [finding for finding in check(*free).findings if finding.kind == "faults-hidden"]
     assert "any encoder offset" in note.message and " rad" not in note.message
-    monkeypatch.setattr(visibility, "visible_size", lambda told, fault: 3.0)
+    monkeypatch.setattr(excitation, "visible_size", lambda told, fault: 3.0)
     (note,) = [finding for finding in check(*free).findings if finding.kind == "faults-hidden"]
     assert "under 3 rad" in note.message
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.checks.fit import Problem, cross_validate
+from forcegp.checks.fit import TorqueProblem, cross_validate
 from forcegp.checks.mechanics import ONE_SIGMA, _upper_spread
 from forcegp.robust import robust_std
 
@@ -15,7 +15,7 @@ def test_instruments_give_the_gain_of_a_torque_that_is_mostly_unmodelled() -> No
     needed, friction = random.normal(size=(n, 1)), 2.0 * random.normal(size=(n, 1))
     logged = (needed + friction) / factor
     one = np.ones(1)
-    problem = Problem(needed - logged, np.zeros((n, 0, 1)), np.ones((n, 1, 1)), one, one)
+    problem = TorqueProblem(needed - logged, np.zeros((n, 0, 1)), np.ones((n, 1, 1)), one, one)
     columns, prior = logged[..., None], np.full(1, 100.0)
     least = cross_validate(problem, columns, prior, (0,))
     told = cross_validate(problem, columns, prior, (0,), needed[..., None])
@@ -29,7 +29,7 @@ def test_instruments_that_are_the_columns_are_least_squares() -> None:
     random, n = np.random.default_rng(1), 200
     columns, nuisance = random.normal(size=(n, 2, 2)), random.normal(size=(n, 2, 1))
     size = np.array([1.0, 2.0])
-    problem = Problem(random.normal(size=(n, 2)), random.normal(size=(n, 1, 2)), nuisance, size, size)
+    problem = TorqueProblem(random.normal(size=(n, 2)), random.normal(size=(n, 1, 2)), nuisance, size, size)
     one = cross_validate(problem, columns, np.ones(2))
     other = cross_validate(problem, columns, np.ones(2), instruments=columns)
     np.testing.assert_allclose(one.theta, other.theta, rtol=1e-8)

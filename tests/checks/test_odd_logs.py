@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from forcegp.checks import Log, check, log_of
-from forcegp.checks.alternatives import _possible, with_alternatives
+from forcegp.checks.explain import _possible, with_alternatives
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import Hypothesis, problem_of, unchanged

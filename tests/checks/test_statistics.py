@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from forcegp.checks.statistics import describe, intervals, spikes
+from forcegp.checks.log import describe, intervals, spikes
 from forcegp.robust import robust_std
 
 

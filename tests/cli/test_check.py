@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import forcegp
 from forcegp import checks
 from forcegp.checks import KINDS, Finding, Log, Report
-from forcegp.checks.alternatives import with_alternatives
+from forcegp.checks.explain import with_alternatives
 from forcegp.cli import app
 from planted_faults import free_log
 

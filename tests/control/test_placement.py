@@ -7,7 +7,7 @@ import torch
 
 import forcegp
 from forcegp import kinematics
-from forcegp.control.placement import POSE_TOLERANCE, inverse_kinematics, tool_rotation
+from forcegp.control.plan import POSE_TOLERANCE, inverse_kinematics, tool_rotation
 from forcegp.errors import NumericalError
 
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)

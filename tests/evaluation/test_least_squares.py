@@ -8,8 +8,7 @@ import torch
 
 import forcegp
 from forcegp.evaluation import least_squares
-from forcegp.evaluation.baselines import as_torque, baselines
-from forcegp.evaluation.least_squares import LeastSquares, identify_rigid
+from forcegp.evaluation.least_squares import LeastSquares, as_torque, baselines, identify_rigid
 from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, inertial_parameters
 from random_data import random_data, table_system
 

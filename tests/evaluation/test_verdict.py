@@ -7,8 +7,7 @@ import math
 import pytest
 import torch
 
-from forcegp.evaluation.scores import SLOWEST, JointErrors, moving_joints
-from forcegp.evaluation.verdict import PredictorScores, sentence, verdicts
+from forcegp.evaluation.scores import SLOWEST, JointErrors, PredictorScores, moving_joints, sentence, verdicts
 
 
 def errors(*by_joint: float) -> JointErrors:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 import forcegp
-from forcegp.data.header import DataHeader
+from forcegp.data.fields import DataHeader
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.default import REMAINING

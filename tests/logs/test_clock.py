@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from forcegp.errors import DataError
-from forcegp.logs import clock, resample, smoothing
-from forcegp.logs.report import Report
-from forcegp.logs.signals import Signals
+from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
+from forcegp.logs.mapping import DerivativesSection
+from forcegp.logs.signals import ImportReport, Signals
+from forcegp.logs.smoothing import add_derivatives, even_clock, impact_mask
 
 
 def signals(t: NDArray[np.float64], **vectors: NDArray[np.float64]) -> Signals:
@@ -18,9 +19,9 @@ def signals(t: NDArray[np.float64], **vectors: NDArray[np.float64]) -> Signals:
     return Signals(("a",), t.copy(), np.arange(n), np.zeros(n, np.int64), values)
 
 
-def split(s: Signals, gap: float | None = None) -> Report:
-    report = Report("log")
-    clock.split(s, gap, report)
+def split(s: Signals, gap: float | None = None) -> ImportReport:
+    report = ImportReport("log")
+    split_trajectories(s, gap, report)
     return report
 
 
@@ -53,43 +54,43 @@ def test_gaps_begin_a_trajectory() -> None:
 def test_repeated_rows_are_dropped_and_conflicting_ones_refused() -> None:
     t = np.arange(20) * 0.1
     t = np.sort(np.concatenate([t, t[[5, 9]]]))
-    s, report = signals(t), Report("log")
-    clock.drop_repeated(s, report)
+    s, report = signals(t), ImportReport("log")
+    drop_repeated(s, report)
     assert len(s) == 20 and report.findings[0].rows == ((6, 6), (11, 11))
     wrong = signals(t)
     wrong.vectors["tau"][6] += 1.0
     with pytest.raises(DataError, match="rows 6 have the time stamp"):
-        clock.drop_repeated(wrong, report)
+        drop_repeated(wrong, report)
 
 
 @pytest.mark.parametrize("drop", [False, True])
 def test_held_rows_are_found(drop: bool) -> None:
-    s, report = signals(np.arange(30) * 0.1), Report("log")
+    s, report = signals(np.arange(30) * 0.1), ImportReport("log")
     for values in s.vectors.values():
         values[11:13] = values[10]
     s.vectors["q"][20] = s.vectors["q"][19]  # at rest the torque goes on: not held
-    clock.find_held(s, drop, report)
+    find_held(s, drop, report)
     assert report.findings[0].rows == ((11, 12),) and len(s) == (28 if drop else 30)
 
 
 def test_a_slower_stream_is_interpolated_and_rows_without_it_dropped() -> None:
-    s, report = signals(np.arange(0.0, 10.0, 0.01)), Report("log")
+    s, report = signals(np.arange(0.0, 10.0, 0.01)), ImportReport("log")
     t = np.concatenate([np.arange(1.0, 5.0, 0.1), np.arange(6.0, 9.0, 0.1)])
-    resample.join(s, "wrench", t, np.column_stack([t] * 6), None, report)
+    join_stream(s, "wrench", t, np.column_stack([t] * 6), None, report)
     np.testing.assert_allclose(s.vectors["wrench"][:, 0], s.t, atol=1e-12)
     assert (
         s.t[0] == 1.0 and not ((s.t > 4.91) & (s.t < 5.99)).any() and np.unique(s.segment).tolist() == [1, 2]
     )
     assert report.findings[0].kind == "uncovered"
     with pytest.raises(DataError, match="no row at the times"):
-        resample.join(s, "wrench", t + 100.0, np.ones((len(t), 6)), None, report)
+        join_stream(s, "wrench", t + 100.0, np.ones((len(t), 6)), None, report)
 
 
 def test_an_uneven_clock_is_made_even_to_fourth_order() -> None:
     random = np.random.default_rng(0)
     t = np.sort(np.arange(400) * 0.01 + 0.002 * random.standard_normal(400).clip(-2, 2))
-    s, report = signals(t), Report("log")
-    smoothing.even_clock(s, None, report)
+    s, report = signals(t), ImportReport("log")
+    even_clock(s, None, report)
     assert np.ptp(np.diff(s.t)) < 1e-12 and report.findings[0].kind == "uneven"
     # 5/384 h⁴ |q⁗| of a cubic spline with h = 0.018 s; 1/8 h² |τ″| linearly, with |τ″| = 9.
     np.testing.assert_allclose(s.vectors["q"][:, 0], np.sin(s.t), atol=1e-8)
@@ -100,21 +101,21 @@ def test_contact_switches_and_trajectories_cut_what_is_differentiated() -> None:
     """On either side of a kink q̈ is exact, which no window across it can give."""
     t = np.arange(200) * 0.01
     q = np.where(t < 1.0, t**2, 1.0 + 2.0 * (t - 1.0) - 3.0 * (t - 1.0) ** 2)[:, None]
-    s, report = signals(t, q=q), Report("log")
+    s, report = signals(t, q=q), ImportReport("log")
     s.contact["table"] = t >= 1.0
-    settings = smoothing.DerivativesSection(window=11, order=3)
-    std = smoothing.complete(s, settings, report)
+    settings = DerivativesSection(window=11, order=3)
+    std = add_derivatives(s, settings, report)
     expected = np.where(t < 1.0, 2.0, -6.0)
     # Rounding of q, 1e-16, over dt².
     np.testing.assert_allclose(s.vectors["qdd"][:, 0], expected, atol=1e-9)
     assert std is not None and std.shape == (200, 1)
-    mask = smoothing.impact_mask(s, 0.055)["table"]
+    mask = impact_mask(s, 0.055)["table"]
     assert np.flatnonzero(mask).tolist() == list(range(95, 106))
 
 
 def test_stretches_that_are_too_short_are_dropped_and_reported() -> None:
     t = np.arange(100) * 0.01
-    s, report = signals(t), Report("log")
+    s, report = signals(t), ImportReport("log")
     s.contact["table"] = (t > 0.395) & (t < 0.455)
-    smoothing.complete(s, smoothing.DerivativesSection(), report)
+    add_derivatives(s, DerivativesSection(), report)
     assert report.findings[0].rows == ((40, 45),) and len(s) == 94 and s.segment.max() == 1

@@ -9,9 +9,8 @@ import torch
 import forcegp
 from forcegp.errors import DataError, MappingError
 from forcegp.logs import contact, parse_mapping
-from forcegp.logs.report import Report
-from forcegp.logs.sections import ContactSection
-from forcegp.logs.signals import Signals
+from forcegp.logs.mapping import ContactSection
+from forcegp.logs.signals import ImportReport, Signals
 
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
 DT, ROWS = 1.0 / 200.0, 1600
@@ -70,7 +69,7 @@ def test_forces_show_the_intervals(
     pressed: tuple[forcegp.ConstrainedSystem, Signals, np.ndarray], source: str
 ) -> None:
     system, signals, closed = pressed
-    report = Report("log")
+    report = ImportReport("log")
     (found,) = contact.detect(signals, system, mapping(source), report)  # type: ignore[arg-type]
     assert (signals.contact["table"] == closed).mean() >= 0.99
     assert len(found.intervals) == 2 and found.intervals[0][0] == pytest.approx(1.0, abs=2.5 * DT)
@@ -82,7 +81,7 @@ def test_the_multiplier_is_the_force_along_the_normal(
     pressed: tuple[forcegp.ConstrainedSystem, Signals, np.ndarray],
 ) -> None:
     system, signals, closed = pressed
-    estimate = contact.evidence.multiplier(signals, system, system.contacts[0])  # type: ignore[arg-type]
+    estimate = contact.multiplier(signals, system, system.contacts[0])  # type: ignore[arg-type]
     truth = np.where(closed, 20.0 + 5.0 * np.sin(2.0 * signals.t), 0.0)
     # The noise of the torque, 0.05 N m on levers of about half a metre, is below 1 N.
     assert np.abs(estimate - truth).std() < 1.0 and abs((estimate - truth).mean()) < 0.1
@@ -100,7 +99,7 @@ def test_the_distance_shows_the_intervals(
     table = forcegp.SurfaceContact("table", FRAME, POINT, forcegp.Plane(offset=offset))
     system = forcegp.ConstrainedSystem(system.robot, [table])
     more = "shortest = 0.0\nthreshold = 0.02"
-    contact.detect(signals, system, mapping("distance", more), Report("log"))  # type: ignore[arg-type]
+    contact.detect(signals, system, mapping("distance", more), ImportReport("log"))  # type: ignore[arg-type]
     np.testing.assert_array_equal(signals.contact["table"], np.abs(height - offset) <= 0.02)
     assert signals.contact["table"].any() and not signals.contact["table"].all()
 
@@ -125,13 +124,13 @@ def test_what_is_not_said_of_a_contact_is_an_error(
 ) -> None:
     system, signals, _ = pressed
     with pytest.raises(MappingError, match=r"m.toml:\d+: contact.wall: the scene has no contact 'wall'"):
-        contact.detect(signals, system, mapping("always", name="wall"), Report("log"))  # type: ignore[arg-type]
+        contact.detect(signals, system, mapping("always", name="wall"), ImportReport("log"))  # type: ignore[arg-type]
     text = (
         b'[time]\ncolumn = "t"\n[position]\ncolumn = "q"\nunit = "rad"\n[torque]\ncolumn = "i"\nunit = "Nm"\n'
     )
     with pytest.raises(MappingError, match="nothing says whether contact 'table' is closed"):
-        contact.detect(signals, system, parse_mapping(text, "m.toml"), Report("log"))
-    contact.detect(signals, system, mapping("always"), Report("log"))  # type: ignore[arg-type]
+        contact.detect(signals, system, parse_mapping(text, "m.toml"), ImportReport("log"))
+    contact.detect(signals, system, mapping("always"), ImportReport("log"))  # type: ignore[arg-type]
     assert signals.contact["table"].all()
 
 

@@ -10,7 +10,8 @@ import torch
 
 import forcegp
 from forcegp.errors import MappingError
-from forcegp.logs import guess, headings, read_log
+from forcegp.logs import guess, read_log
+from forcegp.logs.headings import declared_unit
 from log_files import REAL, WRITERS, motion, real_logs
 from robots import ARMS
 
@@ -90,7 +91,7 @@ def test_declared_units_are_taken_from_headings() -> None:
 
     stream = Stream("", {}, {"pos": "[deg]"})
     names = ("pos", "q1 [rad]", "vel (deg/s)", "tau_Nm", "t_ms", "x")
-    assert [headings.declared_unit(n, stream) for n in names] == ["deg", "rad", "deg/s", "Nm", "ms", None]
+    assert [declared_unit(n, stream) for n in names] == ["deg", "rad", "deg/s", "Nm", "ms", None]
 
 
 def test_logs_whose_columns_say_nothing(tmp_path: Path) -> None:

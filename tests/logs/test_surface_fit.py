@@ -10,8 +10,7 @@ import forcegp
 from forcegp.constraints import Plane, Sphere
 from forcegp.errors import DataError
 from forcegp.logs import surface_fit
-from forcegp.logs.robust_fit import correlation_time
-from forcegp.logs.tip import Tip, tip_of
+from forcegp.logs.surface_fit import Tip, correlation_time, tip_of
 
 
 def on_plane(n: int, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, float]:

@@ -8,8 +8,9 @@ import torch
 
 import forcegp
 from forcegp.errors import MappingError
-from forcegp.logs import parse_mapping, wrench
-from forcegp.logs.sections import WrenchSection
+from forcegp.logs import parse_mapping
+from forcegp.logs.contact import per_contact
+from forcegp.logs.mapping import WrenchSection
 from forcegp.logs.signals import Signals
 
 FRAME = "lbr_iiwa_link_7"
@@ -60,10 +61,10 @@ def test_the_force_at_the_contact_is_recovered(
     signals = Signals(
         system.robot.joint_names, np.arange(20.0), np.arange(20), np.zeros(20, np.int64), vectors
     )
-    found = wrench.per_contact(signals, system, mapping)
+    found = per_contact(signals, system, mapping)
     # Rounding of forces of 60 N and moments of 10 N m.
     np.testing.assert_allclose(found["F_sensor"]["table"], force, atol=1e-12)
     np.testing.assert_allclose(found["M_sensor"]["table"], np.zeros((20, 3)), atol=1e-12)
     other = parse_mapping(toml.replace(FRAME, "hand").encode(), "m.toml")
     with pytest.raises(MappingError, match=r"m.toml:\d+: wrench.frame: no such frame"):
-        wrench.per_contact(signals, system, other)
+        per_contact(signals, system, other)

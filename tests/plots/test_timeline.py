@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from forcegp.plots.timeline import Timeline
+from forcegp.plots import Timeline
 
 
 def test_segments_whose_time_restarts_follow_one_another() -> None:

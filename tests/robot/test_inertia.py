@@ -11,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 
 import forcegp
 from forcegp.errors import InertiaError
-from forcegp.robot.check import inertia_doubt, inertia_error
 from forcegp.robot.inertia import (
     from_log_cholesky,
     from_pseudo_inertia,
@@ -19,7 +18,7 @@ from forcegp.robot.inertia import (
     log_cholesky,
     pseudo_inertia,
 )
-from forcegp.robot.tree import Inertial
+from forcegp.robot.tree import Inertial, inertia_doubt, inertia_error
 
 ROUND_TRIP = 1e-9  # coordinates up to 2 square the condition of J to some 1e6 or so
 coordinates = arrays(np.float64, (3, 10), elements=st.floats(-1.5, 1.5))

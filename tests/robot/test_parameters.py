@@ -13,9 +13,8 @@ from safetensors.torch import load_file, save_file
 import forcegp
 from forcegp import dynamics, kinematics
 from forcegp.errors import InertiaError, ModelError, UnknownNameError
-from forcegp.robot.check import inertia_doubt, inertia_error
 from forcegp.robot.parameters import POSITIVE, SMALLEST, AnalyticalParameters
-from forcegp.robot.tree import Inertial
+from forcegp.robot.tree import Inertial, inertia_doubt, inertia_error
 from robots import random_states
 
 GRADIENT = 1e-6  # relative, against central differences with Richardson's extrapolation

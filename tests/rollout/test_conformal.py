@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from forcegp.rollout.conformal import widening
+from forcegp.rollout.comparison import widening
 from forcegp.rollout.trajectory import Bands
 
 

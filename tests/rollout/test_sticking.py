@@ -14,7 +14,7 @@ from torch import Tensor
 import forcegp
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.rollout import DivergedError, ForceLaw, RolloutOptions, rollout
-from forcegp.rollout.sticking import dry_friction_force
+from forcegp.rollout.law import dry_friction_force
 
 LIMITS = (2.0, 0.7)
 DT = 2e-3
@@ -139,7 +139,7 @@ def test_a_block_in_contact_slides_to_rest_in_closed_form(tmp_path: Path) -> Non
 
 def test_an_arm_pressed_on_a_table_holds_still() -> None:
     """Seven joints stick in contact, where only six can move: the arm rests, and the table carries it."""
-    from forcegp.constraints.projection import project_state
+    from forcegp.rollout.integrate import project_state
     from rollout_cases import arm, simulated
 
     system = arm()

@@ -15,9 +15,8 @@ from typer.testing import CliRunner
 import forcegp
 from forcegp.cli import app
 from forcegp.view.motion import Motion, at_rest, of_log, pictures, with_rollout
-from forcegp.view.page import write_view
+from forcegp.view.page import Stage, force_text, write_view
 from forcegp.view.shapes import shapes_of
-from forcegp.view.stage import Stage, force_text
 from forces.cases import logged, two_contacts
 
 viser = pytest.importorskip("viser")

@@ -1,8 +1,128 @@
-"""Checks of a log against a scene before a model is fitted to it."""
+"""Checks of a log against a scene before a model is fitted to it: all checks in order, and their report."""
 
-from forcegp.checks.finding import Finding, Report
-from forcegp.checks.kinds import KINDS
-from forcegp.checks.log import Log, log_of, read_log
-from forcegp.checks.run import check
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from forcegp.checks import contact, excitation, kinematics, limits, mechanics, placement, values
+from forcegp.checks.finding import KINDS, SEVERITIES, Finding, NotJudgedError, Report
+from forcegp.checks.log import Log, Outcome, log_of, of_robot, read_log
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data.dataset import Dataset
+from forcegp.resources import announce_memory
 
 __all__ = ["KINDS", "Finding", "Log", "Report", "check", "log_of", "read_log"]
+
+NUMBERS = 24
+"""Upper bound on the numbers of one joint in one row that are held at a time; twenty were measured."""
+OF_CONTACTS = frozenset({"contact", "contact force"})
+"""Checks of contacts, which a scene without any does without."""
+Check = Callable[[ConstrainedSystem, Log], Outcome]
+Progress = Callable[[int, int], None]
+
+
+def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
+    """The robot that the header names against that of the scene."""
+    logged = log.header.robot_fingerprint
+    if logged is None or logged == system.robot.fingerprint:
+        return [], log
+    text = f"logged on robot {log.header.robot!r} ({logged}), and the scene has {system.robot.name!r}"
+    return [Finding("robot-mismatch", text, log.all_rows)], log
+
+
+CHECKS: tuple[tuple[str, Check], ...] = (
+    ("finite values", values.check_finite),
+    ("order of time", values.check_order),
+    ("robot", check_robot),
+    ("held rows", values.check_held),
+    ("gaps", values.check_gaps),
+    ("jitter", values.check_jitter),
+    ("degrees", limits.check_degrees),
+    ("unit of time", kinematics.check_clock_unit),
+    ("sampling period", values.check_period),
+    ("spikes", values.check_spikes),
+    ("standing channels", values.check_stuck),
+    ("jumps", values.check_jumps),
+    ("velocity", kinematics.check_velocity),
+    ("acceleration", kinematics.check_acceleration),
+    ("impacts", values.check_impacts),
+    ("resolution", values.check_resolution),
+    ("limits", limits.check_limits),
+    ("saturation", limits.check_saturation),
+    ("length", excitation.check_length),
+    ("motion", excitation.check_motion),
+    ("noise", kinematics.check_noise),
+    ("placement of the tip", placement.check_placement),
+    ("dynamics", mechanics.check_dynamics),
+    ("contact", contact.check_contacts),
+    ("contact force", contact.check_forces),
+    ("excitation", excitation.check_excitation),
+)
+"""Every check in the order in which they run; each sees the log as those before it have corrected it."""
+
+_MOTION = frozenset({"velocity-mismatch"})
+_ROBOT = frozenset(
+    {"gravity-direction", "base-tilted", "payload-missing", "masses-mismatch", "torque-unexplained"}
+)
+VOIDS = {"dynamics": _MOTION, "contact force": _MOTION | _ROBOT, "excitation": _MOTION}
+"""Findings after which a check cannot judge."""
+
+
+def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress | None = None) -> Report:
+    """Check a log against a scene before a model is fitted to it.
+
+    Each check is silent on a log that is in order. A fault that is found is undone for the checks after it,
+    so that one fault is reported once; the log itself is not changed.
+
+    Args:
+        system: robot and contacts.
+        data: the log; `forcegp.checks.read_log` reads one that `Dataset` refuses.
+        progress: called with the number of checks done and their number.
+
+    Returns:
+        The findings, the gravest first; `report.usable` says whether to go on.
+
+    Raises:
+        DataError: a joint of the robot is not in the log, or the log is empty.
+
+    Example:
+        >>> import forcegp
+        >>> system = forcegp.load_scene("kuka_plane").system()
+        >>> report = forcegp.check(system, forcegp.Dataset.read("run.parquet"))  # doctest: +SKIP
+        >>> print(report.verdict)  # doctest: +SKIP
+        verdict: go on
+    """
+    system = replace(system, robot=system.robot.to("cpu", torch.float64))
+    log = of_robot(data if isinstance(data, Log) else log_of(data), system.robot)
+    samples, findings, skipped = len(log), [], {}
+    announce_memory(8 * NUMBERS * log.nq * samples, f"checking {samples:,} rows")
+    for done, (name, run) in enumerate(CHECKS):
+        if progress is not None:
+            progress(done, len(CHECKS))
+        if name in OF_CONTACTS and not system.contacts:
+            continue
+        kinds = (kind for finding in findings for kind in finding.kinds)
+        void = next((kind for kind in kinds if kind in VOIDS.get(name, ())), None)
+        if void:
+            skipped[name] = f"not judged after {void}"
+            continue
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            try:
+                found, log = run(system, log)
+            except NotJudgedError as reason:
+                skipped[name], found = str(reason), []
+        findings += found
+        if not log.usable.any():
+            text = "no row of the log is usable"
+            findings.append(Finding("log-short", text, log.all_rows, weight="error"))
+            skipped |= {other: "no row is usable" for other, _ in CHECKS[done + 1 :]}
+            break
+    order = list(KINDS)
+    findings.sort(key=lambda finding: (SEVERITIES.index(finding.severity), order.index(finding.kind)))
+    return Report(tuple(findings), samples, system.robot.joint_names, skipped)

@@ -8,33 +8,33 @@ second fault, so that one fault does not show as several.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from forcegp.checks.alternatives import Tried, alternatives_of, with_alternatives
-from forcegp.checks.diagnosis import corrected, finding_of, plausible
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import Fit, Problem, cross_validate, gain_of, pooled_gain_of, score_of
+from forcegp.checks.fit import TorqueFit, TorqueProblem, cross_validate, gain_of, pooled_gain_of, score_of
 from forcegp.checks.hypotheses import (
     LAGS,
     ROBOT,
     Hypothesis,
     continuous,
+    corrected,
     current_hypothesis,
     delays,
     discrete,
     encoder_hypothesis,
+    finding_of,
     gain_hypothesis,
+    plausible,
     problem_of,
     robot_hypotheses,
     with_log,
 )
-from forcegp.checks.log import Log
+from forcegp.checks.log import Array, Log
 from forcegp.checks.placement import leaves_surface
-from forcegp.checks.statistics import Array
 from forcegp.constraints import ConstrainedSystem
 
 ROWS = 1600
@@ -75,11 +75,11 @@ class Explanation:
     findings: list[Finding]
     log: Log
     repairs: tuple[Callable[[Log], Log], ...]
-    problem: Problem
+    problem: TorqueProblem
     robot: tuple[str, ...]
     columns: Array
     prior: Array
-    fit: Fit
+    fit: TorqueFit
     rows: np.ndarray
 
 
@@ -131,7 +131,12 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
 
 
 def _refined(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem, found: Hypothesis, theta: Array
+    system: ConstrainedSystem,
+    log: Log,
+    rows: np.ndarray,
+    problem: TorqueProblem,
+    found: Hypothesis,
+    theta: Array,
 ) -> Array:
     """An encoder offset after two more Gauss-Newton steps, as its effect on the torque is not linear."""
     for _ in range(2):
@@ -141,7 +146,9 @@ def _refined(
     return theta
 
 
-def _weighed(problem: Problem, columns: Array | None = None, prior: Array | None = None) -> Problem:
+def _weighed(
+    problem: TorqueProblem, columns: Array | None = None, prior: Array | None = None
+) -> TorqueProblem:
     """The problem with joints weighed by the noise that the present explanation leaves."""
     for _ in range(2):
         error = cross_validate(problem, columns, prior).error
@@ -155,7 +162,7 @@ def _best(
     system: ConstrainedSystem,
     log: Log,
     rows: np.ndarray,
-    problem: Problem,
+    problem: TorqueProblem,
     kept: Array,
     prior: Array,
     taken: set,
@@ -192,14 +199,14 @@ def _best(
     return Choice((chosen, fit), tuple(dict.fromkeys(j for joints in alike for j in joints)), others)
 
 
-def _same(fit: Fit, other: Fit) -> bool:
+def _same(fit: TorqueFit, other: TorqueFit) -> bool:
     """Whether two fits leave the same errors but for rounding: those of an arm and of its mirror image."""
     return bool(np.allclose(fit.error, other.error, rtol=SAME, atol=0.0))
 
 
 def _fits(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: Array
-) -> Iterator[tuple[Hypothesis, Fit]]:
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: TorqueProblem, kept: Array, prior: Array
+) -> Iterator[tuple[Hypothesis, TorqueFit]]:
     # Once the robot is at fault and its parameters are free, they bend to any sign and order.
     for hypothesis in _promising(system, log, rows, problem) if not len(prior) else ():
         changed = with_log(problem, system, hypothesis.change(log), rows)
@@ -221,7 +228,9 @@ def _fits(
         yield from _currents(log, rows, problem, kept, prior)
 
 
-def _currents(log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: Array) -> Iterator[Tried]:
+def _currents(
+    log: Log, rows: np.ndarray, problem: TorqueProblem, kept: Array, prior: Array
+) -> Iterator[Tried]:
     """Gains of all joints that the log determines, tried where most torques are scaled wrongly."""
     fit = _fit(problem, current_hypothesis(log, rows, problem, tuple(range(log.nq))), kept, prior)
     gains = 1.0 + fit.theta[: log.nq]
@@ -232,7 +241,7 @@ def _currents(log: Log, rows: np.ndarray, problem: Problem, kept: Array, prior: 
         yield hypothesis, _fit(problem, hypothesis, kept, prior)
 
 
-def _fit(problem: Problem, hypothesis: Hypothesis, kept: Array, prior: Array) -> Fit:
+def _fit(problem: TorqueProblem, hypothesis: Hypothesis, kept: Array, prior: Array) -> TorqueFit:
     """A hypothesis with parameters, beside those that the model holds already."""
     assert hypothesis.columns is not None and hypothesis.prior is not None
     columns = np.concatenate([hypothesis.columns, kept], axis=-1)
@@ -256,7 +265,7 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
 
 
 def _promising(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: Problem
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: TorqueProblem
 ) -> Iterator[Hypothesis]:
     """Hypotheses without parameters that lower the error on a part of the rows."""
     few = rows[::SCREENING]
@@ -264,3 +273,77 @@ def _promising(
     for hypothesis in discrete(log):
         if cross_validate(with_log(problem, system, hypothesis.change(log), few)).score.mean() < null:
             yield hypothesis
+
+
+Tried = tuple[Hypothesis, TorqueFit]
+SMALL_MASS = 1e-6
+"""Share of the robot's mass below which a mass is zero."""
+ALONE = 2.0
+"""Standard errors by which an alternative must lower the held-out error on its own.
+
+The threshold is low (chance exceeds it in 4 % of cases), since it is already known that something is wrong.
+"""
+TESTS = {
+    "torque-gain": "hang a known weight from the tip: its torque shows the gain, whatever the masses",
+    "torque-current": "hang a known weight from the tip: its torque shows the gains, whatever the masses",
+    "torque-sign": "push a joint in its positive direction while the arm holds still: its torque must fall",
+    "torque-order": "twist one joint after another, without loading the others: only its torque must change",
+    "torque-delay": "apply a torque step to one joint: its acceleration must change in the same sample",
+    "torque-without-gravity": "hold the arm outstretched and still: the torque must balance gravity",
+    "joint-sign": "turn one joint after another by hand, and watch the sign of its position",
+    "joint-order": "turn one joint after another by hand, and watch which position changes",
+    "encoder-offset": "move the joint to its zero mark: its position must be zero there",
+    "base-tilted": "put a spirit level on the base",
+    "gravity-direction": "check how the base is mounted",
+    "payload-missing": "weigh what is mounted on the last link",
+    "masses-mismatch": "compare the masses with the manufacturer's data",
+}
+"""A test for each kind of fault, in order of preference."""
+
+
+def alternatives_of(
+    system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
+) -> Iterator[Tried]:
+    """The hypotheses that the held-out blocks cannot distinguish from the chosen one.
+
+    The best comes first. Each lowers the error significantly, and by as much as the chosen one to within one
+    standard error of the difference over blocks.
+    """
+    for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
+        if _says_the_same(chosen[0], hypothesis):
+            continue
+        gain, error = gain_of(fit.score, null.score)
+        loss, apart = gain_of(chosen[1].score, fit.score)
+        if gain > ALONE * error and abs(loss) <= apart and _possible(system, hypothesis, fit):
+            yield hypothesis, fit
+
+
+def _says_the_same(chosen: Hypothesis, other: Hypothesis) -> bool:
+    """Whether a hypothesis has the kind and joints of the chosen one, or contains it, as masses do a tool."""
+    if (chosen.name, other.name) == ("payload", "masses"):
+        return True
+    return other.name == chosen.name and (not other.joints or bool({*other.joints} & {*chosen.joints}))
+
+
+def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
+    """Whether every link keeps a mass that is positive, or zero in the robot file; the fit does not enforce
+    it."""
+    if hypothesis.name != "masses":
+        return True
+    given = system.robot.mass.numpy()
+    found = given + fit.theta[: 10 * system.robot.nq : 10]
+    return bool(np.where(given > 0.0, found > 0.0, found >= -SMALL_MASS * given.sum()).all())
+
+
+def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
+    """The finding with its alternatives, if there are any, and a test that tells them apart."""
+    found: list[Finding] = []
+    for other in others:
+        alike = (f for f in (finding, *found) if f.kind == other.kind)
+        if not any({*f.joints} & {*other.joints} or not other.joints for f in alike):
+            found.append(other)
+    if not found:
+        return finding
+    message = "; or ".join(one.message for one in (finding, *found))
+    test = next(TESTS[kind] for kind in TESTS if kind in {finding.kind, *(f.kind for f in found)})
+    return replace(finding, message=message, alternatives=tuple(found), told_apart_by=test)

@@ -1,8 +1,12 @@
-"""Is qd the derivative of q, and qdd that of qd? Units of time and angle, signs and order of columns.
+"""Is qd the derivative of q, and qdd that of qd? Units of time and angle, signs, order, and noise of columns.
 
 Over short windows the change of x is compared with the integral I of its logged rate. Noise in either
 flattens one of the two regression lines, so the slope of Δx over I lies between cov/var(I) and
 var(Δx)/cov: a rate is at fault where both bounds are.
+
+Is the noise on the acceleration white, and as large as the header says? The departure of a sample from the
+cubic through its neighbours at distances k and 2k shows the noise around the frequency 1/(2 k dt), and hardly
+any motion. White noise shows alike at k = 1 and k = 3; filtered noise does not.
 """
 
 from __future__ import annotations
@@ -13,12 +17,10 @@ import numpy as np
 import torch
 
 from forcegp import dynamics
-from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
+from forcegp.checks.fit import residual, tensors
 from forcegp.checks.limits import DEGREE
-from forcegp.checks.log import Log
-from forcegp.checks.residual import residual, tensors
-from forcegp.checks.statistics import Array
+from forcegp.checks.log import Array, Log, Outcome
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
 
@@ -195,14 +197,14 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
         hit = left & level.right(slope) & (np.abs(level.correlation) >= RELATED)
         if not hit.any():
             continue
-        joints = tuple(log.joint_names[j] for j in np.flatnonzero(hit))
+        joints = log.named(hit)
         evidence = {"slope": float(np.median(level.low[hit]))}
         what = {-1.0: "runs against", 1.0 / DEGREE: "is 1/57 of", DEGREE: "is 57 times"}[slope]
         text = f"qd of {', '.join(joints)} {what} the rate of change of q"
         found.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
         factor[hit], left = slope, left & ~hit
     if left.any():
-        joints = tuple(log.joint_names[j] for j in np.flatnonzero(left))
+        joints = log.named(left)
         j = int(np.flatnonzero(left)[0])
         text = (
             f"qd of {', '.join(joints)} is not the rate of change of q: slope {level.low[j]:.3g}, "
@@ -299,7 +301,7 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))
     if not wrong.any():
         return [], log
-    joints = tuple(log.joint_names[j] for j in np.flatnonzero(wrong))
+    joints = log.named(wrong)
     j = int(np.flatnonzero(wrong)[0])
     text = (
         f"qdd of {', '.join(joints)} is not the rate of change of qd: slope {level.low[j]:.3g}, "
@@ -311,3 +313,72 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     for s in log.stretches:
         qdd[s, wrong] = np.gradient(log.qd[s][:, wrong], log.t[s], axis=0)
     return [found], log.replace(qdd=qdd, derived=log.derived | {"qdd"})
+
+
+DEPARTURE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
+"""The departure, with signs: it vanishes on cubics."""
+DEPARTURE_STRIDE = 3
+"""Distance of neighbours that shows noise below the corner of a filter."""
+NOISE_FACTOR = 2.0
+"""Ratio of noise found to noise stated that is reported."""
+FILTERED = 0.4
+"""Noise at the highest frequency, as a share of that at a third of it, that tells a filter."""
+NOISE_ROWS = 100
+
+
+def noise_levels(log: Log) -> tuple[Array, Array] | None:
+    """Standard deviation `(nq,)` of white noise as neighbours at distance 1 and at distance 3 show it."""
+    levels = []
+    for k in (1, DEPARTURE_STRIDE):
+        parts = []
+        for s in log.stretches:
+            x, span = log.qdd[s], 4 * k
+            if len(x) > span:
+                parts.append(sum(w * x[i * k : len(x) - span + i * k] for i, w in enumerate(DEPARTURE)))
+        rest = np.concatenate(parts) if parts else np.empty((0, log.nq))
+        if len(rest) < NOISE_ROWS:
+            return None
+        levels.append(robust_std(rest) / np.linalg.norm(DEPARTURE))
+    return levels[0], levels[1]
+
+
+def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
+    """The noise of the logged acceleration against that of the header."""
+    levels = noise_levels(log) if np.isfinite(log.dt) and "qdd" not in log.derived else None
+    if levels is None:
+        return [], log
+    top, middle = levels
+    stated = log.header.noise_std
+    filtered = top < FILTERED * middle
+    evidence = {"white_noise_std": float(np.median(top)), "std_at_a_third": float(np.median(middle))}
+    if stated is None:
+        # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
+        weight = "note"
+    else:
+        evidence["stated_std"] = stated
+        filtered &= top < stated / NOISE_FACTOR
+        weight = "warning"
+    if filtered.mean() > 0.5 and not log.header.filtered:
+        joints = log.named(filtered)
+        text = (
+            f"the acceleration is filtered: at the highest frequencies it holds "
+            f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them, "
+            "so its noise is not white"
+        )
+        return [Finding("noise-filtered", text, log.all_rows, joints, evidence=evidence, weight=weight)], log
+    return (_stated(log, top, stated, evidence) if stated is not None else []), log
+
+
+def _stated(log: Log, found: Array, stated: float, evidence: dict[str, float]) -> list[Finding]:
+    kinds = {"noise-understated": found > NOISE_FACTOR * stated}
+    if not log.header.filtered:  # the highest frequencies show little of what a filter lets through
+        kinds["noise-overstated"] = found < stated / NOISE_FACTOR
+    result = []
+    for kind, wrong in kinds.items():
+        if wrong.any():
+            joints = log.named(wrong)
+            worst = found[wrong].max() if kind == "noise-understated" else found[wrong].min()
+            place = f"{worst:.3g} rad/s² at {', '.join(joints)}"
+            text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
+            result.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
+    return result

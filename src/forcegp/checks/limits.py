@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
-from forcegp.checks.log import Log
-from forcegp.checks.statistics import Array, any_row, describe, intervals
+from forcegp.checks.log import Array, Log, Outcome, any_row, describe, intervals
 from forcegp.constraints import ConstrainedSystem
 
 DEGREE = np.pi / 180.0
@@ -96,7 +94,7 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
             beyond = ((value < low - slack) | (value > high + slack)) & log.usable[:, None]
         if beyond.any():
             rows = intervals(beyond.any(axis=1))
-            joints = tuple(log.joint_names[j] for j in np.flatnonzero(beyond.any(axis=0)))
+            joints = log.named(beyond.any(axis=0))
             text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in {describe(rows)}"
             found.append(
                 Finding(kinds[name], text, rows, joints, evidence={"rows": beyond.any(axis=1).sum()})
@@ -124,6 +122,6 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
     if not clipped.any():
         return [], log
     rows = intervals(any_row(clipped))
-    joints = tuple(log.joint_names[j] for j in np.flatnonzero(clipped.any(axis=0)))
+    joints = log.named(clipped.any(axis=0))
     text = f"the torque of {', '.join(joints)} stays at its largest value in {describe(rows)}"
     return [Finding("torque-saturated", text, rows, joints)], log

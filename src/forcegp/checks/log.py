@@ -1,4 +1,11 @@
-"""A log as it was recorded, valid or not: NaN and backward time are findings here, not errors."""
+"""A log as it was recorded, valid or not: NaN and backward time are findings here, not errors.
+
+Beside it stand what the checks share: robust statistics, intervals of rows, units in messages, and the filter
+that torques are explained after. Noise ε on q̈ enters the explained torque as M ε. A fit then gains by
+shrinking the inertia, as any regression on noisy columns does; the same filter of a tenth of a second on
+positions, velocities, accelerations and torques takes that away. A linear filter on all columns leaves
+M q̈ = Q true up to the change of M and of the bias force within the window.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +19,97 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from forcegp.checks.statistics import Array, intervals
+from forcegp.checks.finding import Finding
+from forcegp.data.checks import check_joints
 from forcegp.data.columns import parse
-from forcegp.data.compatible import check_joints
 from forcegp.data.dataset import Dataset
 from forcegp.data.derivative import SavitzkyGolay, differentiate
-from forcegp.data.fields import JOINT_VECTORS
-from forcegp.data.header import DataHeader
+from forcegp.data.fields import JOINT_VECTORS, DataHeader
 from forcegp.data.table import read_table
 from forcegp.errors import DataError
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
+
+Array = NDArray[Any]
+
+
+def intervals(mask: NDArray[np.bool_], join: int = 0) -> tuple[tuple[int, int], ...]:
+    """Half-open runs of true rows; runs that are at most `join` rows apart become one.
+
+    >>> intervals(np.array([True, True, False, True]))
+    ((0, 2), (3, 4))
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    runs = [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    joined: list[tuple[int, int]] = []
+    for start, stop in runs:
+        if joined and start - joined[-1][1] <= join:
+            joined[-1] = (joined[-1][0], stop)
+        else:
+            joined.append((start, stop))
+    return tuple(joined)
+
+
+def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Up to `most` of some rows, evenly spread."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]
+
+
+def any_row(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """`(n,)` bool, rows of `(n, d)` in which any column is true."""
+    return np.asarray(mask.any(axis=1))
+
+
+def describe(spans: tuple[tuple[int, int], ...], most: int = 3) -> str:
+    """Rows in words, such as `row 4` or `rows 4 to 9, 20 to 31 and 5 more intervals`."""
+    texts = [f"{a}" if b - a == 1 else f"{a} to {b - 1}" for a, b in spans[:most]]
+    many = len(spans) > 1 or any(b - a > 1 for a, b in spans)
+    rest = f" and {len(spans) - most} more" if len(spans) > most else ""
+    return f"row{'s' * many} {', '.join(texts)}{rest}"
+
+
+OUTER = np.array([-10.0, 10.0, -5.0, 2.0]) / 3.0
+"""Minus the weights that carry a cubic from x = −2, −1, 1, 2 to −3."""
+SPREAD = 3.7
+"""Standard deviation of that contrast over the one of the middle value, for white noise."""
+
+
+def spikes(x: Array) -> tuple[Array, Array]:
+    """Departure of each value from the cubic through its four neighbours, and how well six neighbours agree.
+
+    e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the same departure
+    measured on the neighbours alone, without x_i: a kink of the motion raises both, a spike the first only.
+
+    Args:
+        x: `(n, d)` evenly sampled values, n ≥ 7.
+
+    Returns:
+        Both departures `(n, d)`, zero in the three outermost rows.
+    """
+    own, around = np.zeros_like(x), np.zeros_like(x)
+    a, b, c, middle, d, e, f = (x[k : len(x) - 6 + k] for k in range(7))
+    own[3:-3] = middle - (-b + 4.0 * c + 4.0 * d - e) / 6.0
+    left = a + sum(w * v for w, v in zip(OUTER, (b, c, d, e), strict=True))
+    right = f + sum(w * v for w, v in zip(OUTER, (e, d, c, b), strict=True))
+    around[3:-3] = np.maximum(np.abs(left), np.abs(right)) / SPREAD
+    return own, around
+
+
+def position_unit(robot: RobotModel, j: int | np.integer) -> str:
+    """Unit of the position of joint j."""
+    return "rad" if robot.joint_types[j] == "revolute" else "m"
+
+
+def force_unit(robot: RobotModel, j: int | np.integer) -> str:
+    """Unit of the force of joint j."""
+    return "N m" if robot.joint_types[j] == "revolute" else "N"
+
+
+def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
+    """An offset of the position of joint j in words, an angle in degrees too."""
+    degrees = f" ({np.degrees(offset):+.2f}°)" if robot.joint_types[j] == "revolute" else ""
+    return f"{offset:+.4f} {position_unit(robot, j)}{degrees}"
+
 
 GAP = 1.5
 """A step is a gap from this multiple of the median step on: half a sample is missing."""
@@ -75,6 +162,10 @@ class Log:
         """The whole log as one interval."""
         return ((0, len(self)),)
 
+    def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
+        """Names of the joints that a mask picks."""
+        return tuple(self.joint_names[j] for j in np.flatnonzero(joints))
+
     def replace(self, **fields: Any) -> Log:
         """The log with some fields changed."""
         return dataclasses.replace(self, **fields)
@@ -125,7 +216,11 @@ class Log:
         inner = [np.arange(s.start + margin, s.stop - margin) for s in self.stretches]
         index = np.concatenate([np.empty(0, np.int64), *inner])
         index = index if self.header.ordered else np.flatnonzero(self.usable)
-        return index[np.unique(np.linspace(0, len(index) - 1, min(most, len(index))).astype(np.int64))]
+        return evenly(index, most)
+
+
+Outcome = tuple[list[Finding], Log]
+"""What a check returns: its findings, and the log as those after it should see it."""
 
 
 def log_of(data: Dataset) -> Log:
@@ -196,3 +291,34 @@ def of_robot(log: Log, robot: RobotModel) -> Log:
     return log.replace(
         **{name: getattr(log, name)[:, order] for name in JOINT_VECTORS}, joint_names=robot.joint_names
     )
+
+
+SMOOTHED_SECONDS = 0.1
+"""Length of the filter [s]."""
+SMOOTHED_ORDER = 3
+"""Degree of the polynomial: bends of the motion within the window are kept."""
+
+
+def smoothed(log: Log) -> Log:
+    """The log after a Savitzky-Golay filter on each stretch without a contact switch.
+
+    Rows within half a window of an end, a gap or a switch are masked. A log in order of selection, and one
+    sampled too slowly for a filter, is left as it is.
+    """
+    from scipy.signal import savgol_filter
+
+    half = round(SMOOTHED_SECONDS / log.dt / 2.0) if np.isfinite(log.dt) and log.header.ordered else 0
+    if 2 * half + 1 <= SMOOTHED_ORDER + 1:
+        return log
+    if log.contact:
+        state = np.stack(list(log.contact.values()), axis=1)
+        switch = np.concatenate([[False], (state[1:] != state[:-1]).any(axis=1)])
+        log = log.replace(segment=2 * log.segment * len(log) + np.cumsum(switch))
+    columns = {name: getattr(log, name).copy() for name in JOINT_VECTORS}
+    lost = np.ones(len(log), bool)
+    for s in log.stretches:
+        if s.stop - s.start > 2 * half:
+            for name, value in columns.items():
+                value[s] = savgol_filter(getattr(log, name)[s], 2 * half + 1, SMOOTHED_ORDER, axis=0)
+            lost[s.start + half : s.stop - half] = False
+    return log.replace(**columns).mask(lost) if not lost.all() else log

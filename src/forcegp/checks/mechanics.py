@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from forcegp.checks.clock import Outcome
-from forcegp.checks.excitation import still_joints
+from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError
-from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of, robust_parameters
+from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of, projector, residual, robust_parameters
 from forcegp.checks.hypotheses import (
     LAGS,
     contact_friction_columns,
@@ -18,12 +17,7 @@ from forcegp.checks.hypotheses import (
     robot_columns,
     sharper_friction_columns,
 )
-from forcegp.checks.log import Log
-from forcegp.checks.residual import projector, residual
-from forcegp.checks.smooth import smoothed
-from forcegp.checks.statistics import any_row, describe, intervals
-from forcegp.checks.units import force_unit, position_unit
-from forcegp.checks.visibility import check_visibility
+from forcegp.checks.log import Log, Outcome, any_row, describe, force_unit, intervals, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
@@ -93,7 +87,7 @@ def _without_torque(log: Log) -> list[Finding]:
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
     if not still.any():
         return []
-    joints = tuple(log.joint_names[j] for j in np.flatnonzero(still))
+    joints = log.named(still)
     word = "zero" if zero[still].all() else "constant"
     # One passive joint is a design; an arm without any torque is a missing column.
     weight = "error" if still.all() else "warning"

@@ -15,14 +15,11 @@ import numpy as np
 import torch
 
 from forcegp import kinematics
-from forcegp.checks.clock import Outcome
 from forcegp.checks.contact import FAR, LEAST_ROWS, OFFSET, fit_surface, tip_path
 from forcegp.checks.finding import Finding
+from forcegp.checks.fit import tensors
 from forcegp.checks.hypotheses import Hypothesis, flipped, swapped, unchanged
-from forcegp.checks.log import Log
-from forcegp.checks.residual import tensors
-from forcegp.checks.statistics import Array
-from forcegp.checks.units import displacement
+from forcegp.checks.log import Array, Log, Outcome, displacement, evenly
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data.fields import JOINT_VECTORS
 from forcegp.robot.model import RobotModel
@@ -45,7 +42,7 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
             continue
         closed = log.contact[contact.name] & log.usable
         left = robust_std((path.c - fit_surface(contact, path, closed)[2])[closed])
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(ROWS, len(rows))).astype(np.int64))]
+        rows = evenly(rows, ROWS)
         found = _explanation(system, contact, log, rows, min(OFFSET, BETTER * float(left)))
         if found is not None:
             return found

@@ -1,4 +1,8 @@
-"""Numbers that a sensor cannot have meant: NaN, held rows, spikes, jumps, coarse steps."""
+"""Each column by itself: a clock that runs evenly, numbers that a sensor can have meant, steps of the state.
+
+Numbers that a sensor cannot have meant are NaN, held rows, spikes and coarse steps. Positions that jump, and
+velocities that jump at an impact, are steps of the state within one sample.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +10,82 @@ import numpy as np
 import torch
 
 from forcegp import dynamics
-from forcegp.checks.clock import Outcome
 from forcegp.checks.finding import Finding
-from forcegp.checks.log import Log
-from forcegp.checks.residual import tensors
-from forcegp.checks.statistics import Array, describe, intervals, spikes
+from forcegp.checks.fit import tensors
+from forcegp.checks.log import Array, Log, Outcome, any_row, describe, intervals, spikes
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS
 from forcegp.robust import robust_std
+
+
+def _after(mask: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """Rows at the end of the steps that a mask over steps picks."""
+    return intervals(np.concatenate([[False], mask]))
+
+
+def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Time stamps that repeat or run backward within a segment."""
+    if not log.header.ordered:
+        return [], log
+    found = []
+    for kind, mask in (("time-repeated", log.steps == 0.0), ("time-backward", log.steps < 0.0)):
+        if mask.any():
+            rows = _after(mask)
+            word = "repeats" if kind == "time-repeated" else "runs backward"
+            found.append(
+                Finding(kind, f"time {word} in {describe(rows)}", rows, evidence={"steps": mask.sum()})
+            )
+    wrong = np.concatenate([[False], log.steps <= 0.0])
+    return found, log.mask(wrong) if found else log
+
+
+def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Steps that are longer than the clock's jitter allows: samples are missing."""
+    with np.errstate(invalid="ignore"):
+        gaps = log.steps > log.longest_step
+    if log.masked is not None:
+        # The step after a wrong time stamp is long because of that stamp.
+        gaps &= ~log.masked[:-1]
+    if not gaps.any() or not log.header.ordered:
+        return [], log
+    rows, longest = _after(gaps), float(np.nanmax(log.steps))
+    missing = int(np.round(log.steps[gaps] / log.dt - 1.0).sum())
+    text = (
+        f"about {missing} samples are missing before {describe(rows)}; the longest gap takes {longest:.4g} s"
+    )
+    evidence = {"missing_samples": missing, "longest_s": longest, "period_s": log.dt}
+    return [Finding("time-gap", text, rows, evidence=evidence)], log
+
+
+def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Steps that are so uneven that filters for even sampling do not apply."""
+    with np.errstate(invalid="ignore"):
+        regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
+    if len(regular) < 2 or not log.header.ordered:
+        return [], log
+    spread = float(robust_std(regular) / log.dt)
+    if spread <= UNIFORM_TOLERANCE:
+        return [], log
+    text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
+    evidence = {"relative_spread": spread, "period_s": log.dt}
+    return [Finding("time-jitter", text, log.all_rows, evidence=evidence)], log
+
+
+def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
+    """The sampling period against that of the header."""
+    stated = log.header.dt
+    if (
+        stated is None
+        or not log.header.ordered
+        or not np.isfinite(log.dt)
+        or abs(log.dt / stated - 1.0) <= UNIFORM_TOLERANCE
+    ):
+        return [], log
+    text = f"the header states a period of {stated:.4g} s, and the rows are {log.dt:.4g} s apart"
+    evidence = {"stated_s": stated, "period_s": log.dt}
+    return [Finding("period-header", text, log.all_rows, evidence=evidence)], log
+
 
 HELD_RUN = 2
 """A logger that fails to update repeats a row at least this often before it is reported as held."""
@@ -261,3 +333,62 @@ def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
         f"{noise[worst]:.3g} rad/s to a velocity from neighbouring samples"
     )
     return [Finding("quantised", text, log.all_rows, joints, evidence={"step": step[worst]})], log
+
+
+JUMP = 30.0
+"""Robust standard deviations beyond which a step is a jump, not noise: fifteen at each of two rows."""
+FASTEST = 2.0
+"""A jump also exceeds what the fastest joint changes within a step by this factor."""
+
+
+def _surplus(x: Array, rate: Array, log: Log) -> Array:
+    """`(n, nq)` change of x over each step beyond what its rate accounts for, at the row after the step."""
+    surplus = np.zeros_like(x)
+    for s in log.stretches:
+        mean = 0.5 * (rate[s][1:] + rate[s][:-1])
+        surplus[s][1:] = np.diff(x[s], axis=0) - mean * np.diff(log.t[s])[:, None]
+    return surplus
+
+
+def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
+    """`(n, nq)` bool, rows at which a column jumps."""
+    surplus = _surplus(x, rate, log)
+    usable = log.usable
+    scale = (
+        robust_std(surplus[usable]) + resolution(x[usable]) + np.finfo(float).eps * np.abs(x[usable]).max()
+    )
+    change = np.zeros_like(x)
+    change[1:] = np.abs(np.diff(x, axis=0))
+    fastest = float(np.percentile(np.abs(rate[usable]), 99.9)) * log.dt
+    big = (np.abs(surplus) > JUMP * scale) & (np.abs(surplus) > FASTEST * fastest)
+    # Where the column itself does not change faster than usual, its rate is at fault, not the position.
+    return big & (change > JUMP * np.median(change[usable], axis=0)) & usable[:, None]
+
+
+def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Positions that jump beyond what the velocity accounts for: rows are missing, or a joint wrapped."""
+    if not log.stretches or "qd" in log.derived:
+        return [], log
+    jumps = _jumps(log.q, log.qd, log)
+    if not jumps.any():
+        return [], log
+    rows = intervals(any_row(jumps))
+    joints = log.named(jumps.any(axis=0))
+    text = f"the position of {', '.join(joints)} jumps at {describe(rows)}"
+    segment = log.segment + np.cumsum(any_row(jumps))
+    return [Finding("position-jump", text, rows, joints)], log.replace(segment=segment)
+
+
+def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Velocities that jump where the acceleration does not account for it: impacts."""
+    if not log.stretches or log.derived:
+        return [], log
+    jumps = _jumps(log.qd, log.qdd, log)
+    if not jumps.any():
+        return [], log
+    rows = intervals(any_row(jumps))
+    joints = log.named(jumps.any(axis=0))
+    text = f"the velocity jumps, as at an impact, at {describe(rows)}"
+    around = any_row(jumps)
+    around[:-1] |= around[1:]
+    return [Finding("impact", text, rows, joints)], log.mask(around)

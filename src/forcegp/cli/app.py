@@ -7,15 +7,11 @@ import warnings
 
 import typer
 
-from forcegp.cli.check import check
 from forcegp.cli.evaluate import evaluate
-from forcegp.cli.fit import fit
-from forcegp.cli.import_ import import_
+from forcegp.cli.fit import fit, sweep
+from forcegp.cli.logs import check, import_, select
 from forcegp.cli.predict import predict
-from forcegp.cli.rollout import rollout
-from forcegp.cli.select import select
-from forcegp.cli.simulate import simulate
-from forcegp.cli.sweep import sweep
+from forcegp.cli.rollout import rollout, simulate
 from forcegp.cli.view import view
 from forcegp.errors import ForceGPError
 

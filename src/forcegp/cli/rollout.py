@@ -1,14 +1,25 @@
-"""`forcegp rollout`: a model rolled forward in time under logged torques."""
+"""`forcegp rollout` and `forcegp simulate`: motion predicted by a model, and motion in a physics engine."""
 
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, progress_bar, read_data, show
+from forcegp.cli.common import (
+    AsJson,
+    DataFile,
+    ModelFolder,
+    SceneName,
+    check_data_destination,
+    data_of_robot,
+    progress_bar,
+    read_data,
+    show,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -198,3 +209,42 @@ def _as_data(path: Rollout, log: Dataset, dt: float) -> Dataset:
         extras=extras,
         contact_extras={},
     )
+
+
+def simulate(
+    scene: SceneName,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Where the log goes (.parquet).")],
+    duration: Annotated[
+        float | None, typer.Option(help="Simulated time in seconds; default: the scene's.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of motion and noise; default: the scene's.")] = None,
+    engine: Annotated[str | None, typer.Option(help="pybullet, mujoco or auto; default: scene's.")] = None,
+    contact: Annotated[
+        str | None,
+        typer.Option(help="rigid, or solver for MuJoCo's own contact and friction; default: the scene's."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate the robot of a scene as it slides over its surface, and log the motion.
+
+    [bold]Examples[/bold]
+
+    forcegp simulate --scene kuka_plane --out run.parquet
+
+    forcegp simulate --scene my_scene.toml --duration 10 --seed 3 --out run.parquet
+
+    forcegp simulate --scene ur5_wiping --engine mujoco --contact solver --out run.parquet
+    """
+    from forcegp.destination import write_or_keep
+    from forcegp.scene import load_scene
+    from forcegp.simulate import simulate as run
+
+    check_data_destination(out)
+    read = load_scene(scene)
+    changes = {"duration": duration, "seed": seed, "engine": engine, "contact": contact}
+    config = replace(read.simulation, **{name: v for name, v in changes.items() if v is not None})
+    system = read.system()
+    with progress_bar("simulating", config.steps) as progress:
+        result = run(system, config, progress=lambda done, _: progress(done))
+    write_or_keep(result.data.write, out)
+    show({**result.summary(), "file": str(out)}, as_json)

@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from forcegp import derivatives, dynamics
-from forcegp.compiled.build import Kernel, cpu_kernel, cuda_kernel
 from forcegp.compiled.program import QUANTITIES, trace
-from forcegp.compiled.source import cpu_source, cuda_source
+from forcegp.compiled.source import Kernel, cpu_kernel, cpu_source, cuda_kernel, cuda_source
 from forcegp.errors import ModelError, ShapeError, UnknownNameError
 from forcegp.kinematics import common_states
 from forcegp.robot.model import RobotModel

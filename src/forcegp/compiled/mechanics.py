@@ -10,10 +10,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from forcegp.compiled.build import cpu_kernel
-from forcegp.compiled.links import Links, cross, numbers
-from forcegp.compiled.program import Program, _joint_force, _mass_matrix, _Motion, _motion
-from forcegp.compiled.source import cpu_source
+from forcegp.compiled.program import (
+    Links,
+    Program,
+    _joint_force,
+    _mass_matrix,
+    _Motion,
+    _motion,
+    cross,
+    numbers,
+)
+from forcegp.compiled.source import cpu_kernel, cpu_source
 from forcegp.robot.model import BASE, RobotModel
 
 Vector = NDArray[np.floating]

@@ -1,8 +1,7 @@
 """Implicit constraints: surfaces, contacts, stabilization, and the constrained equations of motion."""
 
 from forcegp.constraints.contact import Constraint, PointConnection, SurfaceContact
-from forcegp.constraints.gauss import Equations
-from forcegp.constraints.linearization import Linearization
+from forcegp.constraints.gauss import Equations, Linearization
 from forcegp.constraints.surface import Cylinder, ImplicitSurface, Plane, Sphere, Surface, SurfaceSchema
 from forcegp.constraints.system import Baumgarte, ConstrainedSystem
 

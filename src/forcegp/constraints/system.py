@@ -13,8 +13,7 @@ from torch.linalg import vecdot
 
 from forcegp import dynamics, kinematics
 from forcegp.constraints.contact import Constraint, ConstraintTerms, MovingPoint
-from forcegp.constraints.gauss import Equations
-from forcegp.constraints.linearization import Linearization, linearize
+from forcegp.constraints.gauss import Equations, Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.notebook import html_table

@@ -1,13 +1,21 @@
 """Logged motion: the data set and its files, derivatives, noise, selection and splits."""
 
-from forcegp.data.compatible import RobotMismatchWarning
+from forcegp.data.checks import RobotMismatchWarning
 from forcegp.data.dataset import Dataset, NotLoggedError
 from forcegp.data.derivative import SavitzkyGolay
-from forcegp.data.header import DataHeader
-from forcegp.data.impacts import without_marked_impacts
-from forcegp.data.noise import with_noise
-from forcegp.data.selection import farthest_points, select_points, standardized, standardized_inputs
-from forcegp.data.split import Split, complement, split_by_selection, split_by_stretches
+from forcegp.data.fields import DataHeader
+from forcegp.data.selection import (
+    Split,
+    complement,
+    farthest_points,
+    select_points,
+    split_by_selection,
+    split_by_stretches,
+    standardized,
+    standardized_inputs,
+    with_noise,
+    without_marked_impacts,
+)
 from forcegp.data.stream import StreamedDataset
 
 __all__ = [

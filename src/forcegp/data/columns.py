@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forcegp.data.derivative import SavitzkyGolay, differentiate
-from forcegp.data.fields import AXES, JOINT_VECTORS, Fields, component_names
-from forcegp.data.header import DataHeader
+from forcegp.data.fields import AXES, JOINT_VECTORS, DataHeader, Fields, component_names
 from forcegp.data.table import Columns, IgnoredColumnsWarning
 from forcegp.errors import DataError, near_names
 from forcegp.limits import JOINTS, SEGMENT_NUMBER

@@ -11,11 +11,19 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from forcegp.data import check, columns, compatible, table
+from forcegp.data.checks import (
+    check_layout,
+    check_robot,
+    check_tensors,
+    check_values,
+    concatenated,
+    contact_table,
+    row_indices,
+)
+from forcegp.data.columns import as_tensors, parse, unparse
 from forcegp.data.derivative import SavitzkyGolay
-from forcegp.data.fields import JOINT_VECTORS
-from forcegp.data.header import DataHeader
-from forcegp.data.summary import summary, summary_table
+from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields
+from forcegp.data.table import check_ending, read_table, write_parquet
 from forcegp.errors import DataError, UnknownNameError
 from forcegp.notebook import html_table
 from forcegp.robot.model import RobotModel
@@ -23,7 +31,45 @@ from forcegp.robot.model import RobotModel
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from forcegp.plots.panels import Target
+    from forcegp.plots import Target
+
+
+def summary(data: Fields) -> str:
+    """What a data set logs, without the numbers: samples, joints, duration, contacts, further quantities."""
+    robot = f" of {data.header.robot!r}" if data.header.robot else ""
+    parts = [f"{len(data)} samples of {len(data.joint_names)} joints"]
+    if len(data):
+        parts += [_time(data), *_contacts(data)]
+    also = [*data.extras, *data.contact_extras]
+    parts += [f"also logged: {', '.join(also)}"] if also else []
+    kind = str(data.q.dtype).removeprefix("torch.")
+    return f"<Dataset{robot}: {'; '.join(parts)}; {kind} on {data.q.device}>"
+
+
+def _time(data: Fields) -> str:
+    count = int(data.segment.unique().numel())
+    segments = f"{count} segment{'s' if count != 1 else ''}"
+    if not data.header.ordered:
+        return f"selected from {segments}, not in order of time"
+    _, rows = torch.unique_consecutive(data.segment, return_counts=True)
+    last = rows.cumsum(0) - 1
+    return f"{float((data.t[last] - data.t[last - rows + 1]).sum()):.4g} s in {segments}"
+
+
+def _contacts(data: Fields) -> list[str]:
+    closed = [f"{name} ({float(value.double().mean()):.0%} closed)" for name, value in data.contact.items()]
+    return [f"contact {', '.join(closed)}"] if closed else []
+
+
+def summary_table(data: Fields) -> tuple[str, tuple[str, ...], list[tuple[object, ...]], list[str]]:
+    """Title, head, rows and notes of a table with the range of each joint's motion."""
+    names = {"q": "rad, m", "qd": "rad/s, m/s", "tau": "N m, N", "qdd": "rad/s², m/s²"}
+    head = ("joint", *(f"{name} [{unit}]" for name, unit in names.items()))
+    rows: list[tuple[object, ...]] = []
+    for j, joint in enumerate(data.joint_names if len(data) else ()):
+        columns = (getattr(data, name)[:, j] for name in names)
+        rows.append((joint, *(f"{float(x.min()):.3g} … {float(x.max()):.3g}" for x in columns)))
+    return summary(data).strip("<>"), head, rows, list(data.header.provenance)
 
 
 class NotLoggedError(DataError, AttributeError):
@@ -75,12 +121,12 @@ class Dataset:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
-        check.check_tensors(self)
+        check_tensors(self)
         if self.segment is None:
             zero = torch.zeros(self.t.shape, dtype=torch.int64, device=self.t.device)
             object.__setattr__(self, "segment", zero)
-        check.check_layout(self)
-        check.check_values(self)
+        check_layout(self)
+        check_values(self)
 
     def __len__(self) -> int:
         """Number of samples."""
@@ -112,7 +158,7 @@ class Dataset:
         Raises:
             DataError: a mask of another length, or an index that does not exist.
         """
-        index = check.row_indices(rows, len(self), self.t.device)
+        index = row_indices(rows, len(self), self.t.device)
         ordered = self.header.ordered and bool((index[1:] > index[:-1]).all())
         header = self.header.model_copy(update={"ordered": ordered})
         return self._map(lambda value: value[index], header=header)
@@ -143,7 +189,7 @@ class Dataset:
         Raises:
             DataError: the data do not say whether a contact is closed.
         """
-        return compatible.contact_table(self, contacts)
+        return contact_table(self, contacts)
 
     def replace(self, **fields: object) -> Dataset:
         """A data set with some fields changed."""
@@ -186,7 +232,7 @@ class Dataset:
         Raises:
             DataError: joints are missing, unknown or in another order; the hint says what to call.
         """
-        compatible.check_robot(self, robot)
+        check_robot(self, robot)
 
     def plot(
         self, quantity: str | None = None, *, joints: Sequence[str] | None = None, ax: Target = None
@@ -245,7 +291,7 @@ class Dataset:
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
         """
-        return Dataset(**compatible.concatenated(parts))
+        return Dataset(**concatenated(parts))
 
     @classmethod
     def read(
@@ -266,10 +312,10 @@ class Dataset:
         Raises:
             DataError: the file is damaged, or not a valid log; names file, column and row.
         """
-        raw, header = table.read_table(path)
-        fields = columns.parse(str(path), raw, header, differentiate)
+        raw, header = read_table(path)
+        fields = parse(str(path), raw, header, differentiate)
         try:
-            return cls(**columns.as_tensors(fields, dtype, torch.device(device)))
+            return cls(**as_tensors(fields, dtype, torch.device(device)))
         except DataError as error:
             raise DataError.at(str(path), error) from None
 
@@ -293,5 +339,5 @@ class Dataset:
             DataError: the name does not end in `.parquet`.
             OSError: the place cannot be written.
         """
-        table.check_ending(path)
-        table.write_parquet(path, *columns.unparse(self))
+        check_ending(path)
+        write_parquet(path, *unparse(self))

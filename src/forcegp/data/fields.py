@@ -1,13 +1,50 @@
-"""The fields of a data set, as its checks and its files see them."""
+"""What a data set holds and what it says about itself, as its checks and its files see it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from forcegp.data.header import DataHeader
+from forcegp.files import Header
+
+
+class DataHeader(Header):
+    """Header of a data set; every field is optional, so that a foreign log can be read.
+
+    Attributes:
+        dt: sampling period [s].
+        noise_std: standard deviation of the noise on q̈ [rad/s²].
+        filtered: q̈ was computed by a filter, so that its noise is correlated in time; otherwise `noise_std`
+            claims white noise.
+        robot: name of the robot.
+        robot_fingerprint: `RobotModel.fingerprint` of the robot that moved.
+        seed: seed of the random numbers that went into the data.
+        ordered: rows follow time within each segment (not so for points in order of selection).
+        provenance: what was done to the data, oldest first, one line per step.
+        joint_names, contact_names: in the order of the columns; empty where a log does not say.
+    """
+
+    FORMAT: ClassVar[str] = "forcegp-dataset"
+    VERSION: ClassVar[int] = 1
+
+    dt: PositiveFloat | None = None
+    noise_std: NonNegativeFloat | None = None
+    filtered: bool = False
+    robot: str | None = None
+    robot_fingerprint: str | None = None
+    seed: int | None = None
+    ordered: bool = True
+    provenance: tuple[str, ...] = ()
+    joint_names: tuple[str, ...] = ()
+    contact_names: tuple[str, ...] = ()
+
+    def with_step(self, step: str, **fields: object) -> DataHeader:
+        """The header with fields changed and one more line of provenance."""
+        return self.model_copy(update={"provenance": (*self.provenance, step), **fields})
+
 
 JOINT_VECTORS = ("q", "qd", "tau", "qdd")
 """The joint vectors that every data set holds."""

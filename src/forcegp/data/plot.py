@@ -9,9 +9,17 @@ from torch import Tensor
 
 from forcegp.data.fields import AXES, JOINT_VECTORS, Fields
 from forcegp.errors import UnknownNameError
-from forcegp.plots.panels import Curve, Panel, Target, chosen, draw_panels
-from forcegp.plots.style import CYCLE, MEASURED, axis_label
-from forcegp.plots.timeline import Timeline
+from forcegp.plots import (
+    CYCLE,
+    MEASURED,
+    Curve,
+    Panel,
+    Target,
+    Timeline,
+    axis_label,
+    chosen,
+    draw_panels,
+)
 
 
 def plot(

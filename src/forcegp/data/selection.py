@@ -1,8 +1,16 @@
-"""Farthest point sampling: few points that cover the inputs of a log (section 5.3 of the paper)."""
+"""How a log is prepared for learning: points selected, stretches held out, impacts left out, noise added.
+
+Farthest point sampling selects few points that cover the inputs of a log (section 5.3 of the paper).
+Neighbouring samples of a trajectory are almost the same point. Where training points are drawn from the
+same stretch as the test rows, as in the paper, the test error says how well a model interpolates; held-out
+stretches say how well it predicts motion that it has not seen.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float, Int
@@ -115,3 +123,169 @@ def select_points(
         return rows[torch.linspace(0, len(rows) - 1, count, dtype=torch.float64).round().long()]
     order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
     return rows[order[:count].to(rows.device)]
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Rows to train on and rows to test on.
+
+    Attributes:
+        train: `(count,)` row numbers in the order of selection.
+        test: row numbers, increasing.
+        stretches: the held-out stretches as (first row, one past the last).
+    """
+
+    train: Int[Tensor, " count"]
+    test: Int[Tensor, " rest"]
+    stretches: tuple[tuple[int, int], ...] = ()
+
+
+def complement(rows: Tensor, n: int) -> Tensor:
+    """The row numbers below n that are not among `rows`, increasing."""
+    keep = torch.ones(n, dtype=torch.bool, device=rows.device)
+    keep[rows] = False
+    return torch.nonzero(keep)[:, 0]
+
+
+def split_by_selection(
+    data: Dataset,
+    count: int,
+    *,
+    method: str = "farthest",
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> Split:
+    """The paper's split: training points selected from the whole log, the rest for testing.
+
+    Raises:
+        DataError: there are fewer distinct points.
+    """
+    train = select_points(data, count, method=method, seed=seed, progress=progress)
+    return Split(train, complement(train, len(data)))
+
+
+def split_by_stretches(
+    data: Dataset,
+    count: int,
+    *,
+    stretch: float = 3.0,
+    fraction: float = 0.2,
+    margin: float = 0.0,
+    method: str = "farthest",
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> Split:
+    """Hold out whole stretches of motion, and select training points from the rest only.
+
+    Each trajectory is cut into stretches of equal duration, as close to `stretch` as fits; of all of
+    them, a fraction is drawn at random.
+
+    Args:
+        data: a log in order of time.
+        count: how many training points.
+        stretch: duration of a held-out stretch [s].
+        fraction: part of the stretches that is held out.
+        margin: time beside each held-out stretch from which no training point is taken either [s].
+        method: see `select_points`.
+        seed: of the draw of stretches (and of a random selection).
+        progress: called with the number of points chosen so far.
+
+    Returns:
+        Training rows, all rows of the held-out stretches, and the stretches. Rows in a margin, and rows
+        outside the stretches that were not selected, are in neither.
+
+    Raises:
+        DataError: the log is not in order of time, is too short to be cut, or leaves too few points.
+    """
+    blocks = _stretches(data, stretch)
+    held_count = max(1, round(fraction * len(blocks)))
+    if not (0.0 < fraction < 1.0 and margin >= 0.0) or held_count >= len(blocks):
+        raise DataError(
+            "the log cannot be split into held-out and training stretches",
+            expected="a fraction between 0 and 1 that leaves at least one of the stretches, a margin ≥ 0",
+            got=f"fraction {fraction}, margin {margin} s, {len(blocks)} stretches of about {stretch} s",
+            hint="use shorter stretches or a longer log",
+        )
+    order = torch.randperm(len(blocks), generator=torch.Generator().manual_seed(seed))
+    held = sorted(blocks[i] for i in order[:held_count].tolist())
+    test = torch.zeros(len(data), dtype=torch.bool, device=data.device)
+    near = torch.zeros_like(test)
+    for first, last in held:
+        test[first:last] = True
+        same = data.segment == data.segment[first]
+        near |= same & (data.t >= data.t[first] - margin) & (data.t <= data.t[last - 1] + margin)
+    candidates = torch.nonzero(~near)[:, 0]
+    train = select_points(data, count, method=method, seed=seed, candidates=candidates, progress=progress)
+    return Split(train, torch.nonzero(test)[:, 0], tuple(held))
+
+
+def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
+    """Row ranges of the trajectories cut into parts of equal duration."""
+    if not data.header.ordered:
+        raise DataError(
+            "held-out stretches need a log in order of time",
+            got="points in order of selection",
+            hint="split the log before selecting points from it",
+        )
+    if not 0.0 < stretch < float("inf"):
+        raise DataError("the duration of a stretch is not valid", expected="a positive time [s]", got=stretch)
+    _, counts = torch.unique_consecutive(data.segment, return_counts=True)
+    blocks, first = [], 0
+    for rows in counts.tolist():
+        t = data.t[first : first + rows]
+        duration = (t[-1] - t[0]).item()
+        parts = min(max(1, round(duration / stretch)), rows)
+        inner = t[0] + torch.arange(1, parts, dtype=t.dtype, device=t.device) * (duration / parts)
+        cuts = [0, *torch.searchsorted(t.contiguous(), inner).tolist(), rows]
+        blocks += [(first + a, first + b) for a, b in pairwise(cuts) if b > a]
+        first += rows
+    return blocks
+
+
+IMPACT = "impact"
+"""Mask by contact, 1 near a switch, as `forcegp import` writes it."""
+
+
+def without_marked_impacts(data: Dataset) -> Dataset:
+    """The rows that no mask `impact.<contact>` marks; all rows of a log without masks.
+
+    Args:
+        data: a log in order of time, or a part of one.
+
+    Returns:
+        The log without the marked rows, with a step in its provenance if there are any.
+    """
+    marked = torch.zeros(len(data), dtype=torch.bool, device=data.t.device)
+    for mask in data.contact_extras.get(IMPACT, {}).values():
+        marked |= mask > 0.0
+    count = int(marked.sum())
+    if count == 0:
+        return data
+    return data[torch.nonzero(~marked)[:, 0]].with_step(f"left out {count} rows at impacts")
+
+
+def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset:
+    """Gaussian noise on q̈, beside the noise-free value: q̈ = q̈_clean + std ε, ε ~ N(0, I).
+
+    Where the data hold `qdd_clean`, the noise is added to that, so that it never adds up.
+
+    Args:
+        data: the log.
+        std: standard deviation [rad/s², m/s²].
+        generator: source of the random numbers; its seed is recorded in the header.
+
+    Raises:
+        DataError: the standard deviation is negative or not finite.
+    """
+    if not 0.0 <= std < float("inf"):
+        raise DataError("the noise is not valid", expected="a finite standard deviation ≥ 0", got=std)
+    clean = data.extras.get("qdd_clean", data.qdd)
+    noise = torch.randn(clean.shape, dtype=clean.dtype, device=generator.device, generator=generator)
+    header = data.header.with_step(
+        f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}",
+        noise_std=std,
+        filtered=False,
+    )
+    return data.replace(
+        qdd=clean + std * noise.to(clean.device), extras={**data.extras, "qdd_clean": clean}, header=header
+    )

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
-from forcegp.data.header import DataHeader
+from forcegp.data.fields import DataHeader
 from forcegp.errors import DataError, near_names
 from forcegp.files import atomic_file
 from forcegp.resources import announce_memory

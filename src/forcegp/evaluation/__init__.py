@@ -1,5 +1,243 @@
 """How good a model is: errors and uncertainty by joint, trivial predictors beside it, and a verdict."""
 
-from forcegp.evaluation.evaluation import Evaluation, evaluate
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
+from forcegp.errors import DataError
+from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines
+from forcegp.evaluation.predicted import (
+    CHUNK_STATES,
+    MultiplierScore,
+    Predicted,
+    Progress,
+    multiplier_scores,
+    predict_all,
+    sensed_scores,
+)
+from forcegp.evaluation.scores import (
+    Errors,
+    JointErrors,
+    PredictorScores,
+    Uncertainty,
+    Verdict,
+    moving_joints,
+    nlpd,
+    sentence,
+    verdicts,
+)
+from forcegp.models.base import Predictor
 
 __all__ = ["Evaluation", "evaluate"]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The predictions of a model against a data set.
+
+    Attributes:
+        kind: of the model.
+        samples: how many were predicted.
+        joint_names: the joints, in the order of everything that is given by joint.
+        noisy: errors against the measured accelerations.
+        clean: errors against the noise-free ones, `None` if they are not logged.
+        uncertainty: coverage and density, `None` for a model without a covariance or unknown noise.
+        residual, residual_max: mean and largest |A q̈ − b| of the predicted mean over closed contacts
+            [m/s²], `None` without contacts.
+        noise_std: assumed for the measured accelerations, one per joint.
+        seconds_per_state: time to predict, including the covariance if there is one.
+        predictors: errors by joint of the model and of the trivial predictors.
+        verdicts: the model against each trivial predictor; empty if there are too few samples.
+        multipliers: λ against the logged one, for models of forces and logs that contain it.
+        sensed: the same with the log's force sensor as a measurement at each state, for models that were
+            fitted to that sensor.
+    """
+
+    kind: str
+    samples: int
+    joint_names: tuple[str, ...]
+    noisy: Errors
+    clean: Errors | None
+    uncertainty: Uncertainty | None
+    residual: float | None
+    residual_max: float | None
+    noise_std: tuple[float, ...] | None
+    seconds_per_state: float
+    predictors: tuple[PredictorScores, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()
+    multipliers: tuple[MultiplierScore, ...] = ()
+    sensed: tuple[MultiplierScore, ...] = ()
+
+    @property
+    def noisy_mae(self) -> float:
+        """Mean absolute error against measured accelerations, the paper's measure."""
+        return self.noisy.mae
+
+    @property
+    def clean_mae(self) -> float | None:
+        """Mean absolute error against noise-free accelerations."""
+        return None if self.clean is None else self.clean.mae
+
+    @property
+    def verdict(self) -> str:
+        """Whether the model is better than the trivial predictors, in one sentence."""
+        return sentence(self.verdicts)
+
+    @property
+    def coverage_noisy(self) -> float | None:
+        """±2σ coverage of measured accelerations."""
+        return None if self.uncertainty is None else self.uncertainty.coverage_noisy
+
+    @property
+    def coverage_clean(self) -> float | None:
+        """±2σ coverage of noise-free accelerations."""
+        return None if self.uncertainty is None else self.uncertainty.coverage_clean
+
+    @property
+    def calibration(self) -> dict[str, float] | None:
+        """Coverage of the central interval of each level."""
+        return None if self.uncertainty is None else self.uncertainty.calibration
+
+    @property
+    def nlpd(self) -> float | None:
+        """Mean negative log predictive density [nats]."""
+        return None if self.uncertainty is None else self.uncertainty.nlpd
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything in JSON types."""
+        texts = [verdict.text() for verdict in self.verdicts]
+        return asdict(self) | {"verdict": self.verdict, "verdict_texts": texts}
+
+    def summary(self) -> dict[str, float | int | str | None]:
+        """The scores over all joints, by name."""
+        return {
+            "kind": self.kind,
+            "samples": self.samples,
+            "noisy_mae": self.noisy.mae,
+            "noisy_rmse": self.noisy.rmse,
+            "clean_mae": self.clean_mae,
+            "clean_rmse": None if self.clean is None else self.clean.rmse,
+            "coverage_noisy": self.coverage_noisy,
+            "coverage_clean": self.coverage_clean,
+            "nlpd": self.nlpd,
+            "residual": self.residual,
+            "residual_max": self.residual_max,
+            "seconds_per_state": self.seconds_per_state,
+        }
+
+
+def evaluate(
+    model: Predictor,
+    data: Dataset,
+    *,
+    train: Dataset | None = None,
+    compare: bool = True,
+    system: ConstrainedSystem | None = None,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Predict the accelerations of a data set and compare with them, and with trivial predictors.
+
+    Args:
+        model: a fitted model.
+        data: states and measured accelerations, and noise-free ones as `qdd_clean` if known.
+        train: data that the trivial predictors are fitted to; by default each half of `data` (in order
+            of its rows) is predicted by those fitted to the other half.
+        compare: whether to fit the trivial predictors at all.
+        system: robot and contacts for the constraint residual, the torque errors and the trivial
+            predictors; by default those of the model, before it learned any parameters of theirs.
+        progress: called with the number of states predicted and their total number.
+
+    Returns:
+        Scores over all joints and by joint, and the verdict.
+
+    Example:
+        >>> import forcegp, torch
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
+        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
+        >>> t = torch.arange(20, dtype=torch.float64)
+        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+        >>> fit = forcegp.StructuredGP(system, mean="analytical", noise_std=0.1).fit(data[:10])
+        >>> evaluation = evaluate(fit, data[10:])
+        >>> evaluation.samples
+        10
+
+    Raises:
+        DataError: the data are empty, or their joints are not the robot's.
+        ModelError: the model has not been fitted.
+        UnknownNameError: a contact is not in the data.
+    """
+    if len(data) == 0:
+        raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
+    data.check_robot(getattr(model, "specified", model.system).robot)
+    model.system.announce_states(len(data), 2.0, f"an evaluation on {len(data):,} samples")
+    before = system or getattr(model, "specified", model.system)
+    predicted = predict_all(model, data, system or model.system, progress)
+    clean, noise_std = data.extras.get("qdd_clean"), predicted.noise_std
+    spread = None
+    if predicted.variance is not None and noise_std is not None:
+        spread = Uncertainty.of(predicted.mean, predicted.variance, noise_std, data.qdd, clean)
+    residual = predicted.residual
+    scores = _predictors(predicted, spread, before, data, train) if compare else ()
+    return Evaluation(
+        kind=model.kind,
+        samples=len(data),
+        joint_names=data.joint_names,
+        noisy=Errors.of(predicted.mean - data.qdd),
+        clean=None if clean is None else Errors.of(predicted.mean - clean),
+        uncertainty=spread,
+        residual=float(residual.mean()) if len(residual) else None,
+        residual_max=float(residual.max()) if len(residual) else None,
+        noise_std=None if noise_std is None else tuple(noise_std.square().mean(0).sqrt().tolist()),
+        seconds_per_state=predicted.seconds / len(data),
+        predictors=scores,
+        verdicts=verdicts(scores, data.joint_names) if scores else (),
+        multipliers=multiplier_scores(model, data, CHUNK_STATES) if model.force_field() else (),
+        sensed=sensed_scores(model, data, CHUNK_STATES),
+    )
+
+
+def _predictors(
+    predicted: Predicted,
+    spread: Uncertainty | None,
+    system: ConstrainedSystem,
+    data: Dataset,
+    train: Dataset | None,
+) -> tuple[PredictorScores, ...]:
+    """Errors by joint of the model and of the trivial predictors, in torque and in acceleration."""
+    moving = moving_joints(data.qd)
+
+    def score(name: str, error: Tensor, torque: Tensor, density: float | None) -> PredictorScores:
+        by_joint = JointErrors.of(torque, data.tau, moving), JointErrors.of(error, data.qdd, moving)
+        return PredictorScores(name, *by_joint, density)
+
+    error = predicted.mean - data.qdd
+    torque = as_torque(system, data.q, error)
+    found = [score("model", error, torque, None if spread is None else spread.nlpd)]
+    for name, (error, torque, std) in _trivial(system, data, train).items():
+        certain = bool((std == 0.0).any())
+        found.append(score(name, error, torque, None if certain else nlpd(error, std)))
+    return tuple(found)
+
+
+def _trivial(
+    system: ConstrainedSystem, data: Dataset, train: Dataset | None
+) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
+    """Errors, errors as torques and standard deviations, `(n, nq)`, never on their own training data."""
+    half = len(data) // 2
+    parts = [(train, data)] if train is not None else [(data[half:], data[:half]), (data[:half], data[half:])]
+    found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
+    for known, new in parts:
+        if len(known) < FEWEST_TRAINING:
+            return {}
+        for baseline in baselines(system, known):
+            error = baseline.predict(new) - new.qdd
+            torque = as_torque(baseline.system, new.q, error)
+            found.setdefault(baseline.name, []).append((error, torque, baseline.std.expand_as(error)))
+    return {name: tuple(map(torch.cat, zip(*rows, strict=True))) for name, rows in found.items()}  # pyright: ignore[reportReturnType]

@@ -1,4 +1,8 @@
-"""Predictions at all samples of a data set, in chunks that bound the memory."""
+"""Predictions at all samples of a data set, in chunks that bound the memory.
+
+The predicted multiplier is compared with a logged one, without and with the log's force sensor as a
+measurement.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,9 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.evaluation.scores import share
 from forcegp.models.base import Predictor
+from forcegp.models.sensed import force_from_sensor, has_sensor
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 
@@ -91,3 +97,103 @@ def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
     if noise is None:
         return None
     return torch.as_tensor(noise, dtype=data.dtype, device=data.device).expand(len(data), data.nq)
+
+
+@dataclass(frozen=True)
+class MultiplierScore:
+    """The predicted multiplier λ of one contact against a logged one, over samples in contact.
+
+    Attributes:
+        contact: name.
+        samples: in contact.
+        bias, spread: mean and standard deviation of predicted less logged λ [N].
+        correlation: of predicted and logged λ, `None` if either is constant.
+        coverage: share of logged values within ±2σ, noise of the torque included; `None` without a
+            covariance.
+    """
+
+    contact: str
+    samples: int
+    bias: float
+    spread: float
+    correlation: float | None
+    coverage: float | None
+
+
+@torch.no_grad()
+def multiplier_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[MultiplierScore, ...]:
+    """Compare λ with what a simulator or another sensor logged as `multiplier`, contact by contact.
+
+    Args:
+        model: a fitted model that predicts forces.
+        data: with `multiplier` of some contacts of the model that have one row each.
+        chunk: states predicted at a time.
+
+    Returns:
+        One score per contact with a logged multiplier and at least two samples in contact.
+    """
+    names = model.system.contact_names
+    if not _comparable(model, data):
+        return ()
+    fit, active, means, stds = structured_fit_of(model), data.active(names), [], []
+    for i in range(0, len(data), chunk):
+        part, closed = data[i : i + chunk], active[i : i + chunk]
+        states = part.q, part.qd, part.tau
+        predicted = model.predict(*states, "multiplier", active=closed)
+        means.append(predicted.mean)
+        variance = predicted.variance
+        if variance is not None and fit is not None:
+            variance = variance + fit.noise_variance(*states, "multiplier", closed, sensor=False)
+        stds += [] if variance is None else [variance.clamp(min=0.0).sqrt()]
+    return _scores(data, names, torch.cat(means), torch.cat(stds) if stds else None)
+
+
+@torch.no_grad()
+def sensed_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[MultiplierScore, ...]:
+    """The same where the log's force sensor is a measurement at the predicted states too.
+
+    Args:
+        model, data, chunk: see `multiplier_scores`.
+
+    Returns:
+        Nothing for a model that was not fitted to a sensor, or a log without one.
+    """
+    fit = structured_fit_of(model)
+    if fit is None or "multiplier" not in fit.noise or not _comparable(model, data):
+        return ()
+    if not has_sensor(data, fit.system):
+        return ()
+    parts = [force_from_sensor(fit, data[i : i + chunk]) for i in range(0, len(data), chunk)]
+    mean, std = (torch.cat(part) for part in zip(*parts, strict=True))
+    return _scores(data, model.system.contact_names, mean[:, None], std[:, None])
+
+
+def _comparable(model: Predictor, data: Dataset) -> bool:
+    """Whether λ has one row per contact and was logged for one of them."""
+    logged, names = data.contact_extras.get("multiplier", {}), model.system.contact_names
+    return model.system.m == len(names) and any(name in logged for name in names)
+
+
+def _scores(
+    data: Dataset, names: tuple[str, ...], mean: Tensor, std: Tensor | None
+) -> tuple[MultiplierScore, ...]:
+    """Scores of λ `(n, contacts)` over the samples in which each contact is closed."""
+    logged, active = data.contact_extras["multiplier"], data.active(names)
+    return tuple(
+        _score(name, mean[rows, i], None if std is None else std[rows, i], logged[name][rows])
+        for i, (name, rows) in enumerate(zip(names, active.T, strict=True))
+        if name in logged and int(rows.sum()) >= 2
+    )
+
+
+def _score(contact: str, mean: Tensor, std: Tensor | None, logged: Tensor) -> MultiplierScore:
+    error = mean - logged
+    varies = float(mean.std()) > 0.0 and float(logged.std()) > 0.0
+    return MultiplierScore(
+        contact=contact,
+        samples=len(error),
+        bias=float(error.mean()),
+        spread=float(error.std()),
+        correlation=float(torch.corrcoef(torch.stack([mean, logged]))[0, 1]) if varies else None,
+        coverage=None if std is None else share(error.abs() <= 2.0 * std),
+    )

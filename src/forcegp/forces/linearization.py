@@ -1,6 +1,6 @@
 """The acceleration and the multiplier that a force field gives, with their derivatives by state and torque.
 
-A system linearized at a fixed force (`constraints/linearization.py`) lacks how the force changes. With
+A system linearized at a fixed force (`constraints/gauss.py`) lacks how the force changes. With
 F = Q̄ − Q_C − Q_G − Q_D, the part of the impressed forces that the robot file does not know,
 
     dq̈/dx = ∂q̈/∂x + H ∂F/∂x,   dλ/dx = ∂λ/∂x − Lᵀ ∂F/∂x   for x = q, q̇, τ.

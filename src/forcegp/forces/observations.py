@@ -12,7 +12,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.data.compatible import check_robot, contact_table
+from forcegp.data.checks import check_robot, contact_table
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.priors.base import ForcePrior

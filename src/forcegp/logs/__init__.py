@@ -1,16 +1,212 @@
-"""Logs of other programs: readers, mappings of columns, clocks, units, derivatives, contact."""
+"""Logs of other programs: readers, mappings of columns, clocks, units, derivatives, contact.
 
-from forcegp.logs.importing import Imported, import_log, read_log
-from forcegp.logs.mapping import Mapping, load_mapping, parse_mapping
-from forcegp.logs.report import Finding, Report
+`read_log` reads a log file of any format as a data set of a robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data import DataHeader, Dataset
+from forcegp.errors import DataError
+from forcegp.logs.clock import usual_step
+from forcegp.logs.contact import Evidence, detect, per_contact
+from forcegp.logs.gather import gather
+from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
+from forcegp.logs.signals import ImportFinding, ImportReport, Signals
+from forcegp.logs.smoothing import add_derivatives, even_clock, impact_mask
+from forcegp.resources import announce_memory
+from forcegp.robot import RobotModel
+from forcegp.scene import Scene, load_scene
 
 __all__ = [
-    "Finding",
+    "ImportFinding",
+    "ImportReport",
     "Imported",
     "Mapping",
-    "Report",
     "import_log",
     "load_mapping",
     "parse_mapping",
     "read_log",
 ]
+
+NUMBERS = 16
+"""Upper bound on the numbers of one joint in one row that are held at a time; ten were measured."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A log that has been imported.
+
+    Attributes:
+        data: the data set.
+        report: what was found and done.
+        contacts: the evidence for each contact that was detected.
+    """
+
+    data: Dataset
+    report: ImportReport
+    contacts: tuple[Evidence, ...] = ()
+
+
+def read_log(
+    path: str | Path,
+    scene: Scene | ConstrainedSystem | RobotModel | str | Path,
+    mapping: Mapping | str | Path | None = None,
+) -> Dataset:
+    """Read a log of any known format as a data set of a robot; see `import_log`.
+
+    Args:
+        path: the log, a file or a folder.
+        scene: a scene or its file, a system, or a robot.
+        mapping: what the columns mean: a mapping, its file, or the name of a bundled one. Without it, the
+            columns must be named as in a data set or as ROS names joint states.
+
+    Returns:
+        The log in SI units, in the robot's joint order.
+
+    Raises:
+        DataError: the log cannot be read or used; names column and rows.
+        MappingError: the mapping is not valid or does not fit the log.
+        MissingDependencyError: the format's reader is not installed.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "run.csv"
+    >>> rows = "\\n".join(f"{k},{k / 10},0,{k / 5},0" for k in range(40))
+    >>> _ = file.write_text("ms,a,b,Ta,Tb\\n" + rows)
+    >>> from forcegp.logs import parse_mapping
+    >>> toml = '''
+    ... time = { column = "ms", unit = "ms" }
+    ... joints = { shoulder = "a", elbow = "b" }
+    ... position = { column = "{joint}", unit = "deg" }
+    ... torque = { column = "T{joint}", unit = "Nm" }
+    ... '''
+    >>> import forcegp
+    >>> robot = forcegp.load_robot("double_pendulum")
+    >>> data = read_log(file, robot, parse_mapping(toml.encode(), "mapping"))
+    >>> round(float(data.qd[20, 0]), 3)  # 0.1 degrees per millisecond
+    1.745
+    """
+    return import_log(path, scene, mapping).data
+
+
+def import_log(
+    path: str | Path,
+    scene: Scene | ConstrainedSystem | RobotModel | str | Path,
+    mapping: Mapping | str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Imported:
+    """Read a log, and say what was found in it and done to it.
+
+    Args:
+        path, scene, mapping: see `read_log`.
+        progress: called while the file is read, with the work done and the total.
+
+    Raises:
+        DataError, MappingError, MissingDependencyError: see `read_log`.
+    """
+    system = system_of(scene)
+    robot = system.robot
+    if mapping is None:
+        known = default_mapping(path, system)
+    else:
+        known = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
+    report = ImportReport(str(path))
+    report.did(f"read {Path(path).name} by mapping {Path(known.source).name}")
+    try:
+        signals = gather(path, known, robot.joint_names, report, progress)
+        announce_memory(_bytes(signals), f"importing {len(signals):,} rows")
+        even_clock(signals, known.sections.time.period, report)
+        found = _contacts(signals, system, known, report)
+        std = add_derivatives(signals, known.sections.derivatives, report)
+        data = _dataset(signals, std, known, system, report)
+    except DataError as error:
+        raise error if str(path) in error.message else DataError.at(str(path), error) from None
+    return Imported(data, report, tuple(found))
+
+
+def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> ConstrainedSystem:
+    """The robot with its contacts, however it is given."""
+    if isinstance(scene, ConstrainedSystem):
+        return scene
+    if isinstance(scene, RobotModel):
+        return ConstrainedSystem(scene)
+    return (scene if isinstance(scene, Scene) else load_scene(scene)).system()
+
+
+def _bytes(signals: Signals) -> int:
+    return 8 * NUMBERS * len(signals.joint_names) * len(signals)
+
+
+def _contacts(
+    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
+) -> list[Evidence]:
+    """Find the state of each contact; λ needs accelerations, which are first computed across the switches."""
+    if not any(section.source == "multiplier" for section in mapping.sections.contact.values()):
+        return detect(signals, system, mapping, report)
+    copies = {name: value.copy() for name, value in signals.vectors.items()}
+    trial = replace(signals, vectors=copies, contact={}, row=np.arange(len(signals)))
+    add_derivatives(trial, mapping.sections.derivatives, ImportReport(report.source))
+    kept = np.zeros(len(signals), dtype=bool)
+    kept[trial.row] = True
+    signals.keep(kept)
+    signals.segment, trial.row, trial.contact = trial.segment, signals.row, signals.contact
+    found = detect(trial, system, mapping, report)
+    signals.contact = trial.contact
+    return found
+
+
+def _dataset(
+    signals: Signals,
+    std: np.ndarray | None,
+    mapping: Mapping,
+    system: ConstrainedSystem,
+    report: ImportReport,
+) -> Dataset:
+    """The data set of finished signals."""
+    robot = system.robot
+    settings = mapping.sections.derivatives
+    dt = usual_step(signals.t)
+    margin = settings.impact_margin if settings.impact_margin is not None else 0.5 * settings.window * dt
+    extras = {} if std is None else {"qdd_std": _tensor(std)}
+    masks = impact_mask(signals, margin)
+    contact = {name: torch.from_numpy(value) for name, value in signals.contact.items()}
+    impact = {name: torch.from_numpy(value.astype(np.float64)) for name, value in masks.items()}
+    contact_extras = {"impact": impact} if impact else {}
+    if "wrench" in signals.vectors and contact:
+        sensed = per_contact(signals, system, mapping)
+        contact_extras |= {
+            name: {key: _tensor(value) for key, value in group.items()} for name, group in sensed.items()
+        }
+        report.did("took the tool's weight off the wrench and carried it to the contact")
+    vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
+    header = DataHeader(
+        dt=dt,
+        noise_std=None if std is None else float(np.sqrt(np.mean(std**2))),
+        filtered=std is not None,
+        robot=robot.name,
+        robot_fingerprint=robot.fingerprint,
+        provenance=tuple(report.steps),
+        joint_names=robot.joint_names,
+        contact_names=tuple(signals.contact),
+    )
+    return Dataset(
+        t=_tensor(signals.t),
+        **vectors,
+        joint_names=robot.joint_names,
+        contact=contact,
+        extras=extras,
+        contact_extras=contact_extras,
+        segment=torch.from_numpy(signals.segment),
+        header=header,
+    )
+
+
+def _tensor(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values))

@@ -1,20 +1,147 @@
-"""Intervals in which a contact is closed, with the evidence for them."""
+"""Intervals in which a contact is closed, with the evidence for them.
+
+The evidence is the distance to the surface, a measured force, or λ of the rigid body.
+
+A force-torque sensor's reading becomes force and moment of the environment at the contact, in the world. The
+sensor sits in a frame of the robot, at p_S with rotation R. With f and m its reading as the environment and
+gravity act on the robot beyond it, the tool's weight m_T g at its centre of mass p_T is taken off and the
+moment carried to the contact point p_C:
+
+    F = R f − m_T g,   M = R m − (p_T − p_S) × m_T g − (p_C − p_S) × F.
+
+The tool's inertial force m_T p̈_T is not taken off: it is small for light tools and slow motion.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
-from forcegp.logs import evidence
-from forcegp.logs.mapping import Mapping
-from forcegp.logs.report import Report
-from forcegp.logs.sections import ContactSection
-from forcegp.logs.signals import Array, Signals, runs
+from forcegp.logs.mapping import ContactSection, Mapping, WrenchSection
+from forcegp.logs.signals import Array, ImportReport, Signals, runs
+from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
+
+CHUNK = 1 << 12
+"""Rows that are computed at a time."""
+
+
+def _chunks(signals: Signals, *names: str) -> Iterator[tuple[slice, list[torch.Tensor]]]:
+    """Blocks of rows, with their vectors as tensors."""
+    for start in range(0, len(signals), CHUNK):
+        rows = slice(start, start + CHUNK)
+        yield rows, [torch.from_numpy(np.ascontiguousarray(signals.vectors[name][rows])) for name in names]
+
+
+def at_sensor(signals: Signals, robot: RobotModel, mapping: Mapping) -> tuple[Array, Array]:
+    """Force, and moment about the sensor, in world axes, without the tool's weight; `(n, 3)` each [N], [N m].
+
+    Raises:
+        MappingError: the sensor's frame is none of the robot.
+    """
+    section = mapping.sections.wrench
+    assert section is not None
+    if section.frame not in robot.frame_names:
+        listing = ", ".join(robot.frame_names)
+        raise mapping.error(("wrench", "frame"), "no such frame of the robot", listing, repr(section.frame))
+    force, moment = np.empty((len(signals), 3)), np.empty((len(signals), 3))
+    for rows, (q, reading) in _chunks(signals, "q", "wrench"):
+        f, m = contact_wrench(robot, section, q, reading)
+        force[rows], moment[rows] = f.numpy(), m.numpy()
+    return force, moment
+
+
+def contact_wrench(
+    robot: RobotModel, section: WrenchSection, q: torch.Tensor, reading: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Force and moment about the sensor that the environment exerts on the robot, in world axes.
+
+    Args:
+        robot: the robot.
+        section: the sensor.
+        q: `(n, nq)` positions.
+        reading: `(n, 6)` force and moment in the sensor's axes or the world's [N], [N m].
+    """
+    rotation, _ = kinematics.frame_pose(robot, q, section.frame)
+    sign = 1.0 if section.acts_on == "robot" else -1.0
+    force, moment = sign * reading[:, :3], sign * reading[:, 3:]
+    if section.axes == "frame":
+        force = (rotation @ force[..., None])[..., 0]
+        moment = (rotation @ moment[..., None])[..., 0]
+    weight = section.tool_mass * robot.gravity
+    arm = rotation @ torch.tensor(section.tool_com, dtype=q.dtype)
+    return force - weight, moment - torch.linalg.cross(arm, weight.expand_as(arm))
+
+
+def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
+    """The sensor's force and moment at each contact with a surface, `F_sensor` and `M_sensor` of a data set.
+
+    Raises:
+        MappingError: the sensor's frame is none of the robot.
+    """
+    force, moment = at_sensor(signals, system.robot, mapping)
+    section = mapping.sections.wrench
+    assert section is not None
+    touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
+    moments = {contact.name: np.empty_like(moment) for contact in touching}
+    for rows, (q,) in _chunks(signals, "q"):
+        _, sensor = kinematics.frame_pose(system.robot, q, section.frame)
+        for contact in touching:
+            arm = (_tip(system, contact, q) - sensor).numpy()
+            moments[contact.name][rows] = moment[rows] - np.cross(arm, force[rows])
+    return {"F_sensor": dict.fromkeys(moments, force), "M_sensor": moments}
+
+
+def surface_distance(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
+    """c(q) `(n,)`: how far the touching point is from the surface [m]."""
+    c = np.empty(len(signals))
+    for rows, (q,) in _chunks(signals, "q"):
+        c[rows] = contact.center_surface.value(_tip(system, contact, q)).numpy()
+    return c
+
+
+def normal_force(
+    signals: Signals, system: ConstrainedSystem, mapping: Mapping, contact: SurfaceContact
+) -> Array:
+    """n·F `(n,)`: the sensor's force along the surface's normal [N]."""
+    force, _ = at_sensor(signals, system.robot, mapping)
+    along = np.empty(len(signals))
+    for rows, (q,) in _chunks(signals, "q"):
+        normal = contact.surface.gradient(_tip(system, contact, q)).numpy()
+        along[rows] = (normal * force[rows]).sum(axis=1)
+    return along
+
+
+def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
+    """λ `(n,)` of the rigid-body model [N], zero in free motion where the model is right.
+
+    M q̈ − Q is the generalized force that the known forces do not explain, and
+    λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) the part of it along the surface's normal.
+
+    Args:
+        signals: with `qd`, `qdd` and `tau`.
+        system: the robot with its contacts.
+        contact: which of them.
+    """
+    alone = ConstrainedSystem(system.robot, [contact])
+    result = np.empty(len(signals))
+    for rows, (q, qd, qdd, tau) in _chunks(signals, "q", "qd", "qdd", "tau"):
+        eom = alone.equations(q, qd)
+        rest = qdd - eom.free_acceleration(eom.Q_K + tau)
+        result[rows] = (eom.constraint_inertia @ (eom.A @ rest[..., None]))[:, 0, 0].numpy()
+    return result
+
+
+def _tip(system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor) -> torch.Tensor:
+    return kinematics.point_position(system.robot, q, contact.frame, tuple(contact.point))
+
 
 SEPARATION = 6.0
 """Least distance between the two levels of force, in standard deviations of the open one."""
@@ -66,7 +193,9 @@ class Evidence:
         )
 
 
-def detect(signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: Report) -> list[Evidence]:
+def detect(
+    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
+) -> list[Evidence]:
     """Set `signals.contact` for every contact of the scene.
 
     Args:
@@ -125,16 +254,16 @@ def _detect(
     section: ContactSection,
 ) -> tuple[NDArray[np.bool_], Evidence]:
     if section.source == "distance":
-        values = evidence.distance(signals, system, contact)
+        values = surface_distance(signals, system, contact)
         high = section.threshold if section.threshold is not None else touching(values)
         low = section.release if section.release is not None else high
         below = section.threshold if section.threshold is not None else TOUCHING
         closed = hysteresis(-values, -high, -low, signals.segment) & (values >= -below)
     else:
         if section.source == "wrench":
-            values = evidence.normal_force(signals, system, mapping, contact)
+            values = normal_force(signals, system, mapping, contact)
         else:
-            values = evidence.multiplier(signals, system, contact)
+            values = multiplier(signals, system, contact)
         high, low = force_levels(values, contact.name, section)
         closed = hysteresis(values, high, low, signals.segment)
     merged = _merge_short(closed, signals, section.shortest)

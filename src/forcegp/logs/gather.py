@@ -1,4 +1,10 @@
-"""From a table and its mapping to quantities in SI units, in the robot's joint order."""
+"""From a table and its mapping to quantities in SI units, in the robot's joint order.
+
+Motor side and joint side, currents and torques, signs and offsets are one factor per joint. A reading r is
+y = s k (r − o): o what the sensor shows at zero, in the unit of the column; s = ±1; and k the unit, times the
+torque constant K_t for a current. Through a gear of ratio N, a motor turns N times as fast as its joint and a
+joint bears N times the motor's torque: q = q_m / N, τ = N τ_m.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +14,45 @@ from pathlib import Path
 import numpy as np
 
 from forcegp.errors import DataError
-from forcegp.logs import clock, resample, torque, units
+from forcegp.logs import units
+from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
 from forcegp.logs.mapping import Mapping
 from forcegp.logs.readers import read
-from forcegp.logs.report import Report, listed
-from forcegp.logs.signals import Array, Signals
+from forcegp.logs.signals import Array, ImportReport, Signals, listed
 from forcegp.logs.table import LogTable, Progress, Stream
+
+QUANTITIES = ("position", "velocity", "acceleration", "torque")
+"""Joint vectors of a mapping."""
+
+
+def joint_factors(mapping: Mapping, name: str, joints: Sequence[str]) -> tuple[list[float], list[float]]:
+    """Factor s k and offset o of a quantity for each joint.
+
+    Args:
+        mapping: says unit, sign, side, gear ratio, torque constant and offset.
+        name: `position`, `velocity`, `acceleration` or `torque`.
+        joints: the robot's joints.
+
+    Returns:
+        Factors to SI on the joint side, and offsets in the unit of the column.
+
+    Raises:
+        MappingError: a joint has no number.
+    """
+    section = mapping.quantity(name)
+    assert section is not None
+    unit = units.QUANTITY[name][section.unit]
+    gear = [1.0] * len(joints)
+    if section.side == "motor":
+        ratios = mapping.per_joint(name, "gear_ratio", joints)
+        gear = [ratio if name == "torque" else 1.0 / ratio for ratio in ratios]
+    constant = [1.0] * len(joints)
+    if name == "torque" and mapping.sections.torque.torque_constant is not None:
+        constant = mapping.per_joint(name, "torque_constant", joints)
+    signs = mapping.per_joint(name, "sign", joints)
+    scale = [s * unit * g * k for s, g, k in zip(signs, gear, constant, strict=True)]
+    return scale, mapping.per_joint(name, "offset", joints)
+
 
 SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
 """Quantity of a mapping → name in a data set."""
@@ -23,7 +62,7 @@ def gather(
     path: str | Path,
     mapping: Mapping,
     joints: Sequence[str],
-    report: Report,
+    report: ImportReport,
     progress: Progress | None = None,
     rows: int | None = None,
 ) -> Signals:
@@ -64,7 +103,9 @@ def _needed(mapping: Mapping, joints: Sequence[str]) -> set[str]:
 class _Gathering:
     """The columns of a table while they are taken out of it."""
 
-    def __init__(self, table: LogTable, mapping: Mapping, joints: tuple[str, ...], report: Report) -> None:
+    def __init__(
+        self, table: LogTable, mapping: Mapping, joints: tuple[str, ...], report: ImportReport
+    ) -> None:
         self.table, self.mapping, self.joints, self.report = table, mapping, joints, report
         self.time = mapping.sections.time
         position = mapping.columns_of("position", joints)
@@ -88,7 +129,7 @@ class _Gathering:
         for name, (stream, values) in others.items():
             t = self._stamps(stream)
             good = np.isfinite(values).all(axis=1) & np.isfinite(t)
-            resample.join(signals, name, t[good], values[good], self.time.gap, self.report)
+            join_stream(signals, name, t[good], values[good], self.time.gap, self.report)
         for name in flags:
             signals.contact[name] = signals.vectors.pop(f"contact {name}")[:, 0] >= 0.5
         return signals
@@ -102,7 +143,7 @@ class _Gathering:
         assert section is not None
         columns = self.mapping.columns_of(name, self.joints)
         stream = self.table.stream_of(columns[0], section.stream)
-        scale, offset = torque.factors(self.mapping, name, self.joints)
+        scale, offset = joint_factors(self.mapping, name, self.joints)
         result = np.empty((len(stream), len(self.joints)))
         for i, column in enumerate(columns):
             values = self._take(stream, column)
@@ -164,11 +205,11 @@ class _Gathering:
             segment[1:] = np.cumsum(numbers[1:] != numbers[:-1])
         signals = Signals(self.joints, t, np.arange(len(t)), segment, vectors)
         self._complete(signals)
-        clock.drop_repeated(signals, self.report)
+        drop_repeated(signals, self.report)
         self._crop(signals)
-        clock.split(signals, self.time.gap, self.report)
+        split_trajectories(signals, self.time.gap, self.report)
         if "tau" in signals.vectors:
-            clock.find_held(signals, self.time.held == "drop", self.report)
+            find_held(signals, self.time.held == "drop", self.report)
         return signals
 
     def _complete(self, signals: Signals) -> None:

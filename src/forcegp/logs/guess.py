@@ -6,6 +6,8 @@ torque with the inverse dynamics of the scene's robot, gravity included. What is
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,16 +15,18 @@ import numpy as np
 import torch
 
 from forcegp import dynamics
-from forcegp.constraints import ConstrainedSystem
-from forcegp.logs import headings, smoothing, units
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.errors import DataError
+from forcegp.logs import units
+from forcegp.logs.contact import force_levels, level_and_spread, multiplier
 from forcegp.logs.draft import Draft
 from forcegp.logs.gather import gather
-from forcegp.logs.guess_contact import propose_contacts
-from forcegp.logs.mapping import Mapping, parse_mapping
+from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
+from forcegp.logs.mapping import ContactSection, Mapping, parse_mapping
 from forcegp.logs.readers import read
-from forcegp.logs.report import Report
-from forcegp.logs.signals import Array, Signals
-from forcegp.logs.table import Progress, Stream
+from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.logs.smoothing import add_derivatives, even_clock
+from forcegp.logs.table import LogTable, Progress, Stream
 
 ROWS = 100_000
 """Rows that are looked at."""
@@ -69,9 +73,9 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
     """
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
-    stream = headings.find_time(table, draft)
-    headings.find_families(stream, system.robot, draft)
-    headings.find_wrench(table, system.robot, draft)
+    stream = find_time(table, draft)
+    find_families(stream, system.robot, draft)
+    find_wrench(table, system.robot, draft)
     _try(path, draft, system, _possible_units(draft, stream))
     propose_contacts(table, draft, system, lambda: _signals(path, draft, system))
     return Guess(draft.toml(), tuple(draft.doubts))
@@ -118,11 +122,11 @@ def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without:
         .replace("[time]\n", '[time]\nmissing = "drop"\n', 1)
     )
     mapping = parse_mapping(toml.encode(), "proposed mapping")
-    signals = gather(path, mapping, system.robot.joint_names, Report(str(path)), rows=ROWS)
-    smoothing.even_clock(signals, None, Report(str(path)))
+    signals = gather(path, mapping, system.robot.joint_names, ImportReport(str(path)), rows=ROWS)
+    even_clock(signals, None, ImportReport(str(path)))
     signals.contact = {}
     settings = mapping.sections.derivatives.model_copy(update={"source": "position"})
-    smoothing.complete(signals, settings, Report(str(path)))
+    add_derivatives(signals, settings, ImportReport(str(path)))
     return signals
 
 
@@ -180,7 +184,7 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
     elif not clear.all():
         draft.say("torque", f"the sign is that of {clear.sum()} of {len(clear)} joints", doubt=True)
     size = float(np.median(np.abs(slopes[clear])))
-    words = headings.tokens(family.pattern)
+    words = tokens(family.pattern)
     if not family.declared and ("current" in words or "currents" in words):
         family.unit = "A"
         draft.say("torque", "a current: give the gear ratio and the torque constant [N m/A]", doubt=True)
@@ -217,3 +221,47 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
             product = float(left[:, 0] @ left[:, 1])
             slopes[i], correlation[i] = product / power[0], product / float(np.sqrt(power[0] * power[1]))
     return slopes, correlation
+
+
+LEAST_FORCE = 1.0
+"""A contact that is always closed presses with more than this [N]."""
+
+
+def propose_contacts(
+    table: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
+) -> None:
+    """Write into a draft how the state of each contact of the scene may be known.
+
+    Args:
+        table: the log.
+        draft: gets a table for each contact.
+        system: the robot with its contacts.
+        signals: reads the log by the draft, with accelerations.
+    """
+    trial: Signals | None = None
+    for contact in system.contacts:
+        name = contact.name
+        column = next(
+            (c for c in table.names if "contact" in c.lower() and (name in c or system.m == 1)), None
+        )
+        if column is not None and np.isin(table.stream_of(column).columns[column], (0.0, 1.0)).all():
+            draft.contacts[name] = ['source = "column"', f"column = {json.dumps(column)}"]
+        elif draft.wrench or not isinstance(contact, SurfaceContact):
+            draft.contacts[name] = ['source = "wrench"' if draft.wrench else 'source = "always"']
+        else:
+            trial = signals() if trial is None else trial
+            values = multiplier(trial, system, contact)
+            source, reason = _state(values, name)
+            draft.contacts[name] = [f'source = "{source}"   # or "multiplier", "distance", "always", "never"']
+            draft.say(f"contact {name}", f"no contact column; {reason}", doubt=True)
+
+
+def _state(values: Array, name: str) -> tuple[str, str]:
+    """Whether λ of the rigid body shows two states, or which one it shows."""
+    middle, spread = level_and_spread(values)
+    try:
+        high, low = force_levels(values, name, ContactSection(source="multiplier"))
+    except DataError:
+        source = "always" if middle > max(2.0 * spread, LEAST_FORCE) else "never"
+        return source, f"λ of the rigid body shows one state, {middle:.3g} ± {spread:.2g} N"
+    return "multiplier", f"λ of the rigid body shows two states, parted at {low:.3g} to {high:.3g} N"

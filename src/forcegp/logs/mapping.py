@@ -1,22 +1,119 @@
 """Mapping files: which column of a log is which quantity of which joint, in TOML (docs/import.md).
 
 Joints are matched by name. `[joints]` says what the log calls each joint of the robot, and a column such as
-`"q_{joint}"` is filled in with that name.
+`"q_{joint}"` is filled in with that name. A data set, and ROS joint states with the robot's names, need no
+file.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
+from typing import Literal
 
-from forcegp.data.compatible import lock_hint
-from forcegp.errors import MappingError
+from pydantic import Field
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data.checks import lock_hint
+from forcegp.errors import MappingError, did_you_mean
 from forcegp.logs import units
-from forcegp.logs.sections import MappingSections, PerJoint, QuantitySection
+from forcegp.logs.readers import read
+from forcegp.logs.table import LogTable
 from forcegp.scene.document import Document, Key
+from forcegp.scene.sections import Section
+
+PerJoint = float | dict[str, float]
+"""One number for all joints, or one for each by name."""
+
+
+class TimeSection(Section):
+    """`[time]`: the clock."""
+
+    column: str
+    stream: str | None = None
+    unit: Literal["s", "ms", "us", "ns", "min"] = "s"
+    start: float | None = None
+    stop: float | None = None
+    segment: str | None = None
+    period: float | None = Field(default=None, gt=0.0)
+    gap: float | None = Field(default=None, gt=0.0)
+    missing: Literal["error", "drop"] = "error"
+    held: Literal["keep", "drop"] = "keep"
+
+
+class QuantitySection(Section):
+    """`[position]`, `[velocity]`, `[acceleration]`: the columns of a joint vector, and how they are meant."""
+
+    column: str | None = None
+    columns: dict[str, str] = Field(default_factory=dict)
+    stream: str | None = None
+    unit: str
+    sign: PerJoint = 1.0
+    offset: PerJoint = 0.0
+    side: Literal["joint", "motor"] = "joint"
+    gear_ratio: PerJoint | None = None
+
+
+class TorqueSection(QuantitySection):
+    """`[torque]`: a torque, or a current with the torque constant of the motor [N m/A]."""
+
+    torque_constant: PerJoint | None = None
+
+
+class WrenchSection(Section):
+    """`[wrench]`: a force-torque sensor."""
+
+    force: tuple[str, str, str]
+    torque: tuple[str, str, str] | None = None
+    stream: str | None = None
+    frame: str
+    axes: Literal["frame", "world"] = "frame"
+    force_unit: Literal["N", "kN", "mN", "kgf"] = "N"
+    torque_unit: Literal["Nm", "mNm", "Ncm", "kNm"] = "Nm"
+    acts_on: Literal["robot", "environment"] = "robot"
+    offset: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    tool_mass: float = Field(default=0.0, ge=0.0)
+    tool_com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class ContactSection(Section):
+    """`[contact.<name>]`: where it is known from whether a contact of the scene is closed."""
+
+    source: Literal["column", "wrench", "multiplier", "distance", "always", "never"]
+    column: str | None = None
+    stream: str | None = None
+    threshold: float | None = Field(default=None, gt=0.0)
+    release: float | None = Field(default=None, gt=0.0)
+    shortest: float = Field(default=0.05, ge=0.0)
+
+
+class DerivativesSection(Section):
+    """`[derivatives]`: how velocities and accelerations that the log lacks are computed."""
+
+    method: Literal["savitzky_golay", "smoother"] = "savitzky_golay"
+    source: Literal["position", "velocity"] | None = None
+    window: int = Field(default=11, ge=3, le=10001)
+    order: int = Field(default=3, ge=2, le=9)
+    filter_torque: bool = True
+    impact_margin: float | None = Field(default=None, ge=0.0)
+
+
+class MappingSections(Section):
+    """All tables of a mapping file."""
+
+    time: TimeSection
+    joints: dict[str, str] = Field(default_factory=dict)
+    position: QuantitySection
+    velocity: QuantitySection | None = None
+    acceleration: QuantitySection | None = None
+    torque: TorqueSection
+    wrench: WrenchSection | None = None
+    contact: dict[str, ContactSection] = Field(default_factory=dict)
+    derivatives: DerivativesSection = DerivativesSection()
+
 
 BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "ur3_mat")
 """Mappings that come with the library: those of published logs, and of ROS topics with the robot's names."""
@@ -101,13 +198,11 @@ class Mapping:
     def _check_joints(self, key: Key, named: Iterable[str], joints: Sequence[str]) -> None:
         for joint in named:
             if joint not in joints:
-                near = get_close_matches(joint, joints, n=1)
-                hint = f"did you mean {near[0]!r}?" if near else None
                 raise self.error(
                     (*key, joint),
                     f"{joint!r} is not a joint of the robot",
                     expected=", ".join(joints),
-                    hint=hint,
+                    hint=did_you_mean(joint, joints),
                 )
 
 
@@ -126,11 +221,10 @@ def load_mapping(source: str | Path) -> Mapping:
     bundled = str(source) in BUNDLED
     path = Path(str(files("forcegp.logs") / "bundled" / f"{source}.toml")) if bundled else Path(source)
     if not path.is_file():
-        near = get_close_matches(str(source), BUNDLED, n=1)
         raise MappingError(
             f"{path}: no such mapping",
             expected=f"a TOML file, or one of {', '.join(BUNDLED)}",
-            hint=f"did you mean {near[0]!r}?" if near else "write one with --guess",
+            hint=did_you_mean(source, BUNDLED) or "write one with --guess",
         )
     return parse_mapping(path.read_bytes(), str(path))
 
@@ -213,3 +307,47 @@ def _check_time(mapping: Mapping) -> None:
         )
     if derivatives.source == "velocity" and mapping.sections.velocity is None:
         raise mapping.error(("derivatives", "source"), "the velocity is not mapped", "a table [velocity]")
+
+
+def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
+    """The mapping of a log whose names leave no doubt.
+
+    Raises:
+        MappingError: they do; the hint says how to write a mapping.
+    """
+    table, robot = read(path, rows=1), system.robot
+    names = set(table.names)
+    if (
+        all(f"{symbol}.{joint}" in names for symbol in ("q", "tau") for joint in robot.joint_names)
+        and "t" in names
+    ):
+        return parse_mapping(_data_set(table, system).encode(), "columns named as in a data set")
+    joint_states = all(
+        f"position.{joint}" in names and f"effort.{joint}" in names for joint in robot.joint_names
+    )
+    if joint_states and "header" in names:
+        return load_mapping("ros_joint_states")
+    shown = ", ".join(table.names[:12]) + (", …" if len(table.names) > 12 else "")
+    raise MappingError(
+        f"{path}: the names of the columns do not say what they are",
+        expected=f"t, q.{robot.joint_names[0]}, tau.{robot.joint_names[0]}, …, or a mapping",
+        got=shown,
+        hint="write a mapping by --guess mapping.toml, check it, and pass it by --mapping",
+    )
+
+
+def _data_set(table: LogTable, system: ConstrainedSystem) -> str:
+    names = set(table.names)
+    lines = ["[time]", 'column = "t"', *(['segment = "segment"'] if "segment" in names else [])]
+    units = {"position": ("q", "rad"), "velocity": ("qd", "rad/s"), "acceleration": ("qdd", "rad/s2")}
+    for quantity, (symbol, unit) in (units | {"torque": ("tau", "Nm")}).items():
+        if all(f"{symbol}.{joint}" in names for joint in system.robot.joint_names):
+            lines += [f"[{quantity}]", f'column = "{symbol}.{{joint}}"', f'unit = "{unit}"']
+    for name in system.contact_names:
+        if f"contact.{name}" in names:
+            lines += [
+                f"[contact.{json.dumps(name)}]",
+                'source = "column"',
+                f"column = {json.dumps('contact.' + name)}",
+            ]
+    return "\n".join(lines) + "\n"

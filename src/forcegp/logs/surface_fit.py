@@ -1,19 +1,154 @@
-"""The plane or sphere that the tip slid on, fitted to its path, with error bars."""
+"""The plane or sphere that the tip slid on, fitted to its path, with error bars that hold for residuals
+correlated in time; the tip is a point, or a ball of known or unknown radius.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import torch
+from scipy.optimize import least_squares
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, Plane, Sphere, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
-from forcegp.logs.robust_fit import LEAST_POINTS, Solution, robust_least_squares
 from forcegp.logs.signals import Array
-from forcegp.logs.tip import Tip, tip_of
+from forcegp.robust import robust_std
+
+LEAST_POINTS = 20
+"""Points that a fit needs."""
+ROUNDING = 1e-9
+"""Smallest scale of the residuals, in their unit, so that an exact fit has one."""
+OUTLIER_STD = 4.0
+"""Rows with residuals beyond so many deviations are outliers."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Parameters, their covariance, residuals of the rows used, and how many of these are independent."""
+
+    x: Array
+    covariance: Array
+    residuals: Array
+    effective: float
+
+
+def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> Solution:
+    """A robust fit tells the outliers from the rest; least squares of the rest gives the error bars.
+
+    Args:
+        residual: of the parameters, `(n,)`.
+        start: parameters `(k,)`.
+    """
+    robust = start
+    for _ in range(2):
+        scale = max(float(robust_std(residual(robust))), ROUNDING)
+        found = least_squares(residual, robust, loss="soft_l1", f_scale=scale, x_scale="jac")
+        robust = found.x
+    first = residual(robust)
+    inside = np.abs(first - np.median(first)) <= OUTLIER_STD * max(float(robust_std(first)), ROUNDING)
+    final = least_squares(lambda x: residual(x)[inside], robust, x_scale="jac")
+    residuals = residual(final.x)[inside]
+    effective = len(residuals) / correlation_time(residuals)
+    information = final.jac.T @ final.jac * (effective / len(residuals))
+    scale = max(float(residuals.std()), ROUNDING)
+    return Solution(final.x, scale**2 * np.linalg.pinv(information, hermitian=True), residuals, effective)
+
+
+def correlation_time(values: Array) -> float:
+    """1 + 2 Σ ρ_k up to the first negative ρ_k: the rows that count as one independent row (Sokal 1997).
+
+    >>> 0.8 < correlation_time(np.random.default_rng(0).standard_normal(4000)) < 1.2
+    True
+    """
+    x = values - values.mean()
+    n = len(x)
+    power = np.abs(np.fft.rfft(x, 2 * n)) ** 2
+    autocorrelation = np.fft.irfft(power)[:n]
+    if not autocorrelation[0] > 0.0:
+        return 1.0
+    rho = autocorrelation / autocorrelation[0]
+    first = int(np.argmax(rho < 0.0)) if (rho < 0.0).any() else n
+    return float(min(max(1.0 + 2.0 * rho[1:first].sum(), 1.0), n / LEAST_POINTS if n > LEAST_POINTS else n))
+
+
+LEAST_RADIUS_STD = 4.0
+"""A fitted radius counts from so many of its standard deviations on."""
+
+
+@dataclass(frozen=True)
+class Tip:
+    """A rounded tip: a ball that ends at the path's points, or has its centre there.
+
+    Attributes:
+        axes: `(n, 3)` unit vectors from the ball's centre to the path's points; zero where these are centres.
+        radius: r of the ball; `None` to fit it [m].
+    """
+
+    axes: Array
+    radius: float | None
+
+    @classmethod
+    def sharp(cls, points: Array) -> Tip:
+        """No ball."""
+        return cls(np.zeros_like(points), 0.0)
+
+    def start(self, x: list[float]) -> Array:
+        """Initial parameters, with those of a surface first."""
+        return np.array([*x, 0.0] if self.radius is None else x)
+
+    def of(self, x: Array) -> float:
+        """The radius by parameters."""
+        return float(x[-1]) if self.radius is None else self.radius
+
+    def std(self, found: Solution) -> dict[str, float]:
+        """Error bar of a fitted radius.
+
+        Raises:
+            DataError: the orientation of the tip does not show it.
+        """
+        if self.radius is not None:
+            return {}
+        radius, std = self.of(found.x), float(np.sqrt(found.covariance[-1, -1]))
+        if not radius > LEAST_RADIUS_STD * std:
+            raise DataError(
+                "the path does not determine the radius of the tip",
+                expected=f"a positive radius, at least {LEAST_RADIUS_STD:g} times its standard deviation",
+                got=f"{1e3 * radius:.3g} ± {1e3 * std:.2g} mm",
+                hint="measure it, or turn the tool while it touches",
+            )
+        return {"tip_radius": std}
+
+
+def tip_of(
+    system: ConstrainedSystem,
+    contact: SurfaceContact,
+    q: torch.Tensor,
+    radius: float | Literal["fit"] | None,
+) -> Tip:
+    """The tip that touched at positions `(n, nq)`: that of the scene, or a ball that ends at its point.
+
+    Raises:
+        DataError: the scene's tip has a radius of its own, or the point is the origin of its frame.
+    """
+    if radius is None:
+        return Tip(np.zeros((len(q), 3)), contact.radius)
+    point = torch.tensor(tuple(contact.point), dtype=q.dtype)
+    if contact.radius > 0.0 or not bool(point.any()):
+        raise DataError(
+            f"the tip of contact {contact.name!r} is known, or has no axis",
+            expected="a contact of a point away from the origin of its frame, without a radius",
+            got=f"radius {contact.radius:g} m, point {tuple(contact.point)}",
+            hint="leave out the radius of the tip",
+        )
+    rotation, _ = kinematics.frame_pose(system.robot, q, contact.frame)
+    axes = (rotation @ (point / point.norm())).numpy()
+    return Tip(axes, None if radius == "fit" else radius)
+
 
 MOST_POINTS = 20_000
 """Points that are fitted; of a longer path, every k-th."""

@@ -1,18 +1,70 @@
-"""What every reader returns: named columns of numbers, grouped by the clock that they share."""
+"""What every reader returns: named columns of numbers, grouped by the clock that they share.
+
+What a foreign log claims is checked before the work is done; the bounds are in `forcegp.limits`. A small
+compressed file can claim to hold more than memory does.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
-from forcegp.errors import DataError, ForceGPError
-from forcegp.logs import bounds
+from forcegp.errors import DataError, ForceGPError, did_you_mean
+from forcegp.resources import announce_memory
+
+COPIES = 2
+"""A table is in memory as it is in the file, and as float64."""
+
+
+def check_count(source: str, what: str, count: int, most: int) -> None:
+    """Raise `DataError` where a log claims more than `most` of something.
+
+    Args:
+        source: name of the file, for the message.
+        what: what is counted, in the plural.
+        count: the claim.
+        most: the bound.
+
+    >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
+    """
+    if count > most:
+        raise DataError(
+            f"{source}: the log claims too many {what}",
+            expected=f"at most {most:,}",
+            got=f"{count:,}",
+            hint="split the log, or export only the columns that are needed",
+        )
+
+
+def check_expansion(source: str, size: int, file: int) -> None:
+    """Raise `DataError` where a small file claims to hold far more than it is long.
+
+    Args:
+        source: name of the file, for the message.
+        size: of what it claims to hold [bytes].
+        file: length of the file [bytes].
+    """
+    allowed = max(limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
+    if size > allowed:
+        raise DataError(
+            f"{source}: the file claims to be larger than what is read at once",
+            expected=f"at most {allowed:,} bytes in a file of this size",
+            got=f"{size:,}",
+            hint="split the log into several files",
+        )
+
+
+def check_values(source: str, rows: int, columns: int) -> None:
+    """Raise `DataError` where a table is wider or larger than what is read; announce a large one."""
+    check_count(source, "columns", columns, limits.COLUMNS)
+    check_count(source, f"numbers ({rows:,} rows × {columns} columns)", rows * columns, limits.LOG_VALUES)
+    announce_memory(COPIES * 8 * rows * columns, f"reading {source}")
+
 
 Column = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -112,12 +164,11 @@ class Growing:
 
 def missing(source: str, kind: str, name: str, known: list[str]) -> DataError:
     """The error for a stream or column that a log does not hold."""
-    near = get_close_matches(name, known, n=1, cutoff=0.5)
     shown = ", ".join(repr(k) for k in known[:16]) + (f", … ({len(known)})" if len(known) > 16 else "")
     return DataError(
         f"{source}: the log has no {kind} {name!r}",
         expected=f"one of {shown}" if known else "a log with columns of numbers",
-        hint=f"did you mean {near[0]!r}?" if near else None,
+        hint=did_you_mean(name, known, 0.5),
     )
 
 
@@ -169,11 +220,11 @@ def arrays_to_streams(
         if array.ndim == 2 and array.shape[0] != rows:
             array = array.T
             remarks.append(f"{name!r} was transposed: its rows are samples")
-        bounds.check_values(source, rows, 1 if array.ndim == 1 else array.shape[1])
+        check_values(source, rows, 1 if array.ndim == 1 else array.shape[1])
         groups.setdefault(rows, {}).update(_columns(name, array))
-    bounds.check_count(source, "arrays of different length", len(groups), limits.LOG_STREAMS)
+    check_count(source, "arrays of different length", len(groups), limits.LOG_STREAMS)
     for rows, columns in groups.items():
-        bounds.check_values(source, rows, len(columns))
+        check_values(source, rows, len(columns))
     return tuple(
         Stream("" if rows == common else f"{rows} rows", columns)
         for rows, columns in sorted(groups.items(), key=lambda item: item[0] != common)

@@ -26,7 +26,7 @@ from forcegp.storage.folder import Settings, write_model
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from forcegp.plots.panels import Target
+    from forcegp.plots import Target
 
 FitProgress = Callable[[int, int, float], None]
 """Called with the number of evaluations, their maximum, and the objective."""

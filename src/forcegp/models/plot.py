@@ -12,9 +12,17 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.errors import ShapeError
 from forcegp.models.measured import Predicts, component_names, measured_if_logged, predicted
-from forcegp.plots.panels import Curve, Panel, Target, chosen, draw_panels
-from forcegp.plots.style import MEASURED, PREDICTED, axis_label
-from forcegp.plots.timeline import Timeline
+from forcegp.plots import (
+    MEASURED,
+    PREDICTED,
+    Curve,
+    Panel,
+    Target,
+    Timeline,
+    axis_label,
+    chosen,
+    draw_panels,
+)
 
 MOST_SAMPLES = 2000
 """Samples that are predicted and drawn: more cannot be told apart."""

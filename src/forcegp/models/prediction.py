@@ -14,7 +14,7 @@ from forcegp.errors import NumericalError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from forcegp.plots.panels import Target
+    from forcegp.plots import Target
 
 
 @dataclass(frozen=True, repr=False)

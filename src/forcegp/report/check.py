@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from forcegp.checks import KINDS, Finding, Log, Report
-from forcegp.checks.log import of_robot
-from forcegp.checks.statistics import describe
+from forcegp.checks.log import describe, of_robot
 from forcegp.constraints import ConstrainedSystem
 from forcegp.files import write_text
 from forcegp.report.check_pictures import draw_overview, picture_of

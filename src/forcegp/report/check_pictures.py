@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from forcegp import dynamics
 from forcegp.checks import KINDS, Finding, Log, Report
 from forcegp.checks.contact import tip_path
-from forcegp.checks.statistics import Array
+from forcegp.checks.log import Array
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.report.style import INK, OTHER, Picture, draw
 

@@ -1,8 +1,13 @@
-"""`load_robot`: a robot model from a bundled name, a URDF file or an MJCF file."""
+"""`load_robot`: a robot model from a bundled name, a URDF file or an MJCF file.
+
+The ordered tree of links and joints becomes the robot model, with fixed joints folded into the links.
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -10,12 +15,214 @@ import numpy as np
 import scipy
 import torch
 
-from forcegp.errors import RobotFileError, ShapeError, UnknownNameError
-from forcegp.robot.check import checked
-from forcegp.robot.fold import Pose, build_robot
-from forcegp.robot.model import RobotModel
+from forcegp.errors import (
+    InertiaError,
+    RobotFileError,
+    RobotFileWarning,
+    ShapeError,
+    UnknownNameError,
+    UnsupportedRobotError,
+)
+from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import Tree, lock_joints
+from forcegp.robot.tree import CheckedTree, Inertial, Joint, Site, Tree, checked, joint_motion, lock_joints
+
+FRICTION_VELOCITY = 0.1
+"""Default speed over which Coulomb friction changes sign [rad/s, m/s]; robot files do not specify it."""
+SINGULAR = 1e-12
+"""Smallest eigenvalue of the scaled mass matrix below which it counts as singular in double precision."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pose of the base in the world, gravity, and the type and device of the robot's tensors."""
+
+    base_rotation: np.ndarray
+    base_position: np.ndarray
+    gravity: np.ndarray
+    dtype: torch.dtype
+    device: torch.device | str
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """The moving joints, and for each link of the file the joint that moves it and its pose in that link."""
+
+    moving: list[Joint]
+    parents: list[int]
+    placements: list[np.ndarray]
+    links: dict[str, tuple[int, np.ndarray]]
+
+
+def build_robot(checked: CheckedTree, pose: Pose) -> RobotModel:
+    """The robot that a tree describes.
+
+    Raises:
+        UnsupportedRobotError: the name of a frame is ambiguous.
+        InertiaError: the robot can move without inertia.
+    """
+    tree, remarks = checked.tree, list(checked.remarks)
+    placed = _place(checked.root, checked.joints)
+    bodies = _merge(tree, placed)
+    _check_mass_matrix(tree, placed, bodies)
+    frames = _frames(tree, placed, remarks)
+    for remark in remarks:
+        warnings.warn(remark, RobotFileWarning, stacklevel=3)
+    return _model(tree, placed, bodies, frames, pose, tuple(remarks))
+
+
+def _place(root: str, joints: tuple[Joint, ...]) -> _Placed:
+    placed = _Placed([], [], [], {root: (BASE, np.eye(4))})
+    for joint in joints:
+        index, T = placed.links[joint.parent]
+        T = T @ joint.placement
+        if joint.kind == "fixed":
+            placed.links[joint.child] = (index, T)
+        else:
+            placed.links[joint.child] = (len(placed.moving), np.eye(4))
+            placed.moving.append(joint)
+            placed.parents.append(index)
+            placed.placements.append(T)
+    return placed
+
+
+def _merge(tree: Tree, placed: _Placed) -> list[Inertial]:
+    """Mass, centre of mass and inertia of each moving link, including the links fixed to it."""
+    parts: list[list[Inertial]] = [[] for _ in placed.moving]
+    for link in tree.links:
+        index, T = placed.links[link.name]
+        if link.inertial is None or index == BASE:
+            continue
+        body, R = link.inertial, T[:3, :3]
+        parts[index].append(Inertial(body.mass, R @ body.com + T[:3, 3], R @ body.inertia @ R.T))
+    return [_sum(bodies) for bodies in parts]
+
+
+def _sum(bodies: list[Inertial]) -> Inertial:
+    mass = sum(body.mass for body in bodies)
+    if mass == 0.0:
+        return Inertial(0.0, np.zeros(3), sum((body.inertia for body in bodies), np.zeros((3, 3))))
+    com = sum((body.mass / mass * body.com for body in bodies), np.zeros(3))
+    inertia = np.zeros((3, 3))
+    for body in bodies:
+        d = body.com - com
+        inertia += body.inertia + body.mass * (d @ d * np.eye(3) - np.outer(d, d))
+    return Inertial(mass, com, 0.5 * (inertia + inertia.T))
+
+
+def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
+    """Refuse a robot that can move without kinetic energy, tested at a generic configuration."""
+    M = _mass_matrix(placed, bodies) + np.diag([joint.armature for joint in placed.moving])
+    scale = np.sqrt(np.diag(M))
+    if scale.min() > 0.0:
+        values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+        if values[0] > SINGULAR:
+            return
+        index = int(np.abs(vectors[:, 0]).argmax())
+    else:
+        index = int(scale.argmin())
+    joint, mass = placed.moving[index], bodies[index].mass
+    raise InertiaError(
+        f"{tree.label}: link {joint.child!r} of joint {joint.name!r} moves without inertia",
+        expected="mass beyond every moving joint, so that the mass matrix is positive definite",
+        got=f"link mass {mass:g} kg, and no link beyond it that resists the motion",
+        hint="give the link an <inertial>, or lock the joint with locked_joints",
+    )
+
+
+def _mass_matrix(placed: _Placed, bodies: list[Inertial]) -> np.ndarray:
+    n = len(placed.moving)
+    axes, origins = np.zeros((n, 3)), np.zeros((n, 3))
+    poses: list[np.ndarray] = []
+    moves = np.zeros((n, n), dtype=bool)
+    M = np.zeros((n, n))
+    turns = np.array([joint.kind == "revolute" for joint in placed.moving])
+    for i, joint in enumerate(placed.moving):
+        parent = placed.parents[i]
+        start = placed.placements[i] if parent == BASE else poses[parent] @ placed.placements[i]
+        # The golden ratio spreads the joint positions, so that no axes line up by chance.
+        poses.append(start @ joint_motion(joint.kind, joint.axis, 0.3 + (0.618034 * (i + 1)) % 1.0))
+        axes[i], origins[i] = start[:3, :3] @ joint.axis, start[:3, 3]
+        moves[i] = moves[parent] if parent != BASE else False
+        moves[i, i] = True
+        J = np.flatnonzero(moves[i])
+        R, body = poses[i][:3, :3], bodies[i]
+        arm = R @ body.com + poses[i][:3, 3] - origins[J]
+        w = axes[J] * turns[J, None]
+        v = np.where(turns[J, None], np.cross(axes[J], arm), axes[J])
+        M[np.ix_(J, J)] += body.mass * v @ v.T + w @ (R @ body.inertia @ R.T) @ w.T
+    return M
+
+
+def _frames(tree: Tree, placed: _Placed, remarks: list[str]) -> list[tuple[str, int, np.ndarray]]:
+    frames = [(link.name, *placed.links[link.name]) for link in tree.links if link.frame]
+    taken = {name for name, _, _ in frames}
+    for site in tree.sites:
+        name = _free_name(tree, site, taken, remarks)
+        index, T = placed.links[site.link]
+        frames.append((name, index, T @ site.placement))
+        taken.add(name)
+    return frames
+
+
+def _free_name(tree: Tree, site: Site, taken: set[str], remarks: list[str]) -> str:
+    """A unique frame name: in MJCF, a site and a body may share a name."""
+    if site.name not in taken:
+        return site.name
+    name = f"site/{site.name}"
+    if name in taken:
+        raise UnsupportedRobotError(
+            f"{tree.label}: site {site.name!r} shares its name with a body", expected="different names"
+        )
+    remarks.append(f"{tree.label}: site {site.name!r} shares its name with a body; its frame is {name!r}")
+    return name
+
+
+def _model(
+    tree: Tree,
+    placed: _Placed,
+    bodies: list[Inertial],
+    frames: list[tuple[str, int, np.ndarray]],
+    pose: Pose,
+    remarks: tuple[str, ...],
+) -> RobotModel:
+    def tensor(values: object) -> torch.Tensor:
+        return torch.tensor(np.asarray(values, dtype=np.float64), dtype=pose.dtype, device=pose.device)
+
+    moving, placement = placed.moving, np.stack(placed.placements)
+    poses = np.stack([T for _, _, T in frames])
+    speed = [FRICTION_VELOCITY] * len(moving)
+    return RobotModel(
+        name=tree.name,
+        joint_names=tuple(joint.name for joint in moving),
+        joint_types=tuple("prismatic" if joint.kind == "prismatic" else "revolute" for joint in moving),
+        parents=tuple(placed.parents),
+        placement_rotation=tensor(placement[:, :3, :3]),
+        placement_position=tensor(placement[:, :3, 3]),
+        axis=tensor([joint.axis for joint in moving]),
+        mass=tensor([body.mass for body in bodies]),
+        com=tensor([body.com for body in bodies]),
+        inertia=tensor([body.inertia for body in bodies]),
+        damping=tensor([joint.damping for joint in moving]),
+        friction=tensor([joint.friction for joint in moving]),
+        stribeck=tensor([0.0] * len(moving)),
+        stribeck_velocity=tensor(speed),
+        friction_velocity=tensor(speed),
+        armature=tensor([joint.armature for joint in moving]),
+        lower=tensor([joint.lower for joint in moving]),
+        upper=tensor([joint.upper for joint in moving]),
+        velocity_limit=tensor([joint.velocity for joint in moving]),
+        effort_limit=tensor([joint.effort for joint in moving]),
+        frame_names=tuple(name for name, _, _ in frames),
+        frame_parents=tuple(index for _, index, _ in frames),
+        frame_rotation=tensor(poses[:, :3, :3]),
+        frame_position=tensor(poses[:, :3, 3]),
+        base_rotation=tensor(pose.base_rotation),
+        base_position=tensor(pose.base_position),
+        gravity=tensor(pose.gravity),
+        remarks=remarks,
+    )
+
 
 BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa", "kuka_iiwa14", "ur5")
 

@@ -16,8 +16,7 @@ from xml.etree.ElementTree import Element, tostring
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
-from forcegp.optional import optional_module
+from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError, optional_module
 from forcegp.robot.mjcf_reduce import Coupling, reduce_mjcf
 from forcegp.robot.tree import Inertial, Joint, JointKind, Link, Site, Tree, joint_motion, transform
 

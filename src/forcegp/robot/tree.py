@@ -1,7 +1,11 @@
-"""The tree of links and joints that URDF and MJCF files are read into."""
+"""The tree of links and joints that URDF and MJCF files are read into, and its checks.
+
+Checked are names, a single root, supported joints and physical inertia.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -9,7 +13,7 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from forcegp.errors import RobotFileError, UnknownNameError
+from forcegp.errors import InertiaError, RobotFileError, UnknownNameError, UnsupportedRobotError, did_you_mean
 
 JointKind = Literal["revolute", "prismatic", "fixed"]
 
@@ -141,3 +145,195 @@ def _with_followers(tree: Tree, locked: Mapping[str, float]) -> dict[str, float]
                 leader, multiplier, offset = joint.follows
                 held.setdefault(joint.name, multiplier * held[leader] + offset)
     return held
+
+
+MAX_JOINTS = 500
+ROUNDING = 1e-6
+"""Relative error of principal moments that are printed with a few digits only."""
+
+
+@dataclass(frozen=True)
+class CheckedTree:
+    """A valid tree: its root link, its joints with parents before children, and remarks."""
+
+    tree: Tree
+    root: str
+    joints: tuple[Joint, ...]
+    remarks: tuple[str, ...]
+
+
+def checked(tree: Tree) -> CheckedTree:
+    """The tree, checked, with its joints in depth-first order, siblings in the order of the file.
+
+    Raises:
+        RobotFileError: the links and joints are not a single tree.
+        UnsupportedRobotError: a joint is of an unsupported type.
+        InertiaError: the inertia of a link is not physical.
+    """
+    _check_names(tree)
+    root = _root(tree)
+    children: dict[str, list[Joint]] = {}
+    for joint in tree.joints:
+        children.setdefault(joint.parent, []).append(joint)
+    joints: list[Joint] = []
+    stack = children.get(root, [])[::-1]
+    while stack:
+        joint = stack.pop()
+        joints.append(joint)
+        stack.extend(children.get(joint.child, [])[::-1])
+    if len(joints) < len(tree.joints):
+        reached = {id(joint) for joint in joints}
+        cyclic = next(joint for joint in tree.joints if id(joint) not in reached)
+        raise RobotFileError(
+            f"{tree.label}: joint {cyclic.name!r} is part of a cycle",
+            expected="a tree of links",
+            got=f"link {cyclic.parent!r} is its own ancestor",
+            hint="open the loop and close it with a point constraint",
+        )
+    _check_kinds(tree)
+    remarks = (*tree.remarks, *_check_inertia(tree, joints))
+    return CheckedTree(tree, root, tuple(joints), remarks)
+
+
+def _check_inertia(tree: Tree, joints: list[Joint]) -> list[str]:
+    """Check the inertia of each link; one that never moves has no effect and gets a remark only."""
+    moving: set[str] = set()
+    for joint in joints:
+        if joint.kind != "fixed" or joint.parent in moving:
+            moving.add(joint.child)
+    remarks = []
+    for link in tree.links:
+        if link.inertial is None:
+            continue
+        reason = inertia_error(link.inertial)
+        if reason and link.name in moving:
+            raise InertiaError(
+                f"{tree.label}: the inertia of link {link.name!r} is not physical",
+                expected="positive mass and a positive definite inertia",
+                got=reason,
+                hint="correct the <inertial> of this link",
+            )
+        doubt = reason or inertia_doubt(link.inertial)
+        if doubt:
+            remarks.append(f"{tree.label}: the inertia of link {link.name!r} is not physical: {doubt}")
+    return remarks
+
+
+def inertia_error(body: Inertial) -> str:
+    """Why no rigid body can have these parameters, or "" if one can (see also `inertia_doubt`)."""
+    mass, com, inertia = body.mass, body.com, body.inertia
+    if not (np.isfinite(mass) and np.isfinite(com).all() and np.isfinite(inertia).all()):
+        return "a value is not finite"
+    if mass < 0.0:
+        return f"the mass {mass:g} kg is negative"
+    moments = np.linalg.eigvalsh(inertia)
+    if moments[0] < -ROUNDING * max(abs(moments[2]), 1e-12):
+        return f"the inertia is not positive definite: a principal moment is {moments[0]:.6g} kg m²"
+    return ""
+
+
+def inertia_doubt(body: Inertial) -> str:
+    """Why a rigid body has these parameters only approximately, or ""; published files often round them."""
+    low, mid, high = np.linalg.eigvalsh(body.inertia)
+    if body.mass == 0.0 and high > 0.0:
+        return f"it has a rotational inertia of {high:.4g} kg m² but no mass"
+    if high > (low + mid) * (1.0 + ROUNDING) + 1e-15:
+        return (
+            "its principal moments violate the triangle inequality "
+            f"({low:.6g} + {mid:.6g} < {high:.6g} kg m²), so no mass distribution has them"
+        )
+    return ""
+
+
+def _check_names(tree: Tree) -> None:
+    for kind, names in (("link", [link.name for link in tree.links]), ("joint", _joint_names(tree))):
+        name, count = Counter(names).most_common(1)[0] if names else ("", 0)
+        if count > 1:
+            raise RobotFileError(
+                f"{tree.label}: {kind} name {name!r} is not unique", expected="unique names", got=count
+            )
+    links = {link.name for link in tree.links}
+    for joint in tree.joints:
+        for role, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in links:
+                raise RobotFileError(
+                    f"{tree.label}: joint {joint.name!r} has an unknown {role} link {link!r}",
+                    expected="one of " + _shown([link.name for link in tree.links]),
+                    hint=did_you_mean(link, links),
+                )
+    for name, count in Counter(joint.child for joint in tree.joints).items():
+        if count > 1:
+            several = [joint.name for joint in tree.joints if joint.child == name]
+            raise RobotFileError(
+                f"{tree.label}: link {name!r} is the child of several joints",
+                expected="one parent joint per link",
+                got=_shown(several),
+                hint="open the loop and close it with a point constraint",
+            )
+
+
+def _joint_names(tree: Tree) -> list[str]:
+    return [joint.name for joint in tree.joints if joint.name]
+
+
+def _root(tree: Tree) -> str:
+    moved = {joint.child for joint in tree.joints}
+    roots = [link.name for link in tree.links if link.name not in moved]
+    if len(roots) == 1:
+        return roots[0]
+    if not tree.links:
+        raise RobotFileError(f"{tree.label}: the file has no links", expected="at least one link", got=0)
+    if not roots:
+        raise RobotFileError(
+            f"{tree.label}: joint {tree.joints[0].name!r} is part of a cycle",
+            expected="one link without a parent joint, the base",
+            got="every link is the child of a joint",
+        )
+    raise RobotFileError(
+        f"{tree.label}: the links form several trees",
+        expected="one link without a parent joint, the base",
+        got=_shown(roots),
+        hint="join them with fixed joints, or remove the links without a parent joint",
+    )
+
+
+def _check_kinds(tree: Tree) -> None:
+    refused = [joint for joint in tree.joints if joint.refused]
+    if refused:
+        raise UnsupportedRobotError(
+            f"{tree.label}: joint {refused[0].name!r} {refused[0].refused}",
+            expected="revolute, continuous, prismatic or fixed joints that move independently",
+            hint=f"lock these joints: load_robot(..., locked_joints={_lock(tree, refused)}), "
+            "or locked_joints under [robot] in a scene file",
+        )
+    moving = sum(joint.kind != "fixed" for joint in tree.joints)
+    if not 1 <= moving <= MAX_JOINTS:
+        what = "too many moving joints" if moving else "nothing in this file moves"
+        raise RobotFileError(
+            f"{tree.label}: {what}",
+            expected=f"1 to {MAX_JOINTS} moving joints",
+            got=moving,
+            hint=None if moving else "the file describes an object; a robot has revolute or prismatic joints",
+        )
+
+
+def _lock(tree: Tree, refused: list[Joint]) -> dict[str, float]:
+    """Positions at which refused joints, and the joints that they follow, can be locked."""
+    joints = {joint.name: joint for joint in tree.joints if joint.kind != "fixed"}
+    lock: dict[str, float] = {}
+    for joint in refused:
+        if joint.follows is None or joint.follows[0] not in joints:
+            lock[joint.name] = _nearest_to_zero(joint)
+            continue
+        leader, multiplier, offset = joint.follows
+        lock[leader] = _nearest_to_zero(joints[leader])
+        lock[joint.name] = multiplier * lock[leader] + offset
+    return lock
+
+
+def _nearest_to_zero(joint: Joint) -> float:
+    return float(min(max(0.0, joint.lower), joint.upper))
+
+
+def _shown(names: list[str]) -> str:
+    return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")

@@ -1,12 +1,10 @@
 """Forward in time: trajectories that stay on the surface, with uncertainty, and contact that can be lost."""
 
-from forcegp.rollout.comparison import Comparison, beside_log, compare
-from forcegp.rollout.conformal import widening
-from forcegp.rollout.events import ContactEvent
+from forcegp.rollout.comparison import Comparison, beside_log, compare, widening
+from forcegp.rollout.events import ContactEvent, contact_loss_probability
 from forcegp.rollout.forward import RolloutOptions, rollout, rollout_model
 from forcegp.rollout.inputs import Feedback, Inputs, Sampled, TaskSpaceControl, Torque
 from forcegp.rollout.law import AccelerationLaw, ForceField, ForceLaw, ForwardModel, Law, law_of
-from forcegp.rollout.probability import contact_loss_probability
 from forcegp.rollout.trajectory import Bands, DivergedError, Divergence, Rollout
 
 __all__ = [

@@ -1,8 +1,12 @@
-"""Comparison of predicted and logged trajectories: tip error over time, drift, coverage of the bands."""
+"""Comparison of predicted and logged trajectories: tip error over time, drift, coverage of the bands.
+
+Split-conformal widening is the factor by which bands must grow to cover as much as they claim.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,11 +17,44 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
-from forcegp.rollout.conformal import widening
-from forcegp.rollout.forward import RolloutOptions, rollout_model
+from forcegp.rollout.forward import RolloutOptions, rollout_model, share_of
 from forcegp.rollout.integrate import Progress
 from forcegp.rollout.law import ForwardModel
 from forcegp.rollout.trajectory import Bands, Rollout
+
+
+def widening(values: Tensor, band: Bands, level: float) -> float:
+    """Factor on the half-widths of bands so that they cover a share `level` of trajectories like these.
+
+    The score of a trajectory is the factor that puts a share `level` of its values inside the band, from the
+    ratios |value − median| / (half-width on that side); the factor is the ⌈(n + 1) level⌉-th smallest of n
+    scores. Trajectories are exchangeable, unlike the values along one: with bands widened by it
+    (`Bands.widened`), a further trajectory has a share `level` of its values inside with probability `level`
+    or more, however wrong the model is.
+
+    Args:
+        values: `(n, …)` observed values of n trajectories, NaN where there is none.
+        band: the band of each value.
+        level: wanted coverage, between 0 and 1.
+
+    Returns:
+        The factor; infinite if it takes more trajectories (9 for a level of 0.9) or samples of the model.
+
+    Source: Lei, G'Sell, Rinaldo, Tibshirani, Wasserman, *Distribution-free predictive inference for
+    regression* (JASA 113, 2018), section 2.2.
+
+    Example:
+        >>> bands = Bands(torch.tensor([-1.0]), torch.tensor([1.0]), torch.tensor([0.0]))
+        >>> widening(torch.tensor([[0.5], [-3.0], [2.0]]), bands, 0.5)
+        2.0
+    """
+    apart = values - band.median
+    half = torch.where(apart < 0.0, band.median - band.lower, band.upper - band.median)
+    ratios = (apart.abs() / half).nan_to_num(torch.inf).flatten(1).sort(dim=1).values
+    scores = ratios[:, math.ceil(ratios.shape[1] * level) - 1].sort().values
+    rank = math.ceil((len(scores) + 1) * level)
+    return float(scores[rank - 1]) if rank <= len(scores) else math.inf
+
 
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Times at which tip errors are reported [s]."""
@@ -90,7 +127,7 @@ class Comparison:
         return float(inside.to(self.q.dtype).mean())
 
     def inflation(self, model: str, level: float = LEVEL) -> float:
-        """Factor by which bands must grow to cover a share `level` of tip coordinates (`conformal.py`).
+        """Factor by which bands must grow to cover a share `level` of tip coordinates (`widening`).
 
         It counts trajectories, which must not overlap; infinite with too few, such as below 9 for 0.9.
         """
@@ -174,7 +211,7 @@ def compare(
             drawn,
             active=data.active(system.contact_names)[first],
             options=options,
-            progress=_part(progress, i, len(models)),
+            progress=share_of(progress, i, len(models)),
         )
     return _beside(system, data, rows, dt, predicted)
 
@@ -223,9 +260,3 @@ def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
     if not isinstance(starts, int):
         return starts
     return fits[torch.linspace(0, len(fits) - 1, count).round().long()]
-
-
-def _part(progress: Progress | None, part: int, parts: int) -> Progress | None:
-    if progress is None:
-        return None
-    return lambda done, total: progress(part * total + done, parts * total)

@@ -1,7 +1,8 @@
 """The instants at which contacts open and close, located within a step.
 
 A closed contact opens where λ falls to zero, an open one closes where c does; the mechanics are those of
-`constraints/unilateral.py`.
+`constraints/unilateral.py`. The probability that contact is lost at a state comes from the posterior over
+the multiplier.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints.unilateral import impact_velocity, pulling, reached, rows_of
-from forcegp.rollout.law import Evaluation, Problem, State, Step
+from forcegp.errors import ModelError
+from forcegp.rollout.law import ForwardModel, Instant, RolloutProblem, State, Step
 
 MAX_EVENTS = 8
 """Events within one step; a contact that bounces to rest within a step has infinitely many."""
@@ -38,7 +40,7 @@ class ContactEvent(NamedTuple):
     closed: bool
 
 
-def _signal(problem: Problem, state: State, now: Evaluation) -> tuple[Tensor, Tensor]:
+def _signal(problem: RolloutProblem, state: State, now: Instant) -> tuple[Tensor, Tensor]:
     """`(n, n_contacts)`: what crosses zero at the next event, and whether it has."""
     system, active = problem.system, state.active
     crossed = pulling(system, active, now.multiplier) | reached(system, active, now.c, now.cd)
@@ -47,7 +49,7 @@ def _signal(problem: Problem, state: State, now: Evaluation) -> tuple[Tensor, Te
     return signal[:, first.to(signal.device)], crossed
 
 
-def switch(problem: Problem, state: State, crossed: Tensor) -> State:
+def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
     """Open and close the contacts that crossed `(n, n_contacts)`, with the impacts of those that close."""
     active = state.active ^ crossed
     landing = (crossed & active).any(-1)
@@ -58,7 +60,7 @@ def switch(problem: Problem, state: State, crossed: Tensor) -> State:
     return State(state.t, state.q, qd, active)
 
 
-def settle(problem: Problem, state: State, end: Tensor) -> tuple[State, Evaluation, list[ContactEvent]]:
+def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, Instant, list[ContactEvent]]:
     """The state at the start of a step, after contacts that pull have opened and those reached have closed.
 
     The torque may jump there, and λ with it.
@@ -76,7 +78,7 @@ def settle(problem: Problem, state: State, end: Tensor) -> tuple[State, Evaluati
 
 
 def advance(
-    problem: Problem, step: Step, state: State, first: Evaluation, h: Tensor
+    problem: RolloutProblem, step: Step, state: State, first: Instant, h: Tensor
 ) -> tuple[State, list[ContactEvent]]:
     """One step of the batch, stopping each trajectory at its events on the way.
 
@@ -109,10 +111,10 @@ def advance(
 
 @torch.no_grad()
 def _locate(
-    problem: Problem,
+    problem: RolloutProblem,
     step: Step,
     state: State,
-    first: Evaluation,
+    first: Instant,
     h: Tensor,
     signal: Tensor,
     crossed: Tensor,
@@ -144,9 +146,41 @@ def _locate(
     return fraction
 
 
-def _listed(problem: Problem, state: State, crossed: Tensor) -> list[ContactEvent]:
+def _listed(problem: RolloutProblem, state: State, crossed: Tensor) -> list[ContactEvent]:
     names = problem.system.contact_names
     return [
         ContactEvent(float(state.t[row, 0]), row, names[k], bool(state.active[row, k]))
         for row, k in crossed.nonzero().tolist()
     ]
+
+
+def contact_loss_probability(
+    model: ForwardModel, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
+) -> Tensor:
+    """Probability that a contact would have to pull at a state, and therefore opens.
+
+    P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²). A contact that is open is lost already: its
+    probability is 1.
+
+    Args:
+        model: a model with a posterior over forces.
+        q, qd, tau: `(*batch, nq)` states.
+        active: `(*batch, n_contacts)` bool, closed contacts; default all.
+
+    Returns:
+        `(*batch, m)`, between 0 and 1.
+
+    Raises:
+        ModelError: the model gives no variance of the multiplier.
+    """
+    found = model.predict(q, qd, tau, "multiplier", active=active, covariance=True)
+    if found.std is None:
+        raise ModelError(
+            f"a {model.kind!r} model gives no uncertainty of the multiplier",
+            hint="use StructuredGP, or compare the predicted multiplier with zero",
+        )
+    certain = found.std == 0.0
+    probability = torch.special.ndtr(-found.mean / torch.where(certain, 1.0, found.std))
+    probability = torch.where(certain, (found.mean < 0.0).to(probability.dtype), probability)
+    closed = model.system.active_rows(active, found.mean.shape[:-1])
+    return torch.where(closed, probability, 1.0)

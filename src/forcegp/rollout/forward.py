@@ -16,7 +16,7 @@ from forcegp.errors import ForceGPError, ModelError, UnknownNameError
 from forcegp.resources import one_thread
 from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
-from forcegp.rollout.law import ForceLaw, ForwardModel, Law, Problem, State, law_of
+from forcegp.rollout.law import ForceLaw, ForwardModel, Law, RolloutProblem, State, law_of
 from forcegp.rollout.trajectory import FIELDS, DivergedError, Rollout
 
 STEP = 1.0 / 240.0
@@ -181,12 +181,12 @@ def rollout_model(
     batch = torch.broadcast_shapes(q0.shape[:-1], qd0.shape[:-1])
     law, system = law_of(model, system), system or model.system
     shares, start = (2 if samples else 1), (q0, qd0)
-    report = _share(progress, 0, shares)
+    report = share_of(progress, 0, shares)
     found = _run(law, system, start, tau, duration, batch, active, options, report)
     if samples:
         generator = torch.Generator().manual_seed(seed)
         force = ForceLaw(model.force_samples(samples, generator))
-        whole, report = torch.Size((samples, *batch)), _share(progress, 1, shares)
+        whole, report = torch.Size((samples, *batch)), share_of(progress, 1, shares)
         density = model.torque_disturbance if options.torque_noise else None
         noise = None if density is None else (density, generator)
         sampled = _run(
@@ -226,7 +226,7 @@ def _run(
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
     system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
     mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
-    problem = Problem(mechanics, law, inputs, unilateral, options.sticking)
+    problem = RolloutProblem(mechanics, law, inputs, unilateral, options.sticking)
     with one_thread() if n <= FEW else nullcontext():
         found = integrate(
             problem,
@@ -246,7 +246,7 @@ def _run(
 
 
 def _initial(
-    problem: Problem, start: tuple[Tensor, Tensor], whole: torch.Size, active: Tensor | None
+    problem: RolloutProblem, start: tuple[Tensor, Tensor], whole: torch.Size, active: Tensor | None
 ) -> State:
     """The initial states of all trajectories, and the contacts that are closed there."""
     n, contacts = whole.numel(), len(problem.system.contacts)
@@ -267,7 +267,7 @@ def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
     return ~(apart & can_open(system, apart))
 
 
-def _share(progress: Progress | None, part: int, parts: int) -> Progress | None:
+def share_of(progress: Progress | None, part: int, parts: int) -> Progress | None:
     """Progress of one of several runs of the same length, as part of the whole."""
     if progress is None:
         return None

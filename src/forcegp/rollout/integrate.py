@@ -1,6 +1,11 @@
 """Integration of a rollout over time: the methods for one step, and the loop over all steps.
 
 The methods are semi-implicit Euler, Runge-Kutta of order four, and SciPy's adaptive ones with error control.
+
+After a step the state may be projected onto the constraint manifold, c(q) = 0 and A q̇ = 0, in the metric of
+M. Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces
+push; q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy, and also the velocity
+after an inelastic impact without friction, M (q̇⁺ − q̇⁻) = AᵀΛ with A q̇⁺ = 0.
 """
 
 from __future__ import annotations
@@ -13,11 +18,67 @@ import scipy
 import torch
 from torch import Tensor
 
-from forcegp.constraints.projection import project_state
+from forcegp.constraints.gauss import Equations
+from forcegp.constraints.system import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError, NumericalError
 from forcegp.rollout.events import ContactEvent, advance, settle
-from forcegp.rollout.law import Evaluation, Problem, State, Step
+from forcegp.rollout.law import Instant, RolloutProblem, State, Step
 from forcegp.rollout.trajectory import Divergence, Rollout
+from forcegp.types import ActiveContacts, JointVector
+
+POSITION_TOLERANCE = 1e-12
+"""Largest constraint error that counts as none [m]; rounding of the kinematics of an arm leaves 1e-15."""
+ROUNDING = 100.0
+"""Constraint error, in units of the precision's ε, that rounding may leave; it counts in float32 only."""
+MAX_ITERATIONS = 30
+"""Newton doubles the digits in each iteration; a state off by a centimetre needs four."""
+MAX_STEP = 0.2
+"""Largest move of a joint in one iteration [rad, m]; light wrist joints are asked for more than they give."""
+
+
+def project_velocity(eom: Equations, qd: JointVector) -> JointVector:
+    """T q̇ = q̇ − L A q̇, the velocity after an inelastic impact on the active constraints, `(*batch, nq)`."""
+    return qd - (eom.L @ (eom.A @ qd[..., None]))[..., 0]
+
+
+def project_state(
+    system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
+) -> tuple[JointVector, JointVector]:
+    """The state on the constraint manifold next to (q, q̇).
+
+    Args:
+        system: robot and contacts.
+        q, qd: `(*batch, nq)` joint positions and velocities.
+        active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+
+    Returns:
+        q with |c(q)| ≤ 1e−12 m (1e−5 m in float32) and q̇ with A q̇ = 0, for the active contacts.
+
+    Raises:
+        NumericalError: the iteration does not converge, as where the surface is out of reach.
+    """
+    rows = system.active_rows(active, q.shape[:-1])
+    tolerance = max(POSITION_TOLERANCE, ROUNDING * torch.finfo(q.dtype).eps)
+    error = torch.zeros((), dtype=q.dtype)
+    for _ in range(MAX_ITERATIONS):
+        eom = system.equations(q, qd, active)
+        c = torch.where(rows, eom.c, 0.0)
+        error = _largest(c)
+        if float(error) <= tolerance:
+            return q, project_velocity(eom, qd)
+        move = (eom.L @ c[..., None])[..., 0]
+        q = q - move * (MAX_STEP / move.detach().abs().amax(-1, keepdim=True).clamp(min=MAX_STEP))
+    raise NumericalError(
+        "no state on the constraint manifold is found",
+        expected=f"a constraint error of at most {tolerance:g} m after {MAX_ITERATIONS} iterations",
+        got=f"{float(error):.3g} m",
+        hint="start nearer to the surface, and check that the arm can reach it",
+    )
+
+
+def _largest(c: Tensor) -> Tensor:
+    return c.detach().abs().max() if c.numel() else c.new_zeros(())
+
 
 Progress = Callable[[int, int], None]
 """Called with the number of steps done and the total number."""
@@ -27,13 +88,13 @@ ABSOLUTE_TOLERANCE = 1e-11
 """Error of an adaptive step in position [rad] and velocity [rad/s]: well below any model's own error."""
 
 
-def semi_implicit_euler(problem: Problem, state: State, first: Evaluation, h: Tensor) -> State:
+def semi_implicit_euler(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
     """q̇⁺ = q̇ + h q̈, q⁺ = q + h q̇⁺, the step of the simulators; of first order."""
     qd = state.qd + h * first.qdd
     return State(state.t + h, state.q + h * qd, qd, state.active)
 
 
-def runge_kutta_4(problem: Problem, state: State, first: Evaluation, h: Tensor) -> State:
+def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
     """The classical Runge-Kutta method, of fourth order."""
     t, q, qd, active = state
     end, half = t + h, 0.5 * h
@@ -55,7 +116,7 @@ def adaptive(method: str) -> Step:
     steps differ, as after an event, are solved together.
     """
 
-    def step(problem: Problem, state: State, first: Evaluation, h: Tensor) -> State:
+    def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
         _refuse_gradients(first, method)
         end, shape = state.t + h, (2, *state.q.shape)
 
@@ -77,7 +138,7 @@ def adaptive(method: str) -> Step:
     return step
 
 
-def _refuse_gradients(first: Evaluation, method: str) -> None:
+def _refuse_gradients(first: Instant, method: str) -> None:
     if first.qdd.requires_grad:
         raise ModelError(
             f"{method} has no gradients",
@@ -100,15 +161,15 @@ class _Record:
     """States at output times, as they are reached."""
 
     states: list[State] = field(default_factory=list)
-    motions: list[Evaluation] = field(default_factory=list)
+    motions: list[Instant] = field(default_factory=list)
     events: list[ContactEvent] = field(default_factory=list)
     diverged: list[Divergence] = field(default_factory=list)
 
-    def write(self, state: State, now: Evaluation, alive: Tensor) -> None:
+    def write(self, state: State, now: Instant, alive: Tensor) -> None:
         """Keep a state; NaN in the rows `(n,)` that were dropped."""
         if not bool(alive.all()):
             rows = alive[:, None]
-            now = Evaluation(*(torch.where(rows, x, torch.nan) for x in now[:-1]))  # pyright: ignore[reportArgumentType]
+            now = Instant(*(torch.where(rows, x, torch.nan) for x in now[:-1]))  # pyright: ignore[reportArgumentType]
             state = state._replace(
                 q=torch.where(rows, state.q, torch.nan), qd=torch.where(rows, state.qd, torch.nan)
             )
@@ -121,7 +182,7 @@ class _Record:
 
 
 def integrate(
-    problem: Problem,
+    problem: RolloutProblem,
     step: Step,
     start: State,
     dt: float,
@@ -177,7 +238,7 @@ def integrate(
 
 
 def _stepped(
-    problem: Problem, step: Step, state: State, now: Evaluation, h: Tensor, record: _Record, alive: Tensor
+    problem: RolloutProblem, step: Step, state: State, now: Instant, h: Tensor, record: _Record, alive: Tensor
 ) -> State:
     """The state one step later, with the contacts that open and close on the way."""
     if not problem.unilateral:
@@ -190,7 +251,7 @@ def _stepped(
 def _stopping(step: Step) -> Step:
     """The method, with joints at rest that dry friction stops within the step, up to its error."""
 
-    def stopped(problem: Problem, state: State, first: Evaluation, h: Tensor) -> State:
+    def stopped(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
         reached = step(problem, state, first, h)
         if first.held is None:
             return reached
@@ -219,7 +280,7 @@ def _give_up(record: _Record, state: State, rows: Tensor, reason: str) -> None:
         record.diverged.append(Divergence(t, row, q, qd, reason))
 
 
-def _result(problem: Problem, record: _Record, dt: float) -> Rollout:
+def _result(problem: RolloutProblem, record: _Record, dt: float) -> Rollout:
     states, motions = record.states, record.motions
     if not motions:
         raise ForceGPError(

@@ -12,9 +12,17 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ParameterError, UnknownNameError
-from forcegp.plots.panels import Curve, Panel, Target, chosen, draw_panels
-from forcegp.plots.style import MEASURED, PREDICTED, axis_label
-from forcegp.plots.timeline import Timeline
+from forcegp.plots import (
+    MEASURED,
+    PREDICTED,
+    Curve,
+    Panel,
+    Target,
+    Timeline,
+    axis_label,
+    chosen,
+    draw_panels,
+)
 
 JOINT_QUANTITIES = ("q", "qd", "qdd", "tau")
 CONTACT_QUANTITIES = ("multiplier", "c", "cd")

@@ -19,7 +19,7 @@ from forcegp.rollout.events import ContactEvent
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from forcegp.plots.panels import Target
+    from forcegp.plots import Target
 
 FIELDS = ("q", "qd", "qdd", "tau", "multiplier", "c", "cd", "active")
 """Attributes of a rollout that have the shape of its batch."""

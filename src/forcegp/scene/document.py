@@ -12,7 +12,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from forcegp.errors import ForceGPError, SceneError, near_names
+from forcegp.errors import ForceGPError, SceneError, did_you_mean
 from forcegp.limits import KEY_PARTS, SCENE_BYTES, SCENE_KEYS
 
 if sys.version_info >= (3, 11):
@@ -120,7 +120,9 @@ class Document:
             return self.error(f"{self.source}: nested too deeply", got=context.get("error"))
         if kind in _UNKNOWN_KEY:
             known = _known_keys(schema, key)
-            return self.error(f"{place}: unknown key", expected=_one_of(known), hint=_near(last, known))
+            return self.error(
+                f"{place}: unknown key", expected=_one_of(known), hint=did_you_mean(last, known)
+            )
         if kind == "missing" and isinstance(key[-1], int):
             return self.error(f"{place}: too few numbers", expected=f"more than {last}")
         if kind == "missing":
@@ -131,7 +133,7 @@ class Document:
                 return self.error(f"{place}: key 'type' is missing", expected=_one_of(tags))
             tag = str(context["tag"])
             message = f"{self.place((*key, 'type'))}: unknown type {tag!r}"
-            return self.error(message, expected=_one_of(tags), hint=_near(tag, tags))
+            return self.error(message, expected=_one_of(tags), hint=did_you_mean(tag, tags))
         return self.error(f"{place}: {error['msg'][0].lower()}{error['msg'][1:]}", got=repr(error["input"]))
 
     def _named(self, key: Key, message: str) -> Key:
@@ -166,11 +168,6 @@ def _check_keys(text: str, source: str, error: type[ForceGPError]) -> None:
 
 def _one_of(names: list[str]) -> str:
     return f"one of {', '.join(names)}"
-
-
-def _near(name: str, known: list[str]) -> str | None:
-    near = near_names(name, known)
-    return f"did you mean {near[0]!r}?" if near else None
 
 
 def _known_keys(schema: type, key: Key) -> list[str]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 
 import torch
 
 from forcegp.constraints import ConstrainedSystem, Constraint, PointConnection, SurfaceContact
-from forcegp.errors import SceneError
+from forcegp.errors import SceneError, did_you_mean
 from forcegp.robot import RobotModel, load_robot
 from forcegp.robot.load import BUNDLED as BUNDLED_ROBOTS
 from forcegp.scene.document import Document
@@ -78,12 +77,11 @@ class Scene:
         bundled = section.model in BUNDLED_ROBOTS
         source = section.model if bundled else self.folder / section.model
         if not bundled and not _is_file(Path(source)):
-            near = get_close_matches(section.model, BUNDLED_ROBOTS, n=1)
             raise SceneError(
                 f"{self.document.place(('robot', 'model'))}: no such robot",
                 expected=f"a URDF or MJCF file, or one of {', '.join(BUNDLED_ROBOTS)}",
                 got=repr(section.model),
-                hint=f"did you mean {near[0]!r}?" if near else f"paths start at {self.folder}",
+                hint=did_you_mean(section.model, BUNDLED_ROBOTS) or f"paths start at {self.folder}",
             )
         options = section.model_dump(exclude={"model"})
         return self.document.at(("robot",), load_robot, source, **options, dtype=dtype, device=device)
@@ -135,11 +133,10 @@ def load_scene(source: str | Path) -> Scene:
     path = Path(str(files("forcegp.scene") / "bundled" / f"{source}.toml")) if bundled else Path(source)
     if not _is_file(path):
         beside = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
-        near = get_close_matches(str(source), [*BUNDLED, *beside], n=1)
         raise SceneError(
             f"{path}: no such scene",
             expected=f"a TOML file, or one of {', '.join(BUNDLED)}",
-            hint=f"did you mean {near[0]!r}?" if near else None,
+            hint=did_you_mean(source, [*BUNDLED, *beside]),
         )
     document = Document(path.read_bytes(), str(path))
     return Scene(document.validated(SceneSections), document, path.parent)

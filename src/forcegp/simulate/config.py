@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from forcegp.control.motion import MotionConfig
+from forcegp.control.plan import MotionConfig
 from forcegp.errors import ForceGPError
 
 CONTACTS = ("rigid", "solver")

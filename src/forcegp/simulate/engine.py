@@ -1,9 +1,19 @@
-"""What a physics engine must offer to simulate a robot, and where to get one."""
+"""What a physics engine must offer to simulate a robot, and where to get one.
+
+`check_engine` compares it with our own equations of motion.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import torch
+from torch import Tensor
+
+from forcegp import dynamics
+from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import MissingDependencyError, UnknownNameError
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointMatrix, JointVector
@@ -86,3 +96,117 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
         return PyBulletEngine(robot, dt)
     except MissingDependencyError:
         return MuJoCoEngine(robot, dt)
+
+
+CHUNK = 8192
+"""States whose equations are held in memory at once."""
+
+
+@dataclass(frozen=True)
+class EngineCheck:
+    """Largest differences between an engine and our library on random states.
+
+    Attributes:
+        engine: name and version.
+        states: number of states compared.
+        mass_matrix: [kg m²].
+        inverse_dynamics: [N m].
+        free_acceleration: of one step under a random force [rad/s²].
+        constrained_acceleration: of one step with the constraint force and joint friction applied [rad/s²].
+        largest_acceleration: largest acceleration of all these steps, for scale [rad/s²].
+    """
+
+    engine: str
+    states: int
+    mass_matrix: float
+    inverse_dynamics: float
+    free_acceleration: float
+    constrained_acceleration: float
+    largest_acceleration: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.engine}, {self.states} random states, largest differences: "
+            f"mass matrix {self.mass_matrix:.1e} kg m², inverse dynamics {self.inverse_dynamics:.1e} N m, "
+            f"free acceleration {self.free_acceleration:.1e} rad/s², "
+            f"constrained acceleration {self.constrained_acceleration:.1e} rad/s² "
+            f"(of {self.largest_acceleration:.0f})"
+        )
+
+
+def check_engine(
+    system: ConstrainedSystem, engine: Engine, generator: torch.Generator, states: int = 50
+) -> EngineCheck:
+    """Compare an engine with our library on random states.
+
+    Args:
+        system: robot and contacts.
+        engine: holds the same robot.
+        generator: source of the states: angles in ±π, speeds and accelerations of some rad/s and rad/s².
+        states: how many.
+
+    Returns:
+        The largest differences.
+    """
+    robot = system.robot
+
+    def draw(scale: float) -> Tensor:
+        return scale * torch.randn(states, robot.nq, dtype=torch.float64, generator=generator).to(robot.dtype)
+
+    with torch.no_grad():
+        turns = torch.rand(states, robot.nq, dtype=torch.float64, generator=generator).to(robot.dtype)
+        q, qd, qdd, force = math.pi * (2.0 * turns - 1.0), draw(1.0), draw(5.0), draw(20.0)
+        eom = system.equations(q, qd)
+        Q_bar = eom.Q_K + force
+        free = dynamics.forward_dynamics(robot, q, qd, force)
+        constrained = eom.acceleration(Q_bar)
+        held = force + eom.Q_D + eom.constraint_force(Q_bar)
+        return EngineCheck(
+            engine=engine.name,
+            states=states,
+            mass_matrix=_largest(torch.stack([engine.mass_matrix(x) for x in q]) - eom.M),
+            inverse_dynamics=_largest(
+                torch.stack([engine.inverse_dynamics(*x) for x in zip(q, qd, qdd, strict=True)])
+                - dynamics.inverse_dynamics(robot, q, qd, qdd)
+            ),
+            free_acceleration=_largest(_step(engine, q, qd, force) - free),
+            constrained_acceleration=_largest(_step(engine, q, qd, held) - constrained),
+            largest_acceleration=max(_largest(free), _largest(constrained)),
+        )
+
+
+def acceleration_mismatch(
+    system: ConstrainedSystem,
+    q: JointVector,
+    qd: JointVector,
+    qdd: JointVector,
+    Q_bar: JointVector,
+    active: Tensor,
+) -> float:
+    """Largest difference between logged accelerations and L b + H Q̄ of our equations [rad/s²].
+
+    Args:
+        system: robot and contacts.
+        q, qd, qdd: `(n, nq)` logged motion, without noise.
+        Q_bar: `(n, nq)` impressed forces Q + Q_z.
+        active: `(n, n_contacts)` closed contacts.
+    """
+    worst = 0.0
+    for rows in torch.arange(len(q)).split(CHUNK):
+        ours = system.equations(q[rows], qd[rows], active=active[rows]).acceleration(Q_bar[rows])
+        worst = max(worst, _largest(ours - qdd[rows]))
+    return worst
+
+
+def _step(engine: Engine, q: Tensor, qd: Tensor, force: Tensor) -> Tensor:
+    """Accelerations of one step from each state."""
+    accelerations = []
+    for state in zip(q, qd, force, strict=True):
+        engine.reset(state[0], state[1])
+        engine.step(state[2])
+        accelerations.append((engine.state()[1] - state[1]) / engine.dt)
+    return torch.stack(accelerations)
+
+
+def _largest(difference: Tensor) -> float:
+    return float(difference.abs().max())

@@ -14,13 +14,13 @@ from forcegp.control.plan import Plan
 from forcegp.control.task_space import tool_motion
 from forcegp.control.trajectory import Reference
 from forcegp.data.dataset import Dataset
-from forcegp.data.header import DataHeader
-from forcegp.simulate.check import acceleration_mismatch
+from forcegp.data.fields import DataHeader
 from forcegp.simulate.config import SimulationConfig
+from forcegp.simulate.engine import acceleration_mismatch
 
 
 @dataclass(frozen=True)
-class Log:
+class RunLog:
     """What is written down at every step.
 
     Attributes:
@@ -47,14 +47,14 @@ class Log:
     measured: dict[str, Tensor] = field(default_factory=dict)
 
     @staticmethod
-    def empty(steps: int, system: ConstrainedSystem) -> Log:
+    def empty(steps: int, system: ConstrainedSystem) -> RunLog:
         """Room for a number of steps."""
 
         def columns(width: int, dtype: torch.dtype = system.robot.dtype) -> Tensor:
             return torch.zeros(steps, width, dtype=dtype)
 
         nq, m = system.robot.nq, system.m
-        return Log(
+        return RunLog(
             q=columns(nq),
             qd=columns(nq),
             qdd=columns(nq),
@@ -141,7 +141,7 @@ def make_result(
     system: ConstrainedSystem,
     config: SimulationConfig,
     plan: Plan,
-    log: Log,
+    log: RunLog,
     engine: str,
     generator: torch.Generator,
 ) -> SimulationResult:
@@ -165,7 +165,7 @@ def make_result(
     )
 
 
-def _mismatch(system: ConstrainedSystem, config: SimulationConfig, log: Log) -> float:
+def _mismatch(system: ConstrainedSystem, config: SimulationConfig, log: RunLog) -> float:
     """Largest difference of the engine's accelerations to ours, under its contact forces if it has any."""
     if config.contact == "solver":
         force = log.Q + log.Q_I + log.Q_z
@@ -178,7 +178,7 @@ def _dataset(
     system: ConstrainedSystem,
     config: SimulationConfig,
     plan: Plan,
-    log: Log,
+    log: RunLog,
     engine: str,
     generator: torch.Generator,
 ) -> Dataset:
@@ -209,7 +209,7 @@ def _dataset(
     )
 
 
-def _multipliers(system: ConstrainedSystem, log: Log) -> dict[str, dict[str, Tensor]]:
+def _multipliers(system: ConstrainedSystem, log: RunLog) -> dict[str, dict[str, Tensor]]:
     """λ by contact, for constraints of one row."""
     if not system.contacts:
         return {}

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forcegp import kinematics
-from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.models.base import Predictor
 from forcegp.rollout import Rollout, RolloutOptions
+from forcegp.rollout.comparison import tip_of
 from forcegp.rollout.inputs import sampling_period
 
 Array = NDArray[np.float64]
@@ -138,18 +139,11 @@ def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: floa
     )
 
 
-def tip_of(system: ConstrainedSystem) -> tuple[str, tuple[float, ...]]:
-    """Frame and point of the first contact with a surface, or else the last frame of the robot."""
-    for contact in system.contacts:
-        if isinstance(contact, SurfaceContact):
-            return contact.frame, tuple(contact.point)
-    return system.robot.frame_names[-1], (0.0, 0.0, 0.0)
-
-
 def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:
     """Positions of the tip `(n, 3)`, up to where a trajectory diverged [m]."""
     sound = int(torch.isfinite(q).all(-1).long().cumprod(0).sum())
-    return _array(kinematics.point_position(system.robot, q[:sound], *tip_of(system)))
+    frame, point = tip_of(system)
+    return _array(kinematics.point_position(system.robot, q[:sound], frame, tuple(point)))
 
 
 def pictures(t: Tensor) -> Tensor:

@@ -1,5 +1,146 @@
-"""One file per log format; `read` picks the reader by content, never by running what the file holds."""
+"""Which format a log has, by its first bytes and then by its name; formats that can run code are refused."""
 
-from forcegp.logs.readers.detect import FORMATS, read
+from __future__ import annotations
 
-__all__ = ["FORMATS", "read"]
+import zipfile
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+from forcegp.errors import DataError
+from forcegp.logs.table import LogTable, Progress, Wanted
+
+_READERS = {
+    "text": ("CSV or text columns", "text.read_text"),
+    "text folder": ("a folder of text columns", "text.read_folder"),
+    "parquet": ("Parquet", "parquet.read_parquet"),
+    "numpy": ("NumPy .npz or .npy", "arrays.read_numpy"),
+    "matlab": ("MATLAB .mat", "arrays.read_matlab"),
+    "hdf5": ("HDF5", "arrays.read_hdf5"),
+    "rosbag1": ("ROS 1 bag", "bags.read_rosbag1"),
+    "rosbag2": ("ROS 2 bag", "bags.read_rosbag2"),
+    "mcap": ("MCAP", "bags.read_mcap"),
+    "lerobot": ("LeRobot data set", "parquet.read_lerobot"),
+}
+FORMATS = {kind: name for kind, (name, _) in _READERS.items()}
+"""Formats that are read, with what they are called in messages."""
+
+_MAGIC = (
+    (b"PAR1", "parquet"),
+    (b"\x89HDF\r\n\x1a\n", "hdf5"),
+    (b"#ROSBAG V2.0", "rosbag1"),
+    (b"SQLite format 3\x00", "rosbag2"),
+    (b"\x89MCAP0\r\n", "mcap"),
+    (b"MATLAB 5.0", "matlab"),
+    (b"MATLAB 7.3", "matlab"),
+    (b"\x93NUMPY", "numpy"),
+)
+_TEXT = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", ".tab", ".prn")
+_REFUSED = (".pkl", ".pickle", ".pt", ".pth", ".ckpt", ".joblib", ".dill", ".rdata", ".rds")
+
+
+def read(
+    path: str | Path,
+    *,
+    wanted: Wanted | None = None,
+    rows: int | None = None,
+    progress: Progress | None = None,
+) -> LogTable:
+    """Read a log of any format that is known.
+
+    Args:
+        path: file or folder.
+        wanted: which columns to read; default all.
+        rows: read no more rows than this, where the format allows to stop early.
+        progress: called with the work done and the total.
+
+    Raises:
+        DataError: no such file, a format that is not read or not safe, damage, or a size beyond the limits.
+        MissingDependencyError: the format's reader is not installed.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "run.csv"
+    >>> _ = file.write_text("t;q\\n0,0;1,5\\n0,1;1,75\\n")
+    >>> read(file).streams[0].columns["q"].tolist()
+    [1.5, 1.75]
+    """
+    place = Path(path)
+    module, _, name = _READERS[format_of(place)][1].partition(".")
+    reader: Callable[..., LogTable] = getattr(import_module(f"forcegp.logs.readers.{module}"), name)
+    keep: Wanted = wanted if wanted is not None else lambda name: True
+    return reader(place, wanted=keep, rows=rows, progress=progress)
+
+
+def format_of(path: Path) -> str:
+    """The key in `FORMATS` of a log.
+
+    Raises:
+        DataError: no such file, or a format that is not read or not safe to read.
+    """
+    if path.is_dir():
+        return _format_of_folder(path)
+    if not path.is_file():
+        raise DataError(
+            f"{path}: no such log", hint=None if path.parent.is_dir() else f"{path.parent} is not a folder"
+        )
+    suffix = path.suffix.lower()
+    with path.open("rb") as file:
+        head = file.read(32)
+    _refuse_pickles(path, suffix, head)
+    for magic, kind in _MAGIC:
+        if head.startswith(magic):
+            return "matlab" if kind == "hdf5" and suffix == ".mat" else kind
+    if head.startswith(b"PK\x03\x04"):
+        return _format_of_zip(path)
+    if suffix in _TEXT:
+        return "text"
+    if suffix == ".mat":
+        return "matlab"
+    raise _unknown(path, f"{suffix or 'no ending'}, first bytes {head[:8]!r}")
+
+
+def _format_of_folder(path: Path) -> str:
+    if (path / "meta" / "info.json").is_file():
+        return "lerobot"
+    if (path / "metadata.yaml").is_file():
+        return "rosbag2"
+    endings = {child.suffix.lower() for child in path.iterdir() if child.is_file()}
+    if endings & {".db3", ".mcap"}:
+        raise DataError(
+            f"{path}: a folder with bag files and no metadata.yaml",
+            hint="name the .db3 or .mcap file itself",
+        )
+    if endings & set(_TEXT):
+        return "text folder"
+    raise _unknown(path, "a folder with files ending in " + (", ".join(sorted(endings)) or "nothing"))
+
+
+def _format_of_zip(path: Path) -> str:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as cause:
+        raise DataError(f"{path}: the archive is damaged", got=str(cause)) from cause
+    if any(name.endswith((".pkl", ".pickle")) for name in names):
+        raise _unsafe(path, "an archive with a pickle, such as a PyTorch file")
+    if names and all(name.endswith(".npy") for name in names):
+        return "numpy"
+    raise _unknown(path, "a zip archive")
+
+
+def _refuse_pickles(path: Path, suffix: str, head: bytes) -> None:
+    protocol = len(head) > 2 and head[0] == 0x80 and 2 <= head[1] <= 5
+    if suffix in _REFUSED or (protocol and suffix not in _TEXT):
+        raise _unsafe(path, f"a file ending in {suffix}" if suffix in _REFUSED else "a pickle")
+
+
+def _unsafe(path: Path, what: str) -> DataError:
+    return DataError(
+        f"{path}: refused, because reading {what} can run code that it holds",
+        expected=", ".join(FORMATS.values()),
+        hint="save the arrays as Parquet, CSV or .npz",
+    )
+
+
+def _unknown(path: Path, got: str) -> DataError:
+    return DataError(f"{path}: not a log format that is read", expected=", ".join(FORMATS.values()), got=got)

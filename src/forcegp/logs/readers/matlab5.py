@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import bounds
+from forcegp.logs.table import check_count
 
 HEADER_BYTES = 128
 MATRIX, COMPRESSED, INT8, UTF8 = 14, 15, 1, 16
@@ -107,7 +107,7 @@ class _Reader:
         if depth > limits.GROUP_DEPTH:
             raise DataError(f"{self.source}: structs are nested more than {limits.GROUP_DEPTH} levels deep")
         self.count += 1
-        bounds.check_count(self.source, "variables and fields", self.count, limits.COLUMNS)
+        check_count(self.source, "variables and fields", self.count, limits.COLUMNS)
         if not len(body):
             return Variable("", "holds nothing")
         parts = self.elements(body)

@@ -1,25 +1,39 @@
-"""Parquet tables, with vectors in one column or one column per number."""
+"""Parquet tables, with vectors in one column or one column per number, and LeRobot data sets.
+
+A LeRobot data set, version 2.1 or 3, is a folder with `meta/info.json` and Parquet files of episodes.
+"""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs import bounds
-from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, foreign
+from forcegp.logs.table import (
+    Column,
+    LogTable,
+    Progress,
+    Stream,
+    Wanted,
+    check_count,
+    check_expansion,
+    check_values,
+    foreign,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
 
 BATCH_ROWS = 1 << 16
 """Rows that are decoded at a time."""
 
 
-def read(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
     """Read the columns of numbers, flags and times; a list column becomes `name[0]`, `name[1]`, …
 
     Raises:
@@ -50,7 +64,7 @@ def read_columns(
     for path in paths:
         with pq.ParquetFile(path) as file:
             total += _check(str(path), file)
-            bounds.check_values(str(path), total, 1)
+            check_values(str(path), total, 1)
     length = sum(path.stat().st_size for path in paths)
     done = 0
     for path in paths:
@@ -62,8 +76,8 @@ def read_columns(
                         if wanted(part) or wanted(name):
                             chunks.setdefault(part, []).append(values)
                 done += len(batch)
-                bounds.check_values(str(path), done, max(len(chunks), 1))
-                bounds.check_expansion(str(path), 8 * done * len(chunks), length)
+                check_values(str(path), done, max(len(chunks), 1))
+                check_expansion(str(path), 8 * done * len(chunks), length)
                 if progress is not None:
                     progress(done, total)
                 if rows is not None and done >= rows:
@@ -83,10 +97,10 @@ def _joined(source: str, chunks: dict[str, list[Column]], done: int, rows: int |
 def _check(source: str, file: object) -> int:
     """Number of rows of a file whose claimed size is within the limits."""
     shape = file.metadata  # pyright: ignore[reportAttributeAccessIssue]
-    bounds.check_count(source, "columns", shape.num_columns, limits.COLUMNS)
+    check_count(source, "columns", shape.num_columns, limits.COLUMNS)
     groups = [shape.row_group(i) for i in range(shape.num_row_groups)]
     numbers = sum(group.column(j).num_values for group in groups for j in range(group.num_columns))
-    bounds.check_count(source, "numbers", numbers, limits.LOG_VALUES)
+    check_count(source, "numbers", numbers, limits.LOG_VALUES)
     return shape.num_rows
 
 
@@ -131,7 +145,64 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
             expected=f"{width} numbers in every row",
             got=f"{lengths[row]} in row {row}",
         )
-    bounds.check_count(source, "columns", width, limits.COLUMNS)
+    check_count(source, "columns", width, limits.COLUMNS)
     flat = pc.cast(values.flatten(), pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     table = flat.reshape(len(values), width)
     return {f"{name}[{i}]": np.ascontiguousarray(table[:, i]) for i in range(width)}
+
+
+MAX_INFO_BYTES = 4 << 20
+"""Size of the description of a data set."""
+
+
+def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the columns of numbers of all episodes; `observation.state` of six motors becomes six columns.
+
+    The columns are named as in `meta/info.json`: `observation.state.<motor>`, or `observation.state[i]`
+    where the motors have no names. Images and videos are not read.
+
+    Raises:
+        DataError: the folder is not a LeRobot data set, or is damaged or too large.
+    """
+    features = _features(path / "meta" / "info.json")
+    files = sorted((path / "data").rglob("*.parquet"))
+    check_count(str(path), "files", len(files), limits.LOG_FILES)
+    if not files:
+        raise DataError(f"{path}: no episodes", expected=f"Parquet files below {path / 'data'}")
+    names: dict[str, str] = {}
+    for feature, description in features.items():
+        for i, motor in enumerate(_motors(description)):
+            names[f"{feature}[{i}]"] = f"{feature}.{motor}"[: limits.LOG_NAME]
+    remarks: list[str] = []
+    with foreign(str(path), "a LeRobot data set"):
+        columns = read_columns(files, lambda n: wanted(names.get(n, n)), rows, remarks, progress)
+    renamed: dict[str, Column] = {}
+    for name, values in columns.items():
+        renamed[names.get(name, name)] = values
+    return LogTable(str(path), "lerobot", (Stream("", renamed),), tuple(remarks))
+
+
+def _features(file: Path) -> dict[str, Any]:
+    check_count(str(file), "bytes", file.stat().st_size, MAX_INFO_BYTES)
+    try:
+        info = json.loads(file.read_text(encoding="utf-8"))
+        features = info["features"]
+        if not isinstance(features, dict):
+            raise TypeError("features is not a table")
+    except (ValueError, KeyError, TypeError, RecursionError) as cause:
+        raise DataError(
+            f"{file}: not the description of a LeRobot data set",
+            expected="JSON with 'features'",
+            got=str(cause)[:200],
+        ) from cause
+    return features
+
+
+def _motors(description: Any) -> list[str]:
+    """Names of the numbers of a feature: a list, or a list under one key such as `motors`."""
+    names = description.get("names") if isinstance(description, dict) else None
+    if isinstance(names, dict) and len(names) == 1:
+        names = next(iter(names.values()))
+    if isinstance(names, list) and all(isinstance(n, str) for n in names) and len(set(names)) == len(names):
+        return names[: limits.COLUMNS]
+    return []

@@ -1,0 +1,319 @@
+"""`forcegp import`, `check` and `select`: a log of any program as a data set, its faults, its points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from forcegp.cli.common import (
+    AsJson,
+    Differentiate,
+    RobotName,
+    SceneOrNone,
+    check_apart,
+    check_data_destination,
+    check_robot_named,
+    progress_bar,
+    read_data,
+    show,
+    system_of,
+)
+
+if TYPE_CHECKING:
+    from forcegp.checks import Report
+    from forcegp.constraints import ConstrainedSystem
+    from forcegp.data import Dataset
+    from forcegp.data.selection import Split
+    from forcegp.logs import Imported
+
+
+def import_(
+    log: Annotated[Path, typer.Argument(help="Log file or folder.")],
+    scene: SceneOrNone = None,
+    robot: RobotName = None,
+    mapping: Annotated[
+        str | None, typer.Option("--mapping", "-m", help="Mapping file, or the name of a bundled one.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Where the data set goes (.parquet).")
+    ] = None,
+    guess: Annotated[
+        Path | None, typer.Option(help="Write a mapping to this file for you to check, and import nothing.")
+    ] = None,
+    fit_surface: Annotated[
+        Literal["plane", "sphere"] | None,
+        typer.Option(help="Fit a surface to the path of each contact, and propose it for the scene."),
+    ] = None,
+    tip_radius: Annotated[
+        str | None,
+        typer.Option(
+            help="With --fit-surface: radius in metres of a ball that ends at the scene's point, or fit; "
+            "default: the scene's tip."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Import a log: CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bags, MCAP or LeRobot.
+
+    A mapping in TOML says which column is which joint, with units, signs and frames; --guess writes one.
+
+    [bold]Examples[/bold]
+
+    forcegp import run.csv --scene my_scene.toml --guess mapping.toml
+
+    forcegp import run.csv --scene my_scene.toml --mapping mapping.toml --out log.parquet
+
+    forcegp import run.bag --robot ur3.urdf --mapping ur3_bag --out log.parquet
+    """
+    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.errors import ForceGPError
+    from forcegp.logs import import_log
+
+    check_robot_named(scene, robot)
+    if guess is not None:
+        check_destination(guess)
+        check_apart(guess, log)
+        show(_guess(log, system_of(scene, robot), guess), as_json)
+        return
+    if out is None or out.suffix.lower() != ".parquet":
+        raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
+    check_destination(out)
+    check_apart(out, log)
+    system = system_of(scene, robot)
+    with progress_bar(f"reading {log.name}", 1) as advance:
+        imported = import_log(log, system, mapping, progress=advance)
+    write_or_keep(imported.data.write, out)
+    result = _json(imported) if as_json else _summary(imported)
+    if fit_surface is not None:
+        result |= _surfaces(imported, system, fit_surface, _tip_radius(tip_radius))
+    show(result | {"file": str(out)}, as_json)
+
+
+def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]:
+    from forcegp.destination import write_or_keep
+    from forcegp.files import write_text
+    from forcegp.logs.guess import guess_mapping
+
+    with progress_bar(f"looking at {log.name}", 1) as advance:
+        guessed = guess_mapping(log, system, progress=lambda done, total: advance(done, total))
+    write_or_keep(lambda path: write_text(path, guessed.toml), out)
+    doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
+    return {"mapping": str(out), **doubts, "next": f"check {out}, then import with --mapping {out}"}
+
+
+def _summary(imported: Imported) -> dict[str, object]:
+    """Rows, trajectories and period, then what was found and done."""
+    data, report = imported.data, imported.report
+    result: dict[str, object] = {
+        "rows": f"{len(data)} from {report.rows_read} logged",
+        "segments": int(data.segment[-1]) + 1,
+        "period_s": data.header.dt,
+    }
+    result |= {f"found_{i + 1}": finding.message for i, finding in enumerate(report.findings)}
+    return result | {f"step_{i + 1}": step for i, step in enumerate(report.steps)}
+
+
+def _tip_radius(text: str | None) -> float | Literal["fit"] | None:
+    """The radius of the tip as it was given.
+
+    Raises:
+        ForceGPError: neither a length nor `fit`.
+    """
+    from forcegp.errors import ForceGPError
+
+    if text is None or text == "fit":
+        return text
+    try:
+        radius = float(text)
+    except ValueError:
+        radius = -1.0
+    if not 0.0 <= radius < float("inf"):
+        raise ForceGPError("no such radius of the tip", expected="a length in metres, or fit", got=text)
+    return radius
+
+
+def _surfaces(
+    imported: Imported,
+    system: ConstrainedSystem,
+    kind: Literal["plane", "sphere"],
+    tip_radius: float | Literal["fit"] | None,
+) -> dict[str, object]:
+    """The surface of each contact that was closed, as a line for the scene."""
+    from forcegp.logs.surface_fit import fit_surface
+
+    touched = [name for name, closed in imported.data.contact.items() if bool(closed.any())]
+    fits = {name: fit_surface(imported.data, system, name, kind, tip_radius) for name in touched}
+    return {name: fit.toml().strip() for name, fit in fits.items()}
+
+
+def _json(imported: Imported) -> dict[str, object]:
+    from dataclasses import asdict
+
+    data, report = imported.data, imported.report
+    return {
+        "format": report.format,
+        "rows_read": report.rows_read,
+        "rows": len(data),
+        "segments": len(data.segment.unique()),
+        "period_s": data.header.dt,
+        "noise_std": data.header.noise_std,
+        "contacts": [asdict(evidence) for evidence in imported.contacts],
+        "findings": [asdict(finding) for finding in report.findings],
+        "steps": report.steps,
+    }
+
+
+NOT_USABLE = 1
+"""Exit code where a finding makes a fit worthless."""
+COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
+
+
+def check(
+    data: Annotated[
+        Path, typer.Option("--data", "-d", help="Log, .parquet or .csv; NaN and gaps are findings.")
+    ],
+    scene: SceneOrNone = None,
+    robot: RobotName = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="HTML page with a picture of each finding.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise, motion.
+
+    The last line says whether to go on. The exit code is 0 where a model can be fitted, 1 where a finding
+    makes a fit worthless, and 2 where scene or log cannot be read.
+
+    [bold]Examples[/bold]
+
+    forcegp check --scene kuka_plane --data run.parquet
+
+    forcegp check -s my_scene.toml -d run.parquet --out check.html --json
+
+    forcegp check --robot ur3.urdf --data run.parquet
+    """
+    from threadpoolctl import threadpool_limits
+
+    from forcegp.checks import check as run
+    from forcegp.checks import read_log
+    from forcegp.destination import check_destination, write_or_keep
+
+    if out is not None:
+        check_destination(out)
+        check_apart(out, data)
+    system = system_of(scene, robot)
+    log = read_log(data)
+    # Matrices are small: threads of BLAS cost more than they save, and two checks at once would fight.
+    with progress_bar("checking", 1) as progress, threadpool_limits(1, user_api="blas"):
+        report = run(system, log, progress=progress)
+    if out is not None:
+        from forcegp.report.check import write_check
+
+        title = f"{data} on {scene or robot}"
+        write_or_keep(lambda path: write_check(path, title, report, system, log), out)
+    if as_json:
+        show({**report.to_dict(), "page": str(out) if out else None}, as_json)
+    else:
+        _print(report)
+        typer.echo(f"page: {out}" if out else "", nl=out is not None)
+        typer.secho(report.verdict, bold=True)
+    if not report.usable:
+        raise typer.Exit(NOT_USABLE)
+
+
+def _print(report: Report) -> None:
+    """The findings as a table."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from forcegp.checks.log import describe
+
+    if report.findings:
+        table = Table(box=None, pad_edge=False)
+        for heading in ("severity", "kind", "rows", "finding and remedy"):
+            table.add_column(heading, no_wrap=heading in ("severity", "kind"), overflow="fold")
+        for finding in report.findings:
+            whole = finding.intervals == ((0, report.samples),)
+            rows = (
+                "all"
+                if whole
+                else describe(finding.intervals, most=2).removeprefix("rows ").removeprefix("row ")
+            )
+            # Joint and parameter names may hold brackets, which are no markup.
+            body = Text(f"{finding.message}\n").append(f"→ {finding.remedy}", style="dim")
+            kinds = "\nor ".join(finding.kinds)
+            table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), kinds, rows, body)
+        Console().print(table)
+    for name, reason in report.skipped.items():
+        typer.echo(f"not checked: {name} ({reason})")
+
+
+def select(
+    log: Annotated[Path, typer.Argument(help="Data set to select from, .parquet or .csv.")],
+    count: Annotated[int, typer.Option("--count", "-n", min=1, help="Number of training points.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Where the training points go (.parquet).")],
+    rest: Annotated[Path | None, typer.Option(help="Where the test points go (.parquet).")] = None,
+    split: Annotated[
+        Literal["selection", "stretches"],
+        typer.Option(help="Test on all points not selected (the paper), or on held-out stretches of motion."),
+    ] = "selection",
+    stretch: Annotated[float, typer.Option(help="Duration of a held-out stretch in seconds.")] = 3.0,
+    fraction: Annotated[float, typer.Option(help="Part of the motion that is held out.")] = 0.2,
+    margin: Annotated[float, typer.Option(help="Time kept free beside held-out stretches in seconds.")] = 0.0,
+    method: Annotated[
+        Literal["farthest", "even", "random"], typer.Option(help="How training points are chosen.")
+    ] = "farthest",
+    keep_impacts: Annotated[
+        bool, typer.Option("--keep-impacts", help="Keep rows that the log marks as near an impact.")
+    ] = False,
+    differentiate: Differentiate = None,
+    seed: Annotated[int, typer.Option(help="Seed of the held-out stretches and of a random choice.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Select training points that cover a log, and keep the rest for testing.
+
+    Farthest point sampling on standardized positions, velocities and torques: exact, deterministic, and
+    in the order of selection, so that the first k rows are the selection of k points.
+
+    [bold]Examples[/bold]
+
+    forcegp select run.parquet -n 1000 --out train.parquet --rest test.parquet
+
+    forcegp select run.csv -n 400 --split stretches --differentiate 11 -o train.parquet --rest test.parquet
+    """
+    from forcegp.data import split_by_selection, split_by_stretches, without_marked_impacts
+
+    check_data_destination(out, log)
+    if rest is not None:
+        check_data_destination(rest, log, out)
+    whole = read_data(log, differentiate)
+    data = whole if keep_impacts else without_marked_impacts(whole)
+    held_out = {"stretch": stretch, "fraction": fraction, "margin": margin}
+    with progress_bar("selecting points", count) as progress:
+        if split == "selection":
+            parts = split_by_selection(data, count, method=method, seed=seed, progress=progress)
+        else:
+            parts = split_by_stretches(data, count, **held_out, method=method, seed=seed, progress=progress)
+    how = f"of {len(data)} rows by {method} points, split by {split}, seed {seed}"
+    result = _written(data, parts, how, out, rest)
+    if len(data) < len(whole):
+        result["rows_at_impacts_left_out"] = len(whole) - len(data)
+    show(result, as_json)
+
+
+def _written(data: Dataset, parts: Split, how: str, out: Path, rest: Path | None) -> dict[str, object]:
+    """Write training and test points, and say what was written."""
+    from forcegp.destination import write_or_keep
+
+    count = len(parts.train)
+    write_or_keep(data[parts.train].with_step(f"selected {count} training points {how}").write, out)
+    result: dict[str, object] = {"training_points": count, "training_file": str(out)}
+    if rest is not None:
+        write_or_keep(data[parts.test].with_step(f"kept {len(parts.test)} test points {how}").write, rest)
+        result |= {"test_points": len(parts.test), "test_file": str(rest)}
+    if parts.stretches:
+        result["held_out_rows"] = [list(rows) for rows in parts.stretches]
+    return result

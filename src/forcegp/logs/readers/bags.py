@@ -1,0 +1,296 @@
+"""ROS 1 and ROS 2 bags and MCAP files: joint states and wrenches as columns, without a ROS installation.
+
+Columns of a joint state: `position.<joint>`, `velocity.<joint>`, `effort.<joint>`. Of a wrench:
+`force.x` to `torque.z`. Of both: `header`, the stamp that the driver gave [s], and `receive`, the time of
+recording [s], each counted from the earliest one in the log, as float64 has no nanoseconds since 1970.
+
+The layouts are those of the ROS distributions; definitions that a bag carries are not compiled.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from forcegp import limits
+from forcegp.errors import DataError, optional_module
+from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, check_count, foreign
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+KINDS = (JOINT_STATE, WRENCH)
+"""Message types that are read."""
+QUANTITIES = ("position", "velocity", "effort")
+CLOCKS = ("header", "receive")
+"""Columns of time that every topic has."""
+
+Decode = Callable[[bytes], Any]
+
+
+def canonical(kind: str) -> str:
+    """The ROS 2 name of a message type.
+
+    >>> canonical("sensor_msgs/JointState")
+    'sensor_msgs/msg/JointState'
+    """
+    package, _, name = kind.partition("/")
+    return f"{package}/msg/{name}" if "/" not in name else kind
+
+
+def decoder(kind: str, encoding: str) -> Decode:
+    """Decodes messages of a type.
+
+    Args:
+        kind: one of `KINDS`.
+        encoding: `ros1` or `cdr`.
+
+    Raises:
+        MissingDependencyError: `rosbags` is not installed.
+    """
+    typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
+    if encoding == "ros1":
+        store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+        return lambda raw: store.deserialize_ros1(raw, kind)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    return lambda raw: store.deserialize_cdr(raw, kind)
+
+
+@dataclass
+class Collector:
+    """Gathers the messages of a bag, one stream for each topic and set of joints.
+
+    Args:
+        source: name of the bag, for messages.
+    """
+
+    source: str
+    _rows: dict[tuple[str, str, tuple[str, ...]], list[list[float]]] = field(default_factory=dict)
+    _stamps: dict[tuple[str, str, tuple[str, ...]], list[tuple[int, int]]] = field(default_factory=dict)
+    _orders: dict[tuple[str, tuple[str, ...]], tuple[str, ...]] = field(default_factory=dict)
+    _numbers: int = 0
+    _messages: int = 0
+
+    def add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
+        """Take one message.
+
+        Raises:
+            DataError: it is too large, or its arrays do not fit its joint names.
+        """
+        check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
+        message = decode(raw)
+        names, values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
+        # One stream for a set of joints, in the order of its first message, whatever the order of the others.
+        self._orders.setdefault((topic, tuple(sorted(names))), names)
+        order = self._orders[topic, tuple(sorted(names))]
+        if order != names:
+            values = _reordered(values, names, order)
+        key = (topic, kind, order)
+        stamp = message.header.stamp
+        self._rows.setdefault(key, []).append(values)
+        self._stamps.setdefault(key, []).append((stamp.sec * 10**9 + stamp.nanosec, receive_ns))
+        self._numbers += len(values)
+        self._messages += 1
+        check_count(self.source, "numbers", self._numbers, limits.LOG_VALUES)
+        check_count(self.source, "streams", len(self._rows), limits.LOG_STREAMS)
+
+    @property
+    def rows(self) -> int:
+        """Rows of the longest stream so far."""
+        return max(map(len, self._rows.values()), default=0)
+
+    def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
+        """The log.
+
+        Args:
+            format_: name of the format.
+            topics: topic → message type, of all topics in the bag.
+            wanted: which columns to keep.
+
+        Raises:
+            DataError: no topic has a message type that is read.
+        """
+        if not self._rows:
+            listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
+            raise DataError(
+                f"{self.source}: no message of a type that is read",
+                expected=" or ".join(KINDS),
+                got=listing[:600] or "no topics",
+            )
+        origin = np.min([np.min(np.array(stamps), axis=0) for stamps in self._stamps.values()], axis=0)
+        taken: dict[str, int] = {}
+        streams = []
+        for key in sorted(self._rows, key=lambda k: (k[0], -len(self._rows[k]))):
+            topic = key[0]
+            taken[topic] = taken.get(topic, 0) + 1
+            name = topic if taken[topic] == 1 else f"{topic}#{taken[topic]}"
+            streams.append(self._stream(name, key, origin, wanted))
+        unread = [f"{t} ({k})" for t, k in topics.items() if canonical(k) not in KINDS]
+        remarks = [f"topics of other types were not read: {', '.join(unread)[:600]}"] if unread else []
+        remarks.append(f"time 0 is {origin[0] * 1e-9:.9f} s on the clock of the headers")
+        return LogTable(self.source, format_, tuple(streams), tuple(remarks))
+
+    def _stream(
+        self, name: str, key: tuple[str, str, tuple[str, ...]], origin: np.ndarray, wanted: Wanted
+    ) -> Stream:
+        values = np.array(self._rows.pop(key), dtype=np.float64)
+        stamps = (np.array(self._stamps[key], dtype=np.int64) - origin) * 1e-9
+        _, kind, names = key
+        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps.T), strict=True))
+        parts = (
+            [f"{q}.{n}" for q in QUANTITIES for n in names] if kind == JOINT_STATE else list(WRENCH_COLUMNS)
+        )
+        for i, part in enumerate(parts):
+            column = np.ascontiguousarray(values[:, i])
+            if not np.isnan(column).all() and wanted(part):
+                columns[part] = column
+        units = {p: u for p, u in zip(parts, _units(kind, len(names)), strict=True) if p in columns}
+        return Stream(name, columns, units | dict.fromkeys(CLOCKS, "s"))
+
+
+WRENCH_COLUMNS = tuple(f"{part}.{axis}" for part in ("force", "torque") for axis in "xyz")
+
+
+def _units(kind: str, count: int) -> list[str]:
+    """Units by REP 103."""
+    if kind == WRENCH:
+        return ["N"] * 3 + ["Nm"] * 3
+    return ["rad"] * count + ["rad/s"] * count + ["Nm"] * count
+
+
+def _joint_state(source: str, topic: str, message: Any) -> tuple[tuple[str, ...], list[float]]:
+    """Joint names, and position, velocity and effort in their order; NaN where a quantity is empty."""
+    names = tuple(str(name)[: limits.LOG_NAME] for name in message.name)
+    if not names or len(set(names)) < len(names):
+        raise DataError(f"{source}: a joint state on {topic} has no joint names, or one twice", got=names[:8])
+    values: list[float] = []
+    for quantity in QUANTITIES:
+        numbers = getattr(message, quantity)
+        if len(numbers) not in (0, len(names)):
+            raise DataError(
+                f"{source}: a joint state on {topic} has {len(numbers)} values of {quantity}",
+                expected=f"one for each of its {len(names)} joints, or none",
+            )
+        values += [float(x) for x in numbers] if len(numbers) else [np.nan] * len(names)
+    return names, values
+
+
+def _reordered(values: list[float], names: tuple[str, ...], order: tuple[str, ...]) -> list[float]:
+    """Values of a joint state whose message names the joints in another order."""
+    index = [names.index(name) for name in order]
+    return [values[block * len(names) + i] for block in range(len(QUANTITIES)) for i in index]
+
+
+def _wrench(message: Any) -> tuple[tuple[str, ...], list[float]]:
+    force, torque = message.wrench.force, message.wrench.torque
+    return (), [force.x, force.y, force.z, torque.x, torque.y, torque.z]
+
+
+def read_rosbag1(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of a bag.
+
+    Raises:
+        DataError: the bag is damaged or too large, or has no message of these types.
+        MissingDependencyError: `rosbags` is not installed.
+    """
+    package = optional_module("rosbags.rosbag1", "Reading ROS 1 bags", "import")
+    return read_bag(path, package.Reader, "rosbag1", wanted, rows, progress)
+
+
+def read_bag(
+    path: Path,
+    open_bag: Callable[[Path], Any],
+    format_: str,
+    wanted: Wanted,
+    rows: int | None,
+    progress: Progress | None,
+) -> LogTable:
+    """Read what a reader of the package `rosbags`, made by `open_bag`, finds in a bag."""
+    encoding = "ros1" if format_ == "rosbag1" else "cdr"
+    collector = Collector(str(path))
+    with foreign(str(path), "a bag"), open_bag(path) as bag:
+        check_count(str(path), "topics", len(bag.connections), limits.LOG_STREAMS)
+        check_count(str(path), "messages", bag.message_count, limits.LOG_MESSAGES)
+        topics = {c.topic: c.msgtype for c in bag.connections}
+        used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
+        decoders = {c.msgtype: decoder(canonical(c.msgtype), encoding) for c in used}
+        total = sum(c.msgcount for c in used)
+        for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else []):
+            kind = canonical(connection.msgtype)
+            collector.add(connection.topic, kind, stamp, raw, decoders[connection.msgtype])
+            if progress is not None and done % 1024 == 0:
+                progress(done, total)
+            if rows is not None and collector.rows >= rows:
+                break
+        return collector.table(format_, topics, wanted)
+
+
+def read_rosbag2(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of a bag.
+
+    Raises:
+        DataError: the bag is damaged, compressed or too large, or has no message of these types.
+        MissingDependencyError: `rosbags` is not installed.
+    """
+    package = optional_module("rosbags.rosbag2", "Reading ROS 2 bags", "import")
+    if path.is_dir():
+        _check_metadata(path)
+    elif path.suffix != ".db3":
+        raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
+    return read_bag(path, package.Reader, "rosbag2", wanted, rows, progress)
+
+
+def _check_metadata(path: Path) -> None:
+    """Refuse a bag whose unpacked size nobody knows."""
+    file = path / "metadata.yaml"
+    check_count(str(file), "bytes", file.stat().st_size, 8 << 20)
+    text = file.read_text(encoding="utf-8", errors="replace")
+    found = re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE)
+    if found:
+        raise DataError(
+            f"{path}: the bag is compressed by {found[1].lower()}",
+            expected="a bag without compression, or MCAP with compressed chunks",
+            hint="unpack it with `ros2 bag convert`",
+        )
+
+
+RECORD_BYTES = 256 << 20
+"""Largest record, packed, that is loaded."""
+
+
+def read_mcap(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of an MCAP file, also of one that was cut off and has no index.
+
+    Raises:
+        DataError: the file is damaged or too large, or has no message of these types.
+        MissingDependencyError: `mcap` or `rosbags` is not installed.
+    """
+    package = optional_module("mcap.reader", "Reading MCAP files", "import")
+    collector = Collector(str(path))
+    decoders: dict[int, Decode | None] = {}
+    topics: dict[str, str] = {}
+    with foreign(str(path), "MCAP"), path.open("rb") as file:
+        reader = package.SeekingReader(file, record_size_limit=RECORD_BYTES)
+        summary = reader.get_summary()
+        statistics = summary.statistics if summary is not None else None
+        total = statistics.message_count if statistics is not None else 0
+        check_count(str(path), "messages", total, limits.LOG_MESSAGES)
+        for schema, channel, message in reader.iter_messages():
+            if channel.id not in decoders:
+                kind = canonical(schema.name) if schema is not None else ""
+                topics[channel.topic] = kind or channel.message_encoding
+                check_count(str(path), "topics", len(decoders), limits.LOG_STREAMS)
+                known = kind in KINDS and channel.message_encoding in ("cdr", "ros1")
+                decoders[channel.id] = decoder(kind, channel.message_encoding) if known else None
+            decode = decoders[channel.id]
+            if decode is not None:
+                collector.add(channel.topic, topics[channel.topic], message.log_time, message.data, decode)
+                if progress is not None and collector.rows % 1024 == 0:
+                    progress(collector.rows, max(total, collector.rows))
+                if rows is not None and collector.rows >= rows:
+                    break
+        return collector.table("mcap", topics, wanted)

@@ -1,0 +1,373 @@
+"""CSV and text columns with any separator, decimal mark and heading, read in blocks; folders of such files.
+
+How a table is written is found from its first lines: encoding, separator, decimal mark, heading, first line
+of numbers. In a folder each file holds one quantity: `q.txt`, `tau.txt`, …
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+
+from forcegp import limits
+from forcegp.errors import DataError
+from forcegp.logs.table import (
+    Column,
+    Growing,
+    LogTable,
+    Progress,
+    Stream,
+    Wanted,
+    check_count,
+    check_values,
+    foreign,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+SAMPLE_BYTES = 1 << 18
+"""How much of a file is looked at."""
+SAMPLE_LINES = 200
+"""How many lines of numbers must agree."""
+
+SEPARATORS = (";", "\t", ",", "|", " ")
+"""Candidates; a space stands for any run of blanks."""
+MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "None", "-nan", "#N/A")
+"""Fields that say that there is no value."""
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$|[+-]?(inf|infinity)$", re.IGNORECASE)
+_COMMA_NUMBER = re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?$")
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d+)?(Z|[+-]\d\d:?\d\d)?$")
+_UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])]?$")
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a text table is written.
+
+    Args:
+        encoding: of the text.
+        separator: one of `SEPARATORS`.
+        decimal: decimal mark, a point or a comma.
+        first_line: number of lines before the first line of numbers.
+        names: name of each column.
+        kinds: `number`, `bool`, `date` or `text`, one per column.
+        units: name → unit, where a line below the heading declares units.
+    """
+
+    encoding: str
+    separator: str
+    decimal: str
+    first_line: int
+    names: tuple[str, ...]
+    kinds: tuple[str, ...]
+    units: dict[str, str]
+
+
+def sniff(path: Path) -> Dialect:
+    """Find out how a text table is written, from its first lines.
+
+    Raises:
+        DataError: the file is empty, binary, or has no two lines with equally many numbers.
+    """
+    with path.open("rb") as file:
+        head = file.read(SAMPLE_BYTES)
+    text, encoding = _decode(path, head)
+    lines = text.splitlines()
+    if len(head) == SAMPLE_BYTES:
+        lines = lines[:-1]
+    if not any(line.strip() for line in lines):
+        raise DataError(f"{path}: the file is empty" if not head else f"{path}: a line is too long")
+    found = max((_try(lines, s, d) for s in SEPARATORS for d in ".," if s != d), key=lambda item: item[0])
+    score, separator, decimal, first = found
+    if score <= 0:
+        raise DataError(
+            f"{path}: no table of numbers was found",
+            expected="lines of numbers with one separator, after an optional heading",
+            got=repr(lines[0][:120]),
+        )
+    return _dialect(path, lines, encoding, separator, decimal, first)
+
+
+def split(line: str, separator: str) -> list[str]:
+    """Fields of a line, without blanks and quotation marks around them.
+
+    >>> split("a;  b ;", ";")
+    ['a', 'b', '']
+    """
+    parts = line.split() if separator == " " else line.split(separator)
+    return [part.strip().strip('"').strip() for part in parts]
+
+
+def is_number(field: str, decimal: str = ".") -> bool:
+    """Whether a field is a number, or says that there is none."""
+    if field in MISSING:
+        return True
+    return bool((_COMMA_NUMBER if decimal == "," else _NUMBER).match(field))
+
+
+def _decode(path: Path, head: bytes) -> tuple[str, str]:
+    for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
+        if head.startswith(mark):
+            return head.decode(encoding, errors="replace"), encoding
+    if b"\x00" in head:
+        raise DataError(f"{path}: a binary file, not text", got=repr(head[:16]))
+    try:
+        # A character may be cut at the end of the sample.
+        return head[: len(head) - 4 if len(head) == SAMPLE_BYTES else None].decode("utf-8"), "utf-8"
+    except UnicodeDecodeError:
+        return head.decode("cp1252", errors="replace"), "cp1252"
+
+
+def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, str, int]:
+    """How well a separator and a decimal mark explain the lines: fields with a value, times their share."""
+    kept = [(i, split(line, separator)) for i, line in enumerate(lines) if line.strip()]
+    rows = [(i, fields) for i, fields in kept if _numeric(fields, decimal)]
+    if not rows:
+        return 0.0, separator, decimal, 0
+    first = rows[0][0]
+    after = [fields for i, fields in kept if i >= first][:SAMPLE_LINES]
+    width = len(after[0])
+    same = sum(len(fields) == width for fields in after) / len(after)
+    values = sum(_is_value(f, decimal) for fields in after for f in fields) / len(after)
+    # A comma inside numbers, taken for a separator, leaves fields such as "5;2" that are not values.
+    preferred = 0.01 if decimal == "." else 0.0
+    return (values**2 / width + preferred if same == 1.0 else 0.0), separator, decimal, first
+
+
+def _is_value(field: str, decimal: str) -> bool:
+    known = bool(_DATE.match(field)) or field.lower() in ("true", "false")
+    return field != "" and (known or is_number(field, decimal))
+
+
+def _numeric(fields: list[str], decimal: str) -> bool:
+    """Whether a line is one of values: it has a number, and text at most in a minority of the fields."""
+    if fields and fields[0].startswith(("#", "%", "//")):
+        return False
+    values = [f for f in fields if f not in MISSING]
+    good = sum(is_number(f, decimal) or bool(_DATE.match(f)) for f in values)
+    return good > 0 and 2 * good > len(values)
+
+
+def _dialect(
+    path: Path, lines: list[str], encoding: str, separator: str, decimal: str, first: int
+) -> Dialect:
+    rows = [split(line, separator) for line in lines[first : first + SAMPLE_LINES] if line.strip()]
+    width = len(rows[0])
+    check_count(str(path), "columns", width, limits.COLUMNS)
+    above = [split(line.lstrip("#%/ \t"), separator) for line in lines[:first] if line.strip()]
+    above = [
+        fields for fields in above if len(fields) == width or (len(fields) == width - 1 and not rows[0][-1])
+    ]
+    units: dict[str, str] = {}
+    names = [str(i) for i in range(width)]
+    if above:
+        heading, unit_line = above[-1], None
+        if len(above) > 1 and all(_UNIT.match(f) for f in above[-1]) and any("[" in f for f in above[-1]):
+            heading, unit_line = above[-2], above[-1]
+        heading = [*heading, *[""] * (width - len(heading))]
+        names = [name[: limits.LOG_NAME] or f"column {i}" for i, name in enumerate(heading)]
+        pairs = zip(names, unit_line or [], strict=False)
+        units = {name: unit.strip("[]() ") for name, unit in pairs if unit.strip("[]() ")}
+    for name in names:
+        if names.count(name) > 1:
+            raise DataError(
+                f"{path}: column {name!r} occurs more than once", hint="rename one of the columns"
+            )
+    kinds = tuple(_kind([row[i] for row in rows if i < len(row)], decimal) for i in range(width))
+    return Dialect(encoding, separator, decimal, first, tuple(names), kinds, units)
+
+
+def _kind(fields: list[str], decimal: str) -> str:
+    values = [f for f in fields if f not in MISSING]
+    if all(is_number(f, decimal) for f in values):
+        return "number" if values else "empty"
+    if all(f.lower() in ("true", "false") for f in values):
+        return "bool"
+    if all(_DATE.match(f) for f in values):
+        return "date"
+    return "text"
+
+
+BLOCK_BYTES = 4 << 20
+"""How much text is parsed at a time."""
+
+_BLANKS = re.compile(rb"[ \t]+")
+_EDGES = re.compile(rb"(?m)^ | (?=\r?$)")
+
+
+def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read a text table; columns of text are left out with a remark.
+
+    Raises:
+        DataError: not a table, a line with another number of fields, or a field that is not a number.
+    """
+    dialect = sniff(path)
+    chosen = [name for name, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(name)]
+    kinds = dict(zip(dialect.names, dialect.kinds, strict=True))
+    remarks = [
+        f"column {name!r} holds {kinds[name]} and was left out" for name in chosen if kinds[name] == "text"
+    ]
+    chosen = [name for name in chosen if kinds[name] not in ("text", "empty")]
+    columns = {name: Growing(_rows_expected(path)) for name in chosen}
+    with foreign(str(path), "a table of text"), path.open("rb") as file:
+        for batch in _batches(path, file, dialect, chosen, kinds, progress) if chosen else ():
+            read_rows = len(columns[chosen[0]]) + len(batch)
+            check_values(str(path), read_rows, len(chosen))
+            for name in chosen:
+                columns[name].append(_numbers(batch.column(name), kinds[name]))
+            if rows is not None and read_rows >= rows:
+                break
+    values = {name: columns.pop(name).array(rows) for name in chosen}
+    if dialect.encoding == "cp1252":
+        remarks.append("the file is not UTF-8 and was read as Windows-1252")
+    units = {name: unit for name, unit in dialect.units.items() if name in values}
+    return LogTable(str(path), "text", (Stream("", values, units),), tuple(remarks))
+
+
+def _rows_expected(path: Path) -> int:
+    """A guess from the length of the first lines."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    return int(path.stat().st_size / max(len(head), 1) * (head.count(b"\n") + 1) * 1.05)
+
+
+def _batches(
+    path: Path,
+    file: IO[bytes],
+    dialect: Dialect,
+    chosen: list[str],
+    kinds: dict[str, str],
+    progress: Progress | None,
+) -> Iterator[pa.RecordBatch]:
+    """Batches of rows of the chosen columns."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    types = {"number": pa.float64(), "bool": pa.bool_(), "date": pa.timestamp("ns")}
+    source = _Blocks(file, dialect, path.stat().st_size, progress)
+    options: dict[str, Any] = {"decimal_point": dialect.decimal, "null_values": list(MISSING)}
+    reader = csv.open_csv(
+        pa.PythonFile(source, mode="r"),
+        read_options=csv.ReadOptions(
+            use_threads=True,
+            block_size=BLOCK_BYTES,
+            skip_rows=dialect.first_line,
+            column_names=list(dialect.names),
+            encoding="utf-8" if dialect.encoding == "utf-8-sig" else dialect.encoding,
+        ),
+        parse_options=csv.ParseOptions(delimiter=dialect.separator, ignore_empty_lines=True),
+        convert_options=csv.ConvertOptions(
+            include_columns=chosen, column_types={name: types[kinds[name]] for name in chosen}, **options
+        ),
+    )
+    yield from reader
+
+
+def _numbers(values: pa.Array, kind: str) -> Column:
+    """A column as float64: times of day in seconds of the epoch, true and false as 1 and 0."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    if kind == "date":
+        # Seconds since 2020 keep the nanoseconds that seconds since 1970 lose in float64.
+        whole = pc.cast(values, pa.int64()).to_numpy(zero_copy_only=False)
+        return (whole - DATE_ORIGIN_NS).astype(np.float64) * 1e-9
+    return pc.cast(values, pa.float64()).to_numpy(zero_copy_only=False)
+
+
+DATE_ORIGIN_NS = 1_577_836_800_000_000_000
+"""2020-01-01 in nanoseconds of the epoch: the origin of times that are given as dates."""
+
+
+class _Blocks:
+    """A binary file for the parser: counts what was read, and makes one blank of a run of blanks."""
+
+    def __init__(self, file: IO[bytes], dialect: Dialect, size: int, progress: Progress | None) -> None:
+        self._file, self._size, self._progress = file, size, progress
+        self._collapse = dialect.separator == " "
+        self._rest = b""
+        self._done = 0
+        self.closed = False
+
+    def read(self, count: int = -1) -> bytes:
+        block = self._file.read(count if count and count > 0 else BLOCK_BYTES)
+        self._done += len(block)
+        if self._progress is not None:
+            self._progress(self._done, self._size)
+        if not self._collapse:
+            return block
+        text = self._rest + block
+        # Blanks at the edges of a line are only known once the line is complete.
+        end = text.rfind(b"\n") + 1 if block else len(text)
+        self._rest, text = text[end:], text[:end]
+        check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)
+        result = _EDGES.sub(b"", _BLANKS.sub(b" ", text))
+        return result if result or not block else self.read(count)
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return False
+
+    def writable(self) -> bool:
+        return False
+
+    def tell(self) -> int:
+        return self._done
+
+    def close(self) -> None:
+        self.closed = True
+
+
+ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".asc")
+"""Endings of the files that are read; others in the folder are not."""
+
+
+def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the tables of a folder; a column is `file[i]`, or `file.heading` where the file has headings.
+
+    Files with the same number of rows share a clock and make one stream.
+
+    Raises:
+        DataError: a file is not a table of numbers, or the folder is too large.
+    """
+    files = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
+    check_count(str(path), "files", len(files), limits.LOG_FILES)
+    groups: dict[int, dict[str, Column]] = {}
+    remarks: list[str] = []
+    for number, file in enumerate(files):
+        try:
+            table = read_text(file, wanted=_within(file.stem, wanted), rows=rows, progress=None)
+        except DataError as error:
+            if "no table of numbers" not in error.message:
+                raise
+            remarks.append(f"{file.name} holds no table of numbers and was left out")
+            continue
+        remarks += [f"{file.name}: {remark}" for remark in table.remarks]
+        columns = {_in_file(file.stem, name): values for name, values in table.streams[0].columns.items()}
+        if columns:
+            groups.setdefault(len(next(iter(columns.values()))), {}).update(columns)
+            check_values(str(path), 1, sum(map(len, groups.values())))
+        if progress is not None:
+            progress(number + 1, len(files))
+    most = max(groups, key=lambda length: (len(groups[length]), length), default=0)
+    ordered = sorted(groups.items(), key=lambda item: item[0] != most)
+    streams = tuple(Stream("" if n == most else f"{n} rows", columns) for n, columns in ordered)
+    return LogTable(str(path), "text folder", streams, tuple(remarks))
+
+
+def _in_file(stem: str, column: str) -> str:
+    return f"{stem}[{column}]" if column.isdigit() else f"{stem}.{column}"
+
+
+def _within(stem: str, wanted: Wanted) -> Wanted:
+    return lambda column: wanted(_in_file(stem, column))

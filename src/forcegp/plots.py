@@ -1,0 +1,263 @@
+"""Plots over time: what `plot` of data sets, predictions, models and rollouts draws with matplotlib.
+
+Panels stand one above the other on a common time axis, with curves, bands of ±2 standard deviations, and
+contact. Segments follow one after another, with gaps left open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+from torch import Tensor
+
+from forcegp.errors import ParameterError, UnknownNameError
+
+MEASURED = "#222222"
+PREDICTED = "#0072b2"
+CONTACT = "#f5eed6"
+"""Shade of the time in contact."""
+CYCLE = ("#0072b2", "#d55e00", "#007a5e", "#c4488c", "#6a3d9a", "#d08c00", "#555555")
+"""One colour per joint; joints beyond the last share them again."""
+SYMBOLS = {
+    "q": "q",
+    "qd": r"\dot{q}",
+    "qdd": r"\ddot{q}",
+    "tau": r"\tau",
+    "qdd_free": r"\ddot{q}'",
+    "multiplier": r"\lambda",
+    "constraint_force": "Q_I",
+    "contact_force": "F_I",
+    "total_force": r"\bar{Q}",
+    "joint_force": "Q",
+    "contact_friction": "Q_z",
+    "c": "c",
+    "cd": r"\dot{c}",
+}
+"""Quantities in the notation of the library, as mathematics."""
+POWERS = {"q": "", "qd": "/s", "qdd": "/s²", "qdd_free": "/s²"}
+CARTESIAN = {"multiplier": "N", "contact_force": "N", "c": "m", "cd": "m/s"}
+
+
+def unit(quantity: str, kinds: Sequence[str] = ()) -> str:
+    """The unit of a quantity of joints.
+
+    Args:
+        quantity: a name of `SYMBOLS`.
+        kinds: `"revolute"` or `"prismatic"` for each joint on the axis; without them both units are given.
+
+    Returns:
+        The unit without brackets; empty for an unknown quantity.
+
+    Example:
+        >>> unit("qdd", ["revolute"]), unit("tau"), unit("multiplier")
+        ('rad/s²', 'N m, N', 'N')
+    """
+    if quantity in CARTESIAN:
+        return CARTESIAN[quantity]
+    if quantity not in SYMBOLS:
+        return ""
+    power = POWERS.get(quantity)
+    turning, sliding = ("N m", "N") if power is None else (f"rad{power}", f"m{power}")
+    shown = {"revolute": turning, "prismatic": sliding}
+    return ", ".join(text for kind, text in shown.items() if not kinds or kind in kinds)
+
+
+def axis_label(quantity: str, kinds: Sequence[str] = (), symbol: str | None = None) -> str:
+    """Symbol and unit of a quantity, for an axis; `symbol` replaces that of the library."""
+    shown = symbol or (f"${SYMBOLS[quantity]}$" if quantity in SYMBOLS else quantity)
+    known = unit(quantity, kinds)
+    return f"{shown} [{known}]" if known else shown
+
+
+Array = NDArray[np.float64]
+GAP = 3.0
+"""A step longer than so many median steps interrupts a curve."""
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Positions of samples on the time axis.
+
+    Attributes:
+        x: `(n,)` time, increasing [s].
+        order: `(n,)` row of each position.
+        breaks: positions before which a curve is interrupted.
+        ordered: whether the samples are a time series, which is drawn as a curve.
+        label: of the axis.
+    """
+
+    x: Array
+    order: NDArray[np.int64]
+    breaks: NDArray[np.int64]
+    ordered: bool
+    label: str
+
+    @classmethod
+    def of(cls, t: Tensor, segment: Tensor | None = None, ordered: bool = True) -> Timeline:
+        """Place samples on the time axis.
+
+        Args:
+            t: `(n,)` [s].
+            segment: `(n,)` trajectory of each sample; default one. Segments whose times overlap are placed
+                one after another.
+            ordered: whether the rows follow time within each segment.
+        """
+        x, own = as_array(t), np.zeros(len(t)) if segment is None else as_array(segment)
+        order = np.arange(len(x)) if ordered else np.lexsort((x, own))
+        x, own = x[order], own[order]
+        steps, changes = np.diff(x), np.diff(own) != 0
+        typical = float(np.median(steps[~changes])) if len(steps[~changes]) else 0.0
+        joined = bool((steps[changes] <= 0).any())
+        if joined:
+            shift = np.where(changes, typical - steps, 0.0)
+            x = x + np.concatenate([[0.0], np.cumsum(shift)])
+        breaks = np.flatnonzero(changes | (steps > GAP * typical)) + 1
+        label = "time, segments one after another [s]" if joined else "time [s]"
+        return cls(x, order, breaks, ordered, label)
+
+    def place(self, values: Tensor) -> Array:
+        """Values `(n, …)` in the order of the axis."""
+        return as_array(values)[self.order]
+
+    def open(self, values: Array) -> Array:
+        """Placed values `(n,)` with a NaN where a curve is interrupted."""
+        return np.insert(values, self.breaks, np.nan)
+
+    def spans(self, closed: Tensor) -> list[tuple[float, float]]:
+        """Times between which a flag `(n,)` is true; none where the samples are no time series."""
+        flags = as_array(closed)[self.order] > 0
+        if not self.ordered or not len(flags):
+            return []
+        cuts = np.unique(np.concatenate([[0], np.flatnonzero(np.diff(flags)) + 1, self.breaks, [len(flags)]]))
+        pairs = zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)
+        return [(float(self.x[a]), float(self.x[b - 1])) for a, b in pairs if flags[a]]
+
+
+def as_array(values: Any) -> Array:
+    """A tensor on any device as an array of double precision."""
+    return torch.as_tensor(values).detach().to("cpu", torch.float64).numpy()
+
+
+Target = Axes | Iterable[Axes] | None
+"""Where to draw: axes of the caller, one per panel, or `None` for a new figure."""
+WIDTH, ROW, MARGIN = 7.0, 1.25, 0.9
+"""Size of a new figure [inch]."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values over time.
+
+    Attributes:
+        values: `(n,)`.
+        label: in the legend.
+        colour: of the curve.
+        std: `(n,)` standard deviation, drawn as a band of ±2.
+        width: of the line [pt].
+    """
+
+    values: Tensor
+    label: str
+    colour: str
+    std: Tensor | None = None
+    width: float = 1.1
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One plot.
+
+    Attributes:
+        title: above it.
+        ylabel: name and unit of its values.
+        curves: what it shows.
+    """
+
+    title: str
+    ylabel: str
+    curves: Sequence[Curve]
+
+
+def draw_panels(
+    panels: Sequence[Panel], time: Timeline, closed: Sequence[Tensor] = (), ax: Target = None
+) -> list[Axes]:
+    """Draw panels one above the other.
+
+    Args:
+        panels: from top to bottom.
+        time: of the samples.
+        closed: flags `(n,)` of contacts; the time in which any of them is closed is shaded.
+        ax: axes to draw on, one per panel; default a new figure.
+
+    Returns:
+        The axes, one per panel.
+
+    Raises:
+        ParameterError: another number of axes is given.
+    """
+    axes = _axes(len(panels), ax)
+    spans = time.spans(sum(flags.double() for flags in closed) > 0) if closed else []  # pyright: ignore
+    for one, panel in zip(axes, panels, strict=True):
+        for i, (first, last) in enumerate(spans):
+            one.axvspan(first, last, color=CONTACT, zorder=0, linewidth=0, label="" if i else "in contact")
+        for curve in panel.curves:
+            _draw(one, curve, time)
+        one.set_title(panel.title, loc="left", fontsize="medium")
+        one.set_ylabel(panel.ylabel)
+        one.margins(x=0.0)
+    axes[-1].set_xlabel(time.label)
+    handles, names = axes[0].get_legend_handles_labels()
+    if len(names) > 1:
+        axes[0].legend(handles, names, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False)
+    return axes
+
+
+def _axes(count: int, ax: Target) -> list[Axes]:
+    if ax is None:
+        import matplotlib.pyplot as plt
+
+        size = (WIDTH, MARGIN + ROW * max(count, 2))
+        _, made = plt.subplots(count, 1, sharex=True, squeeze=False, figsize=size, layout="constrained")
+        made[0, 0].figure.align_ylabels()
+        return list(made[:, 0])
+    given = [ax] if isinstance(ax, Axes) else list(np.asarray(ax, dtype=object).ravel())
+    if len(given) != count:
+        raise ParameterError(
+            "the number of axes is not that of the panels",
+            expected=f"{count} axes, one per panel",
+            got=len(given),
+            hint="pass ax=None for a new figure, or choose joints",
+        )
+    return given
+
+
+def _draw(axes: Axes, curve: Curve, time: Timeline) -> None:
+    values = time.place(curve.values)
+    if not time.ordered:
+        error = None if curve.std is None else 2.0 * time.place(curve.std)
+        style: dict[str, Any] = {"color": curve.colour, "linestyle": "none", "marker": ".", "markersize": 4}
+        axes.errorbar(time.x, values, yerr=error, elinewidth=0.6, label=curve.label, **style)
+        return
+    x, y = time.open(time.x), time.open(values)
+    if curve.std is not None:
+        spread = 2.0 * time.open(time.place(curve.std))
+        axes.fill_between(x, y - spread, y + spread, color=curve.colour, alpha=0.25, linewidth=0, label="±2σ")
+    axes.plot(x, y, color=curve.colour, linewidth=curve.width, label=curve.label)
+
+
+def chosen(wanted: Sequence[str] | None, names: Sequence[str], kind: str) -> list[int]:
+    """Indices of the wanted names, by default all of them.
+
+    Raises:
+        UnknownNameError: a name does not exist.
+    """
+    for name in wanted or ():
+        if name not in names:
+            raise UnknownNameError(kind, name, names)
+    return [list(names).index(name) for name in (names if wanted is None else wanted)]

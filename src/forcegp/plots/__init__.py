@@ -1,1 +1,0 @@
-"""Plots over time: what `plot` of data sets, predictions, models and rollouts draws with matplotlib."""
