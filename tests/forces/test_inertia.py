@@ -10,8 +10,17 @@ import forcegp
 from forcegp import dynamics
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import correlation_times
-from forcegp.forces.inertia import Inertia, inertia_of, is_harmless, log_ratio
-from forcegp.forces.inverse_dynamics import APART, Rows, instrumental, partners, products, sums
+from forcegp.forces.inertia import Inertia, inertia_of
+from forcegp.forces.inverse_dynamics import (
+    APART,
+    Rows,
+    instrumental,
+    is_harmless,
+    log_ratio,
+    partners,
+    products,
+    sums,
+)
 from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean
@@ -185,7 +194,7 @@ def test_sums_give_the_dense_least_squares() -> None:
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
     by_stretch = sums(
-        Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, torch.arange(n)), C
+        Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, torch.arange(n), Phi[..., :0]), C
     )
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
@@ -211,7 +220,7 @@ def test_instruments_give_the_textbook_estimate() -> None:
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     partner = torch.cat([torch.arange(n // 2) + n // 2, torch.arange(n // 2)])
     group = torch.arange(n // 2).repeat(2) * 3 // (n // 2)
-    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner)
+    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner, Phi[..., :0])
     every = instrumental(rows, C).total()
     delta = torch.linalg.solve(*every.quadratic(NOISE))
     X, Z = (torch.zeros(n, nq, p + nq * f, dtype=torch.float64) for _ in range(2))
