@@ -13,6 +13,7 @@ from the encoders alone. Cases add friction with memory, torque ripple, a delay 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import tempfile
 import time
@@ -28,10 +29,15 @@ from numpy.typing import NDArray
 from real_cases import Case, moving
 from real_logs import scores
 from real_models import rigid, structured
+from torch import Tensor
 
 import forcegp
 from forcegp.evaluation.least_squares import identify_rigid
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.robot_update import latent_precision, one_row
+from forcegp.identification import regressor
 from forcegp.logs import parse_mapping
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.mujoco import import_mujoco
 from forcegp.simulate.urdf import write_urdf
@@ -40,6 +46,8 @@ ARMS = ("franka_panda", "kuka_iiwa14", "ur5")
 STEP = 0.0005
 """Time step of the engine [s]."""
 SECONDS = {"train": 40.0, "test": 20.0}
+STATES = 50
+"""States that the mass matrix is averaged over."""
 REACH = 0.35
 """Share of each joint's range that the motion spans."""
 
@@ -62,6 +70,7 @@ class Imperfections:
         stribeck: excess of the dry friction at rest over that in motion, with memory: LuGre's model.
         ripple: amplitude of a torque that is periodic in the angle, over the largest torque.
         delay: of the logged torque behind the encoders [s].
+        jitter: standard deviation of the encoders' noise [rad].
         period: sampling period [s].
         window: of the filter that computes accelerations, in samples.
     """
@@ -78,6 +87,7 @@ class Imperfections:
     stribeck: float = 0.0
     ripple: float = 0.0
     delay: float = 0.0
+    jitter: float = 0.0
     period: float = 0.004
     window: int = 11
 
@@ -88,8 +98,8 @@ CASES = {
     "lugre": Imperfections(memory=0.05, stribeck=0.5),
     "ripple": Imperfections(ripple=0.02),
     "delay": Imperfections(delay=0.01),
-    "window 61": Imperfections(period=0.001, window=61),
-    "window 151": Imperfections(period=0.001, window=151),
+    "window 61": Imperfections(period=0.001, window=61, jitter=3e-4),
+    "window 151": Imperfections(period=0.001, window=151, jitter=3e-3),
 }
 RIGHT_FILE = {"mass": 0.0, "drive": 0.0, "gain": 0.0}
 """Imperfections of an arm whose file is right about its inertia, with true torques."""
@@ -156,7 +166,9 @@ class Arm:
         self.offset = wrong.offset * random.uniform(-1.0, 1.0, n) * self.scale
         self.dry = dry if wrong.memory else 0.0 * dry
         true.dof_frictionloss[:] = dry - self.dry
-        further = random.spawn(1)[0]  # the other draws stay those of a case without memory and ripple
+        self.further = further = random.spawn(1)[
+            0
+        ]  # the other draws stay those of a case without memory and ripple
         self.distance = wrong.memory * further.uniform(0.2, 1.0, n)
         self.teeth = further.integers(20, 100, n)
 
@@ -205,7 +217,8 @@ class Arm:
                 torques.append(self.torque(q, qd, qdd + feedback))
                 logged = self.gain * torques[max(0, len(torques) - 1 - late)] + self.offset
                 logged += wrong.noise * self.scale * random.normal(size=len(q))
-                rows.append([k * STEP, *(wrong.encoder * np.round(data.qpos / wrong.encoder)), *logged])
+                angle = data.qpos + wrong.jitter * self.further.normal(size=len(q))
+                rows.append([k * STEP, *(wrong.encoder * np.round(angle / wrong.encoder)), *logged])
             data.qfrc_applied[:] = torques[-1] - self.losses(data, bristle)
             mujoco.mj_step(self.true, data)
         names = self.robot.joint_names
@@ -231,8 +244,31 @@ def case_of(name: str, arm: Arm, folder: Path, seconds: Mapping[str, float] = SE
     return Case(name, forcegp.ConstrainedSystem(arm.robot), read["train"], {"test": read["test"]})
 
 
-def compare(case: Case) -> dict:
-    """Scores of the defaults and of least squares, and their ratios."""
+def mass_matrices(arm: Arm, fit: StructuredFit, q: Tensor) -> dict:
+    """Diagonals of the mass matrix over the engine's, and the fit's error in units of its standard deviation.
+
+    The posterior of the inertial parameters has one; without it, the inertia is taken as known.
+    """
+    robot, posterior, exact = fit.system.robot, fit.posterior, arm.mass_matrix(q.numpy()).mean(0)
+    file, found = (
+        forcegp.dynamics.mass_matrix(each, q).diagonal(dim1=-2, dim2=-1).mean(0).numpy()
+        for each in (arm.robot, robot)
+    )
+    result: dict = {"file": (file / exact).tolist(), "fit": (found / exact).tolist()}
+    for p, prior in enumerate(posterior.priors):
+        if isinstance(prior, InertialPrior):
+            zero, eye = torch.zeros_like(q), torch.eye(robot.nq, dtype=q.dtype)
+            still = regressor(robot, q, zero, zero)
+            columns = [(regressor(robot, q, zero, e.expand_as(q)) - still)[:, j] for j, e in enumerate(eye)]
+            C = torch.stack([column.mean(0) for column in columns]) * prior.scale(robot)
+            inverse = latent_precision(posterior, one_row(posterior, fit.problem), p, robot)
+            std = (C @ torch.linalg.solve(inverse, C.mT)).diagonal().sqrt().numpy()
+            result["sigmas"] = ((found - exact) / std).tolist()
+    return result
+
+
+def compare(arm: Arm, case: Case) -> dict:
+    """Scores of the defaults and of least squares, their ratios, and the mass matrix."""
     test = moving(case.tests["test"])
     found: dict = {}
     fits = {
@@ -244,15 +280,33 @@ def compare(case: Case) -> dict:
         fitted = fit()
         found[model] = scores(fitted.predict(test), test, case.system.robot)
         found[model] |= {"seconds": time.perf_counter() - began, "notes": fitted.notes}
+        if fitted.fit is not None:
+            found["mass_matrix"] = mass_matrices(arm, fitted.fit, test.q[:: max(1, len(test) // STATES)])
     ratio = np.array(found["defaults"]["torque_rmse"]) / found["least squares"]["torque_rmse"]
     squared = np.array(found["defaults"]["acceleration_mse"]) / found["least squares"]["acceleration_mse"]
     found["ratios"] = {
         "torque": float(np.exp(np.log(ratio).mean())),
         "worst_joint": float(ratio.max()),
+        "acceleration": squared.tolist(),
         "worst_acceleration": float(squared.max()),
         "coverage": found["defaults"]["torque_coverage"],
     }
     return found
+
+
+def pooled(result: Mapping[str, dict]) -> dict:
+    """Errors of the mass matrix over all joints and logs."""
+    each = [found["mass_matrix"] for found in result.values()]
+    off = {key: np.abs(np.concatenate([m[key] for m in each]) - 1.0) for key in ("file", "fit")}
+    sigmas = np.abs(np.concatenate([[], *(m["sigmas"] for m in each if "sigmas" in m)]))
+    return {
+        "logs": len(each),
+        "identified": sum("sigmas" in m for m in each),
+        "untouched": sum(m["fit"] == m["file"] for m in each),
+        **{f"median_{key}": float(np.median(x)) for key, x in off.items()},
+        "within_2_sigma": float((sigmas <= 2.0).mean()) if len(sigmas) else None,
+        "largest_sigma": float(sigmas.max()) if len(sigmas) else None,
+    }
 
 
 def main() -> None:
@@ -260,17 +314,21 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--arm", choices=ARMS, nargs="*", default=list(ARMS))
+    parser.add_argument("--case", choices=CASES, nargs="*", default=["plain"])
     parser.add_argument("--seed", type=int, nargs="*", default=[0, 1])
+    parser.add_argument("--right-file", action="store_true", help="true masses, drives and torques")
     parser.add_argument("--json", type=Path, help="write all results to this file")
     options = parser.parse_args()
     result = {}
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for name in options.arm:
-            for seed in options.seed:
-                case = case_of(name, seed, Imperfections(), Path(folder))
-                result[case.name] = found = compare(case)
-                print(case.name, json.dumps(found["ratios"]), flush=True)
+    for case, name, seed in itertools.product(options.case, options.arm, options.seed):
+        wrong = replace(CASES[case], **(RIGHT_FILE if options.right_file else {}))
+        arm = Arm(forcegp.load_robot(name), wrong, np.random.default_rng(seed))
+        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            logs = case_of(f"{name}, {case}, seed {seed}", arm, Path(folder))
+            result[logs.name] = found = compare(arm, logs)
+        print(logs.name, json.dumps(found["ratios"] | found["mass_matrix"]), flush=True)
+    print(json.dumps(pooled(result)))
     if options.json is not None:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 

@@ -41,6 +41,8 @@ from forcegp.robot.model import RobotModel
 
 VOLUME_STATES = 60
 """States that log |M| is averaged over."""
+NEGLIGIBLE = 0.02
+"""Inertia of a drive over its joint's that is left out: a gain of the torque sensor explains as much."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
 """Weights v of the volume, from 1/1024 to 1."""
 
@@ -83,6 +85,7 @@ def inertia_of(
         return Inertia(identified, True, (text, *_told(robot, identified.armature - robot.armature)))
     M = mass_matrix(robot, rows.q)
     armature = _damped(rows, M, _lacking(remembering, M))
+    armature = armature * (armature > NEGLIGIBLE * M.diagonal(dim1=-2, dim2=-1).mean(0))
     if not bool(armature.any()):
         return Inertia(robot)
     return Inertia(robot.replace(armature=robot.armature + armature), doubts=_told(robot, armature))
@@ -136,6 +139,9 @@ def _noise(every: Sums) -> Tensor:
 def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
     """Inertia of drives beyond the file's `(nq,)`, raised where accelerations need it.
 
+    They need it, in the geometric mean of the joints, where their mean predicts them better; only the drives of
+    joints of which that is true are raised.
+
     Args:
         rows: the samples.
         M: mass matrix of the file at the samples.
@@ -144,22 +150,24 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
     by_stretch = sums(rows, torch.diag_embed(rows.qdd))
     noise = _noise(by_stretch.total())
 
-    def is_sane(armature: Tensor) -> bool:
-        """Whether accelerations are predicted as well as by their mean, by the geometric mean of joints."""
+    def excess(armature: Tensor) -> Tensor:
+        """Logarithm of the squared acceleration error over that of the mean acceleration `(nq,)`."""
         friction = by_stretch.total().friction(armature)
         left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
         missed = torch.linalg.solve(M + torch.diag(armature), left[..., None])[..., 0]
         spread = rows.qdd - rows.qdd.mean(0)
-        return float((missed.square().mean(0) / spread.square().mean(0)).log().mean()) <= 0.0
+        return (missed.square().mean(0) / spread.square().mean(0)).log()
 
-    if is_sane(found):
+    begin = excess(found)
+    light = begin > 0.0
+    if float(begin.mean()) <= 0.0:
         return found
     alone = held_out(by_stretch, lambda given: _drives(given, noise, M, 0.0))
     for weight in WEIGHTS:
         if not is_harmless(held_out(by_stretch, lambda given, v=weight: _drives(given, noise, M, v)), alone):
             break
-        found = _drives(by_stretch.total(), noise, M, weight)
-        if is_sane(found):
+        found = torch.where(light, _drives(by_stretch.total(), noise, M, weight), found)
+        if float(excess(found).mean()) <= 0.0:
             break
     return found
 

@@ -36,7 +36,7 @@ RIDGE = 1e-8
 SIGNIFICANT = 2.0
 """Standard errors, over stretches, beyond which a difference counts."""
 APART = 0.05
-"""Time between a sample and its partner [s], longer than filters of accelerations reach."""
+"""Time between a sample and its partner [s], where no filter of accelerations spans more."""
 DISTANCES = (0.01, 0.03, 0.1)
 """Distances over which friction with memory develops [rad, m]."""
 LEAST_SQUARE = 1e-300
@@ -155,7 +155,7 @@ def free_rows(
         if quantity != "qdd" or len(free) < LEAST:
             continue
         m = m[free]
-        later, memory = partners(m), bristles(m)
+        later, memory = partners(m, training.filter_span), bristles(m)
         first = (later >= 0).nonzero()[:, 0]
         paired = len(first) >= LEAST
         if not paired:
@@ -183,10 +183,11 @@ def bristles(m: Measurement) -> Tensor:
     these columns it passes for negative inertia.
     """
     order = _in_time(m)
-    q, segment = m.q[order], m.segment[order]
-    step = q.diff(dim=0, prepend=q[:1])[..., None]
+    t, qd, segment = m.t[order], m.qd[order], m.segment[order]
+    # Velocities, unlike positions, are no noisier in a log of a higher rate.
+    step = (t.diff(prepend=t[:1])[:, None] * 0.5 * (qd + qd.roll(1, 0)))[..., None]
     # z⁺ = a z + b with a = exp(−|Δq|/δ), b = (1 − a) sgn Δq; composed over 1, 2, 4, … steps.
-    a = torch.exp(-step.abs() / q.new_tensor(DISTANCES))
+    a = torch.exp(-step.abs() / qd.new_tensor(DISTANCES))
     b = (1.0 - a) * step.sign()
     starts = segment.diff(prepend=segment[:1] - 1) != 0
     a[starts], b[starts] = 0.0, 0.0
@@ -200,10 +201,11 @@ def bristles(m: Measurement) -> Tensor:
     return found
 
 
-def partners(m: Measurement) -> Tensor:
+def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
     """The sample of the same trajectory that is later by `APART`, or −1, `(n,)`.
 
-    By less where velocities would change too much meanwhile, but never by nothing.
+    By less where velocities would change too much meanwhile, but never by less than the span of a filter that
+    the log states [s]: noise within it is correlated, and instruments have that noise too.
     """
     found = torch.full((len(m.t),), -1, device=m.t.device)
     order = _in_time(m)
@@ -212,10 +214,12 @@ def partners(m: Measurement) -> Tensor:
     if not len(steps) or float(steps.median()) <= 0.0:
         return found
     step, scale = float(steps.median()), qd.square().mean(0).clamp(min=1e-300)
-    for lag in range(1, max(1, round(APART / step)) + 1):
+    least = max(1, math.ceil(filter_span / step - 1e-6))
+    for lag in range(least, max(least, round(APART / step)) + 1):
         near = (segment[lag:] == segment[:-lag]) & ((t[lag:] - t[:-lag] - lag * step).abs() < 0.5 * step)
         coherence = (qd[lag:] * qd[:-lag])[near].mean(0) / scale
-        if int(near.sum()) < LEAST or float(coherence.median()) < COHERENT:
+        spanned = lag == least > 1
+        if int(near.sum()) < LEAST or (not spanned and float(coherence.median()) < COHERENT):
             break
         found.fill_(-1)
         found[order[:-lag][near]] = order[lag:][near]

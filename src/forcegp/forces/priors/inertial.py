@@ -42,7 +42,8 @@ class InertialPrior(ForcePrior):
     Args:
         mass: relative standard deviation of each link's mass.
         length: standard deviation of the first moment over the mass [m].
-        inertia: relative standard deviation of each link's inertia, of products I_ab relative to √(I_aa I_bb).
+        inertia: standard deviation of each link's moments of inertia over their values, and of products
+            I_ab over √(I_aa I_bb).
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
         scales: S `(10 nq,)`; that of the robot by default.
@@ -85,7 +86,9 @@ class InertialPrior(ForcePrior):
             return robot.mass.new_tensor(self.scales)
         m, J = robot.mass[:, None], inertial_parameters(robot.mass, robot.com, robot.inertia)
         gyration = J[:, [4, 7, 9]].clamp(min=0.0).sqrt()
-        products = [gyration[:, a] * gyration[:, b] for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+        products = [
+            gyration[:, a] * gyration[:, b] for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+        ]
         parts = [self.mass * m, (self.length * m).expand(-1, 3), self.inertia * torch.stack(products, dim=-1)]
         return torch.cat(parts, dim=-1).flatten().detach()
 
