@@ -16,6 +16,7 @@ from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.models.minibatch import BatchOptions
+from forcegp.models.structured_fit import StructuredFit
 
 GP_SAMPLES, NETWORK_SAMPLES, NETWORK_EPOCHS = 200, 5000, 200
 """Training samples, evenly spaced among those in motion, of the models that are blind to mechanics."""
@@ -45,6 +46,7 @@ class Fitted:
     predict: Predictor
     seconds: float
     notes: dict = field(default_factory=dict)
+    fit: StructuredFit | None = None
 
 
 def rigid(identify: Callable[[], LeastSquares]) -> Fitted:
@@ -83,7 +85,7 @@ def structured(case: Case, samples: int | None = None, priors: Sequence[ForcePri
         "priors": [prior.name for prior in fit.problem.priors],
         "warnings": list(result.warnings),
     }
-    return Fitted(predict, result.seconds, notes)
+    return Fitted(predict, result.seconds, notes, fit)
 
 
 def independent_gp(case: Case) -> Fitted:

@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scipy.signal import savgol_coeffs
 from torch import Tensor
 
 import forcegp
 from forcegp import dynamics
+from forcegp.data import DataHeader
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import correlation_times
-from forcegp.forces.inertia import Inertia, inertia_of, is_harmless, log_ratio
-from forcegp.forces.inverse_dynamics import APART, Rows, instrumental, partners, products, sums
+from forcegp.forces.inertia import Inertia, inertia_of
+from forcegp.forces.inverse_dynamics import (
+    APART,
+    Rows,
+    instrumental,
+    is_harmless,
+    log_ratio,
+    partners,
+    products,
+    sums,
+)
 from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean
@@ -31,8 +42,14 @@ def log(
     seed: int = 0,
     segments: int = 8,
     acceleration_noise: float = 0.0,
+    memory: float = 0.0,
+    window: int = 1,
 ) -> forcegp.Dataset:
-    """Torques that move a robot with joint friction along sums of sines, measured with noise."""
+    """Torques that move a robot with joint friction along sums of sines, measured with noise.
+
+    With memory, dry friction is four times as large and develops over that distance [rad] (Dahl's model). Noise
+    of accelerations is that of a Savitzky-Golay filter of a window.
+    """
     generator = torch.Generator().manual_seed(seed)
     t = torch.arange(n, dtype=torch.float64) * 0.01
     segment = torch.arange(n) * segments // n
@@ -42,10 +59,27 @@ def log(
     parts = torch.sin(angle), w[segment] * torch.cos(angle), -(w[segment] ** 2) * torch.sin(angle)
     q, qd, qdd = (0.4 * part.sum(1) for part in parts)
     noise = NOISE * torch.randn(n, 2, generator=generator, dtype=torch.float64)
-    friction = 0.3 * qd + 0.4 * torch.tanh(qd / 0.02)
+    dry = 1.6 * dahl(q, segment, memory) if memory else 0.4 * torch.tanh(qd / 0.02)
+    friction = 0.3 * qd + dry
     tau = dynamics.inverse_dynamics(robot, q, qd, qdd) + friction + noise
-    qdd = qdd + acceleration_noise * torch.randn(n, 2, generator=generator, dtype=torch.float64)
-    return forcegp.Dataset(t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names, segment=segment)
+    white = torch.randn(n + window - 1, 2, generator=generator, dtype=torch.float64)
+    weights = torch.ones(1) if window == 1 else torch.from_numpy(savgol_coeffs(window, 3, deriv=2))
+    weights = weights.double() / weights.norm()
+    qdd = qdd + acceleration_noise * (white.unfold(0, window, 1) @ weights)
+    header = DataHeader(filter_span=None if window == 1 else window * 0.01)
+    return forcegp.Dataset(
+        t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names, segment=segment, header=header
+    )
+
+
+def dahl(q: Tensor, segment: Tensor, distance: float) -> Tensor:
+    """z of dz/dq = (sgn q̇ − z)/δ from z = 0 at the start of each segment."""
+    z = torch.zeros_like(q)
+    for k in range(1, len(q)):
+        if segment[k] == segment[k - 1]:
+            step = q[k] - q[k - 1]
+            z[k] = step.sign() + (z[k - 1] - step.sign()) * torch.exp(-step.abs() / distance)
+    return z
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +92,17 @@ def file() -> RobotModel:
 def found(file: RobotModel, data: forcegp.Dataset) -> Inertia:
     system, prior = forcegp.ConstrainedSystem(file), JointFrictionPrior()
     return inertia_of(system, prior, AnalyticalMean(), training_of(data, system, (prior,), None, {}))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_friction_with_memory_is_not_taken_for_inertia(file: RobotModel, seed: int) -> None:
+    """Within some hundredths of a radian of a reversal it is a spring, whose torque is that of negative
+    inertia."""
+    assert found(file, log(file, seed=seed, memory=0.05)).robot is file
+    truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
+    data = log(truth, seed=seed, memory=0.05)
+    result = found(file, data)
+    assert result.identified and inertia_error(result.robot, truth, data) < 0.03
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -92,6 +137,7 @@ def test_links_that_the_file_describes_wrongly_are_identified(file: RobotModel) 
     assert inertia_error(fitted.system.robot, truth, data) < 0.25 * inertia_error(file, truth, data)
     prior = next(prior for prior in model.force_priors if isinstance(prior, InertialPrior))
     assert fitted.problem.pinned == (prior.name,), "its mean is in the robot, its uncertainty remains"
+    assert not fitted.hyperparameters["inertial.log_scale"].any(), "the robot contains what would show its scale"
     again = model.fit(log(truth, 800), learn=["joint_friction"])
     torch.testing.assert_close(again.system.robot.mass, fitted.system.robot.mass, rtol=0.0, atol=0.0)
     assert again.problem.pinned == (prior.name,)
@@ -116,6 +162,19 @@ def test_noise_of_accelerations_does_not_make_inertia_smaller(file: RobotModel, 
     own, exact = (dynamics.mass_matrix(each, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
                   for each in (result.robot, truth))  # fmt: skip
     torch.testing.assert_close(own, exact, rtol=0.04, atol=0.0)
+
+
+def test_instruments_are_further_apart_than_a_filter_spans(file: RobotModel) -> None:
+    """Within the span noise is correlated, and M too far off."""
+    truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
+    data = log(truth, 6400, 0.6, acceleration_noise=0.7, window=11)
+    unstated = data.replace(header=DataHeader())
+    exact = dynamics.mass_matrix(truth, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
+    off = [
+        float((dynamics.mass_matrix(found(file, each).robot, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
+               / exact - 1.0).abs().max()) for each in (data, unstated)
+    ]  # fmt: skip
+    assert off[0] < 0.05 < off[1]
 
 
 def test_a_partner_is_later_in_the_same_trajectory(file: RobotModel) -> None:
@@ -185,7 +244,7 @@ def test_sums_give_the_dense_least_squares() -> None:
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
     by_stretch = sums(
-        Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, torch.arange(n)), C
+        Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, torch.arange(n), Phi[..., :0]), C
     )
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
@@ -211,7 +270,7 @@ def test_instruments_give_the_textbook_estimate() -> None:
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     partner = torch.cat([torch.arange(n // 2) + n // 2, torch.arange(n // 2)])
     group = torch.arange(n // 2).repeat(2) * 3 // (n // 2)
-    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner)
+    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner, Phi[..., :0])
     every = instrumental(rows, C).total()
     delta = torch.linalg.solve(*every.quadratic(NOISE))
     X, Z = (torch.zeros(n, nq, p + nq * f, dtype=torch.float64) for _ in range(2))

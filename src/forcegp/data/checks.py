@@ -281,6 +281,7 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
     agreed["ordered"] = all(header.ordered for header in headers)
     agreed["filtered"] = any(header.filtered for header in headers)
+    agreed["filter_span"] = max((h.filter_span for h in headers if h.filter_span is not None), default=None)
     return DataHeader(**agreed)
 
 

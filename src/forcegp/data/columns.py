@@ -175,4 +175,5 @@ def _fill_in(
     if "qdd" not in absent:
         return header.with_step(step)
     noise = float(np.sqrt(np.mean(fields["extras"]["qdd_std"] ** 2)))
-    return header.with_step(step, noise_std=noise, filtered=True)
+    span = method.window * float(np.median(np.diff(fields["t"])))
+    return header.with_step(step, noise_std=noise, filtered=True, filter_span=span)

@@ -19,6 +19,7 @@ class DataHeader(Header):
         noise_std: standard deviation of the noise on q̈ [rad/s²].
         filtered: q̈ was computed by a filter, so that its noise is correlated in time; otherwise `noise_std`
             claims white noise.
+        filter_span: of the filter that computed q̈ [s]: its noise is uncorrelated further apart in time.
         robot: name of the robot.
         robot_fingerprint: `RobotModel.fingerprint` of the robot that moved.
         seed: seed of the random numbers that went into the data.
@@ -33,6 +34,7 @@ class DataHeader(Header):
     dt: PositiveFloat | None = None
     noise_std: NonNegativeFloat | None = None
     filtered: bool = False
+    filter_span: NonNegativeFloat | None = None
     robot: str | None = None
     robot_fingerprint: str | None = None
     seed: int | None = None

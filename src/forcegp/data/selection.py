@@ -285,6 +285,7 @@ def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset
         f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}",
         noise_std=std,
         filtered=False,
+        filter_span=None,
     )
     return data.replace(
         qdd=clean + std * noise.to(clean.device), extras={**data.extras, "qdd_clean": clean}, header=header

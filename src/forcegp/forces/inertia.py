@@ -21,7 +21,18 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
-from forcegp.forces.inverse_dynamics import LEAST, Rows, Sums, free_rows, held_out, is_less, sums
+from forcegp.forces.inverse_dynamics import (
+    LEAST,
+    Rows,
+    Sums,
+    acceleration_errors,
+    free_rows,
+    held_out,
+    is_harmless,
+    is_less,
+    log_ratio,
+    sums,
+)
 from forcegp.forces.links import rigid_robot
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import ForceMean
@@ -30,10 +41,8 @@ from forcegp.robot.model import RobotModel
 
 VOLUME_STATES = 60
 """States that log |M| is averaged over."""
-LEAST_SQUARE = 1e-300
-"""Mean square of a joint that does not move in a stretch, which has no error."""
-TOLERATED = 0.02
-"""Relative increase of the held-out torque error of a joint that is worth better accelerations."""
+NEGLIGIBLE = 0.02
+"""Inertia of a drive over its joint's that is left out: a gain of the torque sensor explains as much."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
 """Weights v of the volume, from 1/1024 to 1."""
 
@@ -69,18 +78,14 @@ def inertia_of(
     rows = free_rows(system, friction, mean, training)
     if rows is None:
         return Inertia(robot, doubts=_unchecked(training))
-    identified = rigid_robot(robot, rows)
+    remembering = rows.with_memory()
+    identified = rigid_robot(robot, remembering)
     if identified is not None:
         text = "held-out torques ask for other inertial parameters than the robot file's, now identified"
         return Inertia(identified, True, (text, *_told(robot, identified.armature - robot.armature)))
-    drives = sums(rows, torch.diag_embed(rows.qdd))
-    none = rows.qdd.new_zeros(robot.nq)
-    before = held_out(drives, lambda _: none)
-    every = drives.total()
-    noise = every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
     M = mass_matrix(robot, rows.q)
-    alone = held_out(drives, lambda given: _drives(given, noise, M, 0.0))
-    armature = inertia_of_drives(rows, drives, noise, M, alone, is_less(log_ratio(alone, before).mean(-1)))
+    armature = _damped(rows, M, _lacking(remembering, M))
+    armature = armature * (armature > NEGLIGIBLE * M.diagonal(dim1=-2, dim2=-1).mean(0))
     if not bool(armature.any()):
         return Inertia(robot)
     return Inertia(robot.replace(armature=robot.armature + armature), doubts=_told(robot, armature))
@@ -107,46 +112,63 @@ def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
     return (f"{lacks}: {found}",) if found else ()
 
 
-def log_ratio(after: Tensor, before: Tensor) -> Tensor:
-    """Of the roots of mean squares; zero for a joint that does not move in a stretch."""
-    return 0.5 * (after.clamp(min=LEAST_SQUARE) / before.clamp(min=LEAST_SQUARE)).log()
+def _lacking(rows: Rows, M: Tensor) -> Tensor:
+    """Inertia of drives `(nq,)` that predicts held-out torques significantly better than none, or zero.
+
+    No joint's acceleration error may grow.
+    """
+    C = torch.diag_embed(rows.qdd)
+    drives, none = sums(rows, C), torch.zeros_like(M[0, 0])
+    every = drives.total()
+    noise = _noise(every)
+    alone = held_out(drives, lambda given: _drives(given, noise, M, 0.0))
+    if not is_less(log_ratio(alone, held_out(drives, lambda _: none)).mean(-1)):
+        return none
+    found = _drives(every, noise, M, 0.0)
+    before = acceleration_errors(rows, drives, C, none, M)
+    after = acceleration_errors(rows, drives, C, found, M + torch.diag(found))
+    return found if is_harmless(after, before) else none
 
 
-def is_harmless(after: Tensor, before: Tensor) -> bool:
-    """Whether the errors of no joint are larger by more than is tolerated."""
-    return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
+def _noise(every: Sums) -> Tensor:
+    """Root mean square of the torque that the file and friction leave `(nq,)`."""
+    none = every.gram.new_zeros(every.unknowns)
+    return every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
 
 
-def inertia_of_drives(
-    rows: Rows, by_stretch: Sums, noise: Tensor, M: Tensor, alone: Tensor, helped: bool
-) -> Tensor:
-    """Inertia of drives beyond the file's `(nq,)`, zero where torques and accelerations do not need it.
+def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
+    """Inertia of drives beyond the file's `(nq,)`, raised where accelerations need it.
+
+    They need it, in the geometric mean of the joints, where their mean predicts them better; only the drives of
+    joints of which that is true are raised.
 
     Args:
-        rows, by_stretch: the samples.
-        noise: of the torques `(nq,)`.
+        rows: the samples.
         M: mass matrix of the file at the samples.
-        alone: held-out errors with v = 0.
-        helped: whether these are significantly smaller than with the file's inertia.
+        found: inertia of drives that torques ask for.
     """
+    by_stretch = sums(rows, torch.diag_embed(rows.qdd))
+    noise = _noise(by_stretch.total())
 
-    def is_sane(armature: Tensor) -> bool:
-        """Whether accelerations are predicted as well as by their mean, by the geometric mean of joints."""
+    def excess(armature: Tensor) -> Tensor:
+        """Logarithm of the squared acceleration error over that of the mean acceleration `(nq,)`."""
         friction = by_stretch.total().friction(armature)
         left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
         missed = torch.linalg.solve(M + torch.diag(armature), left[..., None])[..., 0]
         spread = rows.qdd - rows.qdd.mean(0)
-        return float((missed.square().mean(0) / spread.square().mean(0)).log().mean()) <= 0.0
+        return (missed.square().mean(0) / spread.square().mean(0)).log()
 
-    found = torch.zeros_like(noise)
-    if helped:
-        found = _drives(by_stretch.total(), noise, M, 0.0)
+    begin = excess(found)
+    light = begin > 0.0
+    if float(begin.mean()) <= 0.0:
+        return found
+    alone = held_out(by_stretch, lambda given: _drives(given, noise, M, 0.0))
     for weight in WEIGHTS:
-        if is_sane(found):
-            break
         if not is_harmless(held_out(by_stretch, lambda given, v=weight: _drives(given, noise, M, v)), alone):
             break
-        found = _drives(by_stretch.total(), noise, M, weight)
+        found = torch.where(light, _drives(by_stretch.total(), noise, M, weight), found)
+        if float(excess(found).mean()) <= 0.0:
+            break
     return found
 
 

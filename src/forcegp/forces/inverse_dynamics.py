@@ -11,6 +11,7 @@ C′ᵀ(C δ + Φ w − r) = 0, and errors are judged by the product ε ε′, i
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,7 +36,13 @@ RIDGE = 1e-8
 SIGNIFICANT = 2.0
 """Standard errors, over stretches, beyond which a difference counts."""
 APART = 0.05
-"""Time between a sample and its partner [s], longer than filters of accelerations reach."""
+"""Time between a sample and its partner [s], where no filter of accelerations spans more."""
+DISTANCES = (0.01, 0.03, 0.1)
+"""Distances over which friction with memory develops [rad, m]."""
+LEAST_SQUARE = 1e-300
+"""Mean square of a joint that does not move in a stretch, which has no error."""
+TOLERATED = 0.02
+"""Relative increase of the held-out error of a joint that is tolerated."""
 COHERENT = 0.9
 """Autocorrelation that the velocities of the two have at least, the median of the joints."""
 
@@ -53,6 +60,7 @@ class Rows:
         group: stretch of each sample `(n,)`, from 0 without gaps.
         segment: `(n,)`.
         partner: index of each sample's partner `(n,)`; its own where the log has none.
+        memory: friction with memory, further features `(n, nq, k)`.
     """
 
     q: Tensor
@@ -64,6 +72,11 @@ class Rows:
     group: Tensor
     segment: Tensor
     partner: Tensor
+    memory: Tensor
+
+    def with_memory(self) -> Rows:
+        """The samples with all features of friction in Φ."""
+        return dataclasses.replace(self, friction=torch.cat([self.friction, self.memory], dim=-1))
 
     @property
     def leading(self) -> int:
@@ -142,7 +155,7 @@ def free_rows(
         if quantity != "qdd" or len(free) < LEAST:
             continue
         m = m[free]
-        later = partners(m)
+        later, memory = partners(m, training.filter_span), bristles(m)
         first = (later >= 0).nonzero()[:, 0]
         paired = len(first) >= LEAST
         if not paired:
@@ -151,29 +164,62 @@ def free_rows(
         _, group = stretches(m.segment[first]).unique(return_inverse=True)
         i = torch.arange(len(first), device=free.device)
         if not paired:
-            return _rows(system, prior, mean, m[first], group, i)
-        both, n = m[torch.cat([first, later[first]])], len(first)
-        return _rows(system, prior, mean, both, group.repeat(2), torch.cat([i + n, i]))
+            return _rows(system, prior, mean, m[first], memory[first], group, i)
+        both, n = torch.cat([first, later[first]]), len(first)
+        return _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
     return None
 
 
-def partners(m: Measurement) -> Tensor:
+def _in_time(m: Measurement) -> Tensor:
+    """Indices of samples in the order of segment and time."""
+    order = torch.argsort(m.t, stable=True)
+    return order[torch.argsort(m.segment[order], stable=True)]
+
+
+def bristles(m: Measurement) -> Tensor:
+    """Friction with memory: z of Dahl's model dz/dt = q̇/δ − |q̇| z/δ for some distances δ, `(n, nq, k)`.
+
+    Within δ of a reversal this friction is a spring, and its torque is about proportional to −q̈: without
+    these columns it passes for negative inertia.
+    """
+    order = _in_time(m)
+    t, qd, segment = m.t[order], m.qd[order], m.segment[order]
+    # Velocities, unlike positions, are no noisier in a log of a higher rate.
+    step = (t.diff(prepend=t[:1])[:, None] * 0.5 * (qd + qd.roll(1, 0)))[..., None]
+    # z⁺ = a z + b with a = exp(−|Δq|/δ), b = (1 − a) sgn Δq; composed over 1, 2, 4, … steps.
+    a = torch.exp(-step.abs() / qd.new_tensor(DISTANCES))
+    b = (1.0 - a) * step.sign()
+    starts = segment.diff(prepend=segment[:1] - 1) != 0
+    a[starts], b[starts] = 0.0, 0.0
+    lag = 1
+    while lag < len(a):
+        b[lag:] = b[lag:] + a[lag:] * b[:-lag].clone()
+        a[lag:] = a[lag:] * a[:-lag].clone()
+        lag *= 2
+    found = torch.empty_like(b)
+    found[order] = b
+    return found
+
+
+def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
     """The sample of the same trajectory that is later by `APART`, or −1, `(n,)`.
 
-    By less where velocities would change too much meanwhile, but never by nothing.
+    By less where velocities would change too much meanwhile, but never by less than the span of a filter that
+    the log states [s]: noise within it is correlated, and instruments have that noise too.
     """
     found = torch.full((len(m.t),), -1, device=m.t.device)
-    order = torch.argsort(m.t, stable=True)
-    order = order[torch.argsort(m.segment[order], stable=True)]
+    order = _in_time(m)
     t, qd, segment = m.t[order], m.qd[order], m.segment[order]
     steps = t.diff()[segment[1:] == segment[:-1]]
     if not len(steps) or float(steps.median()) <= 0.0:
         return found
     step, scale = float(steps.median()), qd.square().mean(0).clamp(min=1e-300)
-    for lag in range(1, max(1, round(APART / step)) + 1):
+    least = max(1, math.ceil(filter_span / step - 1e-6))
+    for lag in range(least, max(least, round(APART / step)) + 1):
         near = (segment[lag:] == segment[:-lag]) & ((t[lag:] - t[:-lag] - lag * step).abs() < 0.5 * step)
         coherence = (qd[lag:] * qd[:-lag])[near].mean(0) / scale
-        if int(near.sum()) < LEAST or float(coherence.median()) < COHERENT:
+        spanned = lag == least > 1
+        if int(near.sum()) < LEAST or (not spanned and float(coherence.median()) < COHERENT):
             break
         found.fill_(-1)
         found[order[:-lag][near]] = order[lag:][near]
@@ -185,15 +231,16 @@ def _rows(
     prior: JointFrictionPrior,
     mean: ForceMean,
     m: Measurement,
+    memory: Tensor,
     group: Tensor,
     partner: Tensor,
 ) -> Rows:
     at = m.at(system)
     Phi = torch.cat([*prior.features(system, at).values(), torch.ones_like(at.q)[..., None]], dim=-1)
-    Phi = Phi / Phi.square().mean(0).sqrt().clamp(min=1e-12)
+    Phi, memory = (x / x.square().mean(0).sqrt().clamp(min=1e-12) for x in (Phi, memory))
     residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
     slides = _slides(m.qd.abs() >= min(prior.speeds), Phi, residual)
-    return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment, partner)
+    return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment, partner, memory)
 
 
 def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
@@ -260,6 +307,34 @@ def held_out(by_stretch: Sums, estimate: Estimate) -> Tensor:
         delta = estimate(rest)
         errors.append(by_stretch.of(g).error(delta, rest.friction(delta)))
     return torch.stack(errors)
+
+
+def acceleration_errors(rows: Rows, by_stretch: Sums, columns: Tensor, delta: Tensor, M: Tensor) -> Tensor:
+    """Mean squares of acceleration errors at δ on stretches that friction has not seen, `(groups, nq)`.
+
+    Args:
+        rows, by_stretch: the samples.
+        columns: C.
+        delta: unknowns.
+        M: mass matrix with them.
+    """
+    left, errors = rows.residual - columns @ delta, []
+    for g in range(len(by_stretch.gram)):
+        own = rows.group == g
+        force = left[own] - (rows.friction[own] * by_stretch.without(g).friction(delta)).sum(-1)
+        missed = torch.linalg.solve(M[own], (rows.slides[own] * force)[..., None])[..., 0]
+        errors.append(missed.square().mean(0))
+    return torch.stack(errors)
+
+
+def log_ratio(after: Tensor, before: Tensor) -> Tensor:
+    """Of the roots of mean squares; zero for a joint that does not move in a stretch."""
+    return 0.5 * (after.clamp(min=LEAST_SQUARE) / before.clamp(min=LEAST_SQUARE)).log()
+
+
+def is_harmless(after: Tensor, before: Tensor) -> bool:
+    """Whether the errors of no joint are larger by more than is tolerated."""
+    return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
 
 
 def is_less(difference: Tensor) -> bool:

@@ -16,7 +16,15 @@ from torch import Tensor
 
 from forcegp.dynamics import mass_matrix
 from forcegp.forces.calibration import autocorrelation_time
-from forcegp.forces.inverse_dynamics import Rows, Sums, instrumental, is_less, products
+from forcegp.forces.inverse_dynamics import (
+    Rows,
+    Sums,
+    acceleration_errors,
+    instrumental,
+    is_harmless,
+    is_less,
+    products,
+)
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
@@ -29,7 +37,8 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     """The physically consistent robot that predicts held-out torques better than the file, or `None`.
 
     It has to do so significantly, by more than two standard errors over stretches of the log: better than the
-    file, and better than the file with drives that it lacks.
+    file, and better than the file with drives that it lacks. And no joint's held-out acceleration error may
+    grow.
 
     Args:
         robot: of the file.
@@ -46,14 +55,14 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
         left = rows.slides * (rows.residual - C @ mean - (rows.friction * every.friction(mean)).sum(-1))
         noise = (left.square().sum(0) / rows.slides.sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
         power = _power(rows, left / noise)
-        mean = _estimate(every, noise, power, n)
+        mean = _estimate(every, noise, power)
 
     def compared(estimate: Tensor | None) -> Tensor:
         """Held-out errors in units of the noise, of an estimate, or of that of the other stretches."""
         errors = []
         for g in range(len(judged.gram)):
             rest = by_stretch.without(g)
-            delta = _estimate(rest, noise, power, n) if estimate is None else estimate
+            delta = _estimate(rest, noise, power) if estimate is None else estimate
             errors.append(judged.of(g).error(delta, rest.friction(delta)) / noise**2)
         return torch.stack(errors)
 
@@ -64,7 +73,12 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     driven = robot.replace(armature=robot.armature + size * mean[:n])
     _, precision = _normal(every, noise, power)
     consistent, moved = prior.updated(driven, mean[n:], precision[n:, n:])
-    return consistent if _is_better(compared(torch.cat([mean[:n], moved])), known) else None
+    found = torch.cat([mean[:n], moved])
+    before, after = (
+        acceleration_errors(rows, by_stretch, C, delta, mass_matrix(each, rows.q))
+        for each, delta in ((robot, nothing), (consistent, found))
+    )
+    return consistent if _is_better(compared(found), known) and is_harmless(after, before) else None
 
 
 def _power(rows: Rows, left: Tensor) -> float:
@@ -82,9 +96,10 @@ def _normal(given: Sums, noise: Tensor, power: float) -> tuple[Tensor, Tensor]:
     return power * shown @ (vectors.mT @ h), precision + torch.eye(len(h), dtype=h.dtype, device=h.device)
 
 
-def _estimate(given: Sums, noise: Tensor, power: float, n: int) -> Tensor:
+def _estimate(given: Sums, noise: Tensor, power: float) -> Tensor:
     """Most probable unknowns, of which the first n, the drives, are not negative."""
     h, precision = _normal(given, noise, power)
+    n = len(noise)
     drives = torch.linalg.solve(precision, h)[:n].clamp(min=0.0)
     links = torch.linalg.solve(precision[n:, n:], h[n:] - precision[n:, :n] @ drives)
     return torch.cat([drives, links])

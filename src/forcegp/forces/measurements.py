@@ -75,6 +75,7 @@ class Training:
         scales: standardization of the inputs of each prior.
         part_of: number of samples that are conditioned on, of which these are a part; 0 where these are all.
         period: sampling period of the log that these are from [s]; 0 where its rows are not in order.
+        filter_span: of the filter that computed the accelerations [s]; 0 where the log does not state it.
         weights: of the samples of each measurement `(n,)`, which their noise variance is divided by; `None`
             for one.
         slopes: G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement with learned forces, `None` for a quantity
@@ -86,6 +87,7 @@ class Training:
     scales: tuple[Standardization, ...]
     part_of: int = 0
     period: float = 0.0
+    filter_span: float = 0.0
     weights: tuple[Tensor, ...] | None = None
     slopes: tuple[Tensor | None, ...] | None = None
 

@@ -208,6 +208,7 @@ def training_of(
         noise_std=tuple(std for _, std in pairs),
         scales=tuple(scales[prior.name] for prior in priors),
         period=_period(observations[0].data),
+        filter_span=max(o.data.header.filter_span or 0.0 for o in observations),
     )
 
 

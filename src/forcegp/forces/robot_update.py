@@ -28,9 +28,9 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
         contained = prior.name in problem.pinned
         if isinstance(prior, InertialPrior) and problem.parameters is None and not contained:
             posterior = force_posterior(problem, values)
-            features = _one_row(posterior, problem)
+            features = one_row(posterior, problem)
             mean = posterior.latent.latent_mean(p, features[p])[0]
-            precision = _precision(posterior, features, p, problem.system.robot)
+            precision = latent_precision(posterior, features, p, problem.system.robot)
             volume = _log_volume(problem, values)
             robot, moved = prior.updated(problem.system.robot, mean, precision, volume)
             # The prior keeps the scale of the file's parameters, not that of the updated ones.
@@ -77,14 +77,14 @@ def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[Rob
     return volume
 
 
-def _one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
+def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
     """Kernel inputs of every prior at the first sample; constants have the same value everywhere."""
     m = problem.training.measurements[0]
     at = m[torch.zeros(1, dtype=torch.int64, device=m.q.device)].at(problem.system)
     return [posterior.features_of(p, problem.system, at) for p in range(len(problem.priors))]
 
 
-def _precision(
+def latent_precision(
     posterior: ForcePosterior, features: list[dict[str, Tensor]], p: int, robot: RobotModel
 ) -> Tensor:
     """Inverse posterior covariance of the components of prior p, all others marginalised."""

@@ -190,6 +190,7 @@ def _dataset(
         dt=dt,
         noise_std=None if std is None else float(np.sqrt(np.mean(std**2))),
         filtered=std is not None,
+        filter_span=None if std is None or settings.method == "smoother" else settings.window * dt,
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,
         provenance=tuple(report.steps),

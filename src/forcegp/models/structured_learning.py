@@ -164,14 +164,20 @@ def search_of(
     chosen: Sequence[str] | None,
     options: LearningOptions | None,
 ) -> Search:
-    """What is learned of a problem, from where, and what keeps its values."""
+    """What is learned of a problem, from where, and what keeps its values.
+
+    The scale of a force that the robot contains is not learned.
+    """
     options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
     start = initial(problem, spec.learn_noise, spec.learns_torque_noise)
-    if chosen is None:
-        return Search(start, {}, options)
-    known = {} if before is None else before.hyperparameters
+    known = {} if before is None or chosen is None else before.hyperparameters
     current = {key: known.get(key, value) for key, value in start.items()}
-    held = {key: value for key, value in current.items() if key.split(".")[0] not in chosen}
+
+    def is_held(name: str) -> bool:
+        # Residuals of a robot that contains a force do not show the scale of that force.
+        return name in problem.pinned or (chosen is not None and name not in chosen)
+
+    held = {key: value for key, value in current.items() if is_held(key.split(".")[0])}
     return Search({key: value for key, value in start.items() if key not in held}, held, options)
 
 

@@ -41,11 +41,12 @@ class InertialPrior(ForcePrior):
 
     Args:
         mass: relative standard deviation of each link's mass.
-        length: standard deviation of the first moment over the mass, and radius of gyration of the error of
-            the inertia [m].
+        length: standard deviation of the first moment over the mass [m].
+        inertia: standard deviation of each link's moments of inertia over their values, and of products
+            I_ab over √(I_aa I_bb).
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
-        masses: of the links, which the scale is relative to; those of the robot by default [kg].
+        scales: S `(10 nq,)`; that of the robot by default.
 
     Example:
         >>> import torch, forcegp
@@ -56,14 +57,15 @@ class InertialPrior(ForcePrior):
 
     mass: float = 0.3
     length: float = 0.1
+    inertia: float = 0.15
     kernel: Kernel = field(default_factory=lambda: Constant(group=PER_LINK))
     name: str = "inertial"
     target: str = JOINT
-    masses: tuple[float, ...] | None = None
+    scales: tuple[float, ...] | None = None
 
     def around(self, robot: RobotModel) -> InertialPrior:
-        """The prior with the masses of this robot as its scale, whatever robot it is read on."""
-        return dataclasses.replace(self, masses=tuple(robot.mass.tolist()))
+        """The prior with the scale of this robot, whatever robot it is read on."""
+        return dataclasses.replace(self, scales=tuple(self.scale(robot).tolist()))
 
     def outputs(self, robot: RobotModel) -> int:
         return PER_LINK * robot.nq
@@ -80,10 +82,15 @@ class InertialPrior(ForcePrior):
 
     def scale(self, robot: RobotModel) -> Tensor:
         """S `(10 nq,)`: standard deviations of π before a link's scale is learned."""
-        m = robot.mass if self.masses is None else robot.mass.new_tensor(self.masses)
-        r = self.length
-        parts = [self.mass * m, *3 * [m * r], *6 * [m * r * r]]
-        return torch.stack(parts, dim=-1).flatten().detach()
+        if self.scales is not None:
+            return robot.mass.new_tensor(self.scales)
+        m, J = robot.mass[:, None], inertial_parameters(robot.mass, robot.com, robot.inertia)
+        gyration = J[:, [4, 7, 9]].clamp(min=0.0).sqrt()
+        products = [
+            gyration[:, a] * gyration[:, b] for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+        ]
+        parts = [self.mass * m, (self.length * m).expand(-1, 3), self.inertia * torch.stack(products, dim=-1)]
+        return torch.cat(parts, dim=-1).flatten().detach()
 
     def updated(
         self,
