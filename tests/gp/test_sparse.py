@@ -15,7 +15,16 @@ from forcegp.gp.likelihood import condition
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block, cross_gram, rows_of
 from forcegp.gp.sums import accumulate
-from gp.sparse_cases import COMPONENTS, PROCESSES, condition_sparse, first, parameters, rows, textbook
+from gp.sparse_cases import (
+    COMPONENTS,
+    PROCESSES,
+    condition_sparse,
+    first,
+    latent_covariance,
+    parameters,
+    rows,
+    textbook,
+)
 
 ALGEBRA = 1e-8
 """Two orders of summation and factorisation of matrices with condition numbers up to about 10⁶."""
@@ -75,7 +84,7 @@ def test_a_process_that_no_row_shows_keeps_its_prior_and_needs_no_points() -> No
     assert posterior.measured == (True, False)
     test = rows(6, seed=2)
     assert torch.equal(posterior.latent_mean(1, test.features[1]), torch.zeros(6, 1, dtype=torch.float64))
-    latent = posterior.latent_covariance(test.features)
+    latent = latent_covariance(posterior, test)
     prior = PROCESSES[1].kernel.diagonal(sub(params, "contact"), test.features[1])[0]
     assert torch.allclose(latent[:, 2, 2], prior, rtol=ROUNDING)
     assert float(latent[:, 2, :2].abs().max()) == 0.0

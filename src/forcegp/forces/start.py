@@ -28,13 +28,18 @@ from forcegp.gp.kernels import Parameters
 from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
 from forcegp.gp.structured_covariance import Block
 
-LOG_LENGTHSCALE_BOUNDS = (math.log(0.03), math.log(3e4))
-LOG_STD_BOUNDS = (math.log(1e-6), math.log(1e6))
-LOG_NOISE_BOUNDS = (math.log(1e-6), math.log(1e4))
-LOG_COEFFICIENT_BOUNDS = (math.log(1e-3), math.log(2.0))
-LOG_SPEED_BOUNDS = (math.log(1e-3), math.log(1.0))
-LOG_TIME_BOUNDS = (math.log(1e-3), math.log(1e4))
-LOG_SMOOTHING_BOUNDS = (math.log(1e-4), math.log(0.1))
+LIMITS = {
+    "log_coefficient": (math.log(1e-3), math.log(2.0)),
+    "log_speed": (math.log(1e-3), math.log(1.0)),
+    "log_time": (math.log(1e-3), math.log(1e4)),
+    "log_smoothing": (math.log(1e-4), math.log(0.1)),
+    MIXING: (-10.0, 10.0),
+}
+"""Bounds of what has a scale of its own, whatever the start."""
+REACH = {"log_lengthscale": (4.0, 8.0)}
+"""How far the others may move below and above their start, in e-folds; `FAR` where not named. An input with a
+length-scale 8 e-folds above its start no longer matters."""
+FAR = (7.0, 7.0)
 WIDTH = {
     "log_coefficient": (2.0, 1.0),
     "log_smoothing": (2.0, 1.0),
@@ -88,7 +93,7 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
     like = problem.system.robot.mass
     known = initial_coulomb(problem.priors, like)
-    limits = below_jamming(problem.system, problem.training.measurements, problem.priors, bounds_of(known))
+    limits = below_jamming(problem.system, problem.training.measurements, problem.priors, limits_of(known))
 
     def start_at(x: float) -> tuple[Tensors, WhitenedRows]:
         own = {
@@ -154,18 +159,21 @@ def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
     return parallel.to(torch.uint8).argmax(0)
 
 
-def bounds_of(params: Parameters) -> dict[str, tuple[float, float]]:
-    """Box of each hyperparameter, for the optimiser."""
-    kinds = {
-        "log_lengthscale": LOG_LENGTHSCALE_BOUNDS,
-        "log_noise_std": LOG_NOISE_BOUNDS,
-        "log_coefficient": LOG_COEFFICIENT_BOUNDS,
-        "log_smoothing": LOG_SMOOTHING_BOUNDS,
-        "log_speed": LOG_SPEED_BOUNDS,
-        "log_time": LOG_TIME_BOUNDS,
-        MIXING: (-10.0, 10.0),
-    }
-    return {key: kinds.get(key.rsplit(".", 1)[-1], LOG_STD_BOUNDS) for key in params}
+def limits_of(params: Parameters) -> dict[str, tuple[float, float]]:
+    """Bounds of the hyperparameters that have a scale of their own."""
+    kinds = {key: key.rsplit(".", 1)[-1] for key in params}
+    return {key: LIMITS[kind] for key, kind in kinds.items() if kind in LIMITS}
+
+
+def box_around(start: Parameters) -> dict[str, tuple[float | Tensor, float | Tensor]]:
+    """Box of each hyperparameter, for the optimiser.
+
+    Far from the start, a likelihood in double precision is rounding: a force a million times as strong as its
+    noise leaves nothing of it.
+    """
+    reach = {key: REACH.get(key.rsplit(".", 1)[-1], FAR) for key in start}
+    around = {key: (x - reach[key][0], x + reach[key][1]) for key, x in start.items()}
+    return {**around, **limits_of(start)}
 
 
 def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tensor | float:
@@ -284,9 +292,10 @@ class Search:
 
     def _minimise(self, problem: Problem, begin: Tensors, progress: Progress | None) -> Learned:
         analytical = frozenset(key for key in begin if key.startswith(ANALYTICAL + "."))
-        bounds = bounds_of({key: value for key, value in begin.items() if key not in analytical})
+        bounds = box_around({key: value for key, value in self.start.items() if key not in analytical})
         if problem.has_coulomb:
-            bounds = below_jamming(problem.system, problem.training.measurements, problem.priors, bounds)
+            limits = limits_of(self.start)
+            bounds |= below_jamming(problem.system, problem.training.measurements, problem.priors, limits)
         # The tolerance is relative to the objective, so the part that no hyperparameter changes is left out.
         constant = float(problem.fixed_rows.constant)
 

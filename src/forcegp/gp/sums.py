@@ -177,7 +177,7 @@ def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> t
             values, explained = part.values(x)
             rows[:, basis.of_process(p)] = part.rows(W, values)
             S_kk, variance = torch.linalg.vecdot(W, W, dim=1).mT, part.rest_variance(x)
-            traces[p] = traces[p] + (S_kk * torch.stack([variance, variance - explained])).sum((1, 2))
+            traces[p] = traces[p] + (S_kk * torch.stack([variance, part.missed(variance, explained)])).sum((1, 2))
     y = torch.cat([block.target.reshape(-1) for block in blocks])
     v = torch.addmv(moments.v, Phi.mT, y)
     prior, missed = torch.stack(traces, dim=1)

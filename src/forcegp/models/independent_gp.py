@@ -20,7 +20,7 @@ from forcegp.forces.inference import require_double
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import FlatStates
-from forcegp.forces.start import bounds_of, initial_hyperparameters, negative_log_prior
+from forcegp.forces.start import box_around, initial_hyperparameters, negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
@@ -202,7 +202,7 @@ def _learn(
         return value + constant + (negative_log_prior(tensors, start) if options.hyperpriors else 0.0)
 
     recorded = objective if saved is None else saved.recorded(objective)
-    return minimise(recorded, start, options, bounds=bounds_of(start), progress=report)
+    return minimise(recorded, start, options, bounds=box_around(start), progress=report)
 
 
 def _record(
@@ -300,4 +300,4 @@ def _variance(posterior: ExactPosterior, features: dict[str, Tensor]) -> Tensor:
     """Variance of a scalar process, `(n,)`."""
     n, like = len(features["q"]), posterior.alpha
     rows = Block((features,), (like.new_ones(n, 1, 1),), like.new_zeros(n, 1))
-    return posterior.covariance(rows)[:, 0, 0].clamp(min=0.0)
+    return posterior.covariance(rows)[:, 0, 0]
