@@ -1,6 +1,6 @@
 """The dense posterior of latent forces in 80-bit arithmetic, from the textbook: a reference for rounding.
 
-`numpy.longdouble` has a unit roundoff of 5e-20 on x86; elsewhere it may be float64, and there is no reference.
+`numpy.longdouble` has a unit roundoff of 5e-20 on x86; elsewhere it may be float64, which is no reference.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from forcegp.gp.kernels import (
     Sum,
     sub,
 )
-from forcegp.gp.structured_covariance import Block, Process
+from forcegp.gp.structured_covariance import Block, Process, rows_of
 
 Array = NDArray[np.longdouble]
 PROFILES: dict[type[Stationary], Callable[[Array], Array]] = {
@@ -115,17 +115,7 @@ def posterior(
     L = cholesky(K + np.eye(len(K), dtype=np.longdouble))
     V = forward(L, rows_covariance(processes, params, data, [at]))
     y = forward(L, np.concatenate([long(block.target).reshape(-1, 1) for block in data]))
-    prior = np.concatenate(
-        [
-            np.diag(rows_covariance(processes, params, [own], [own]))
-            for own in (_sample(at, i) for i in range(len(at.target)))
-        ]
-    )
+    one = (rows_of(at, slice(i, i + 1)) for i in range(len(at.target)))
+    prior = np.concatenate([np.diag(rows_covariance(processes, params, [own], [own])) for own in one])
     shape = tuple(at.target.shape)
     return prior.reshape(shape), (V.T @ y).reshape(shape), (prior - (V**2).sum(0)).reshape(shape)
-
-
-def _sample(block: Block, i: int) -> Block:
-    from forcegp.gp.structured_covariance import rows_of
-
-    return rows_of(block, slice(i, i + 1))

@@ -22,8 +22,8 @@ Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
 """Box of each tensor: a lower and an upper bound of all its entries, or of each."""
 
 OPTIMIZERS = ("lbfgs", "adam")
-FIRST_STEP = 1.0
-"""Largest change of a tensor in the first step of L-BFGS; of logarithms, one e-fold."""
+FIRST_STEP = 2.0
+"""Largest change of an entry in the first step of L-BFGS in a box; of logarithms, two e-folds."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,7 @@ class Learned:
         seconds: how long they took.
         message: why learning stopped.
         history: the objective at each evaluation.
+        doubts: about where learning ended, each with a remedy.
     """
 
     tensors: dict[str, Tensor]
@@ -91,6 +92,7 @@ class Learned:
     seconds: float
     message: str
     history: list[float] = field(default_factory=list)
+    doubts: tuple[str, ...] = ()
 
 
 class _SpentError(Exception):

@@ -37,7 +37,7 @@ def require_resolved_noise(prior: Tensor) -> None:
     if ratio > PRIOR_TO_NOISE:
         raise NumericalError(
             "double precision does not resolve the noise beside the prior",
-            expected=f"a prior whose standard deviation is at most {PRIOR_TO_NOISE:g} times that of the noise",
+            expected=f"a prior standard deviation at most {PRIOR_TO_NOISE:g} times that of the noise",
             got=f"{ratio:.3g} times",
             hint=f"leave out outliers, or state a noise at least {ratio / PRIOR_TO_NOISE:.2g} times as large",
         )
