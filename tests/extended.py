@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from forcegp.data import Dataset
+from forcegp.forces.learn import kernel_parameters
+from forcegp.forces.quantities import affine_maps, states_at
 from forcegp.gp.features import Features, stacked
 from forcegp.gp.kernels import (
     Constant,
@@ -26,6 +29,7 @@ from forcegp.gp.kernels import (
     sub,
 )
 from forcegp.gp.structured_covariance import Block, Process, rows_of
+from forcegp.models.structured_fit import StructuredFit
 
 Array = NDArray[np.longdouble]
 PROFILES: dict[type[Stationary], Callable[[Array], Array]] = {
@@ -119,3 +123,22 @@ def posterior(
     prior = np.concatenate([np.diag(rows_covariance(processes, params, [own], [own])) for own in one])
     shape = tuple(at.target.shape)
     return prior.reshape(shape), (V.T @ y).reshape(shape), (prior - (V**2).sum(0)).reshape(shape)
+
+
+def deviation_errors(fit: StructuredFit, at: Dataset, quantity: str = "qdd") -> float:
+    """Largest relative error of a standard deviation of a fit where the prior has one.
+
+    Args:
+        fit: with exact inference, or priors of finite features.
+        at: states.
+        quantity: what is predicted.
+    """
+    states, _ = states_at(fit.system, at.q, at.qd, at.tau, at.active(fit.system.contact_names))
+    rows = fit.posterior.rows(fit.system, states, affine_maps(fit.system, states, quantity)[0])
+    data = fit.problem.rows(fit.hyperparameters).blocks
+    params = kernel_parameters(fit.hyperparameters)
+    prior, _, variance = posterior(fit.posterior.priors, params, data, rows)
+    found = fit.posterior.latent.covariance(rows).diagonal(dim1=-2, dim2=-1).numpy()
+    known = prior > 0
+    assert (variance[known] > 0).all() and (found[known] > 0).all()
+    return float(np.abs(np.sqrt(found[known] / variance[known]) - 1).max())
