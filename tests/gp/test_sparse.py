@@ -7,6 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from extended import is_extended
+from extended import posterior as dense
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.bound import bound_of
@@ -74,6 +76,25 @@ def test_equals_the_exact_posterior_where_inducing_points_are_the_data() -> None
     covariance = torch.stack([full[i, :, i] for i in range(len(test.target))])
     assert torch.allclose(mean_of(posterior, test), mean, atol=1e-6, rtol=0)
     assert torch.allclose(posterior.covariance(test), covariance, atol=1e-6, rtol=0)
+
+
+@pytest.mark.skipif(not is_extended(), reason="numpy.longdouble is no more than float64 here")
+@pytest.mark.parametrize("stronger", [0.0, 1.5, 3.0, 4.0, 6.0])
+def test_a_strong_prior_leaves_right_variances_or_is_refused(stronger: float) -> None:
+    """Long length-scales and a force up to e¹² times the noise, where the missed variance is a difference."""
+    block, params = rows(25), parameters()
+    params = {k: v + stronger * (k.endswith("std") + 0.3 * k.endswith("scale")) for k, v in params.items()}
+    test = rows_of(block, slice(10))
+    _, _, exact = dense(PROCESSES, params, [block], test)
+    found = condition_sparse(PROCESSES, params, [block], first(block, 25))
+    assert float(found.moments.missed.min()) >= 0.0
+    try:
+        found.require_resolved()
+        variance = found.covariance(test).diagonal(dim1=-2, dim2=-1).numpy()
+    except NumericalError:
+        assert stronger == 6.0
+    else:
+        assert np.abs(np.sqrt(variance / exact) - 1.0).max() < 0.01
 
 
 def test_a_process_that_no_row_shows_keeps_its_prior_and_needs_no_points() -> None:
