@@ -13,6 +13,7 @@ from extended import deviation_errors, is_extended
 from forcegp.errors import NumericalError
 from forcegp.gp.kernels import Matern52
 from forcegp.gp.rounding import require_semidefinite
+from forcegp.models.prediction import Prediction
 from forcegp.models.registry import create
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate
@@ -105,7 +106,7 @@ def test_a_variance_that_is_rounding_and_a_negative_eigenvalue_are_refused() -> 
         model.condition(train, strong)
     covariance = torch.tensor([[1.0, 1.1], [1.1, 1.0]], dtype=torch.float64).expand(3, 2, 2)
     with pytest.raises(NumericalError, match=r"3 of 3 covariances .* not positive"):
-        forcegp.models.prediction.Prediction(torch.zeros(3, 2), covariance)
+        Prediction(torch.zeros(3, 2), covariance)
     require_semidefinite(torch.ones(4, 3, 3, dtype=torch.float64))
     require_semidefinite(torch.zeros(4, 3, 3, dtype=torch.float64))
     assert fit.predict(test.q, test.qd, test.tau).std is not None
