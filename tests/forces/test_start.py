@@ -8,7 +8,7 @@ from torch import Tensor
 
 from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.start import initial_hyperparameters
+from forcegp.forces.start import FAR, LIMITS, box_around, doubts_at_bounds, initial_hyperparameters
 from forcegp.gp.structured_covariance import Block
 
 N, ROWS = 50, 6
@@ -38,3 +38,24 @@ def test_other_forces_start_at_their_least_squares() -> None:
     prior = JointForcePrior(SlidingFrictionPrior("table").kernel)
     found = initial_hyperparameters([prior], blocks)[f"{prior.name}.log_std"].exp()
     assert found.tolist() == pytest.approx(force.square().mean(0).sqrt().tolist(), rel=1e-9)
+
+
+def test_learning_stays_around_its_start_and_says_where_it_ended_at_a_bound() -> None:
+    start = {
+        "joint.log_std": torch.tensor([0.0, 9.0]).double(),
+        "joint.log_lengthscale": torch.tensor([1.0]).double(),
+        "noise.0.log_noise_std": torch.tensor([-2.3]).double(),
+        "coulomb.table.log_coefficient": torch.tensor(-1.0).double(),
+    }
+    box = box_around(start, {**start, "joint.log_lengthscale": torch.tensor([20.0]).double()})
+    low, high = box["joint.log_std"]
+    assert torch.equal(low, start["joint.log_std"] - FAR[0])
+    assert torch.equal(high, start["joint.log_std"] + FAR[1])
+    assert float(box["joint.log_lengthscale"][1]) == 20.0, "where learning begins"
+    assert box["coulomb.table.log_coefficient"] == LIMITS["log_coefficient"]
+    assert doubts_at_bounds(start, box) == ()
+    ended = {**start, "joint.log_std": torch.stack([low[0], high[1]]), "noise.0.log_noise_std": torch.tensor(
+        [-2.3 - FAR[0]]).double(), "joint.log_lengthscale": torch.tensor([20.0]).double()}  # fmt: skip
+    size, noise = doubts_at_bounds(ended, box)
+    assert size.startswith("1 of 2 values of joint.log_std ended at their upper bound")
+    assert noise.startswith("1 of 1 values of noise.0.log_noise_std ended at their lower bound")

@@ -162,3 +162,9 @@ def textbook(
         blocks,
         inducing,
     )
+
+
+def latent_covariance(posterior: SparsePosterior, block: Block) -> Tensor:
+    """Posterior covariance of all components at the samples of a block, `(n, components, components)`."""
+    eye = torch.eye(sum(COMPONENTS), dtype=torch.float64).expand(len(block.target), -1, -1)
+    return posterior.covariance(Block(block.features, eye.split(COMPONENTS, dim=-1), eye[..., 0]))

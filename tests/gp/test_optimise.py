@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, NumericalError, UnknownNameError
-from forcegp.gp.optimise import LearningOptions, minimise
+from forcegp.gp.optimise import FIRST_STEP, LearningOptions, minimise
 
 START = {"a": torch.tensor([3.0, -2.0], dtype=torch.float64), "b": torch.tensor(1.5, dtype=torch.float64)}
 
@@ -65,6 +65,20 @@ def test_lbfgs_keeps_to_bounds_and_adam_has_two_rates() -> None:
     step = {key: (moved[1][key] - moved[0][key]).abs().max() for key in START}
     assert float(step["a"]) == pytest.approx(0.1, rel=1e-4)  # Adam's first step is its rate
     assert float(step["b"]) == pytest.approx(0.01, rel=1e-4)
+
+
+def test_the_first_step_in_a_box_is_limited_where_the_objective_is_steep() -> None:
+    """Without a limit L-BFGS-B evaluates the corner of the box."""
+    moved: list[float] = []
+
+    def steep(x: dict[str, Tensor]) -> Tensor:
+        moved.append(float((x["a"].detach() - START["a"]).abs().max()))
+        return 1e4 * bowl(x)
+
+    box = {"a": (START["a"] - 50.0, START["a"] + 50.0), "b": (-50.0, 50.0)}
+    learned = minimise(steep, START, LearningOptions(tolerance=1e-12), bounds=box)
+    assert learned.converged and learned.value == pytest.approx(2e4, abs=1e-3)
+    assert 0.0 < moved[1] <= FIRST_STEP * (1.0 + 1e-9)
 
 
 def test_tensors_that_do_not_matter_stay_and_the_start_is_not_changed() -> None:

@@ -7,6 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from extended import is_extended
+from extended import posterior as dense
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.bound import bound_of
@@ -15,7 +17,16 @@ from forcegp.gp.likelihood import condition
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block, cross_gram, rows_of
 from forcegp.gp.sums import accumulate
-from gp.sparse_cases import COMPONENTS, PROCESSES, condition_sparse, first, parameters, rows, textbook
+from gp.sparse_cases import (
+    COMPONENTS,
+    PROCESSES,
+    condition_sparse,
+    first,
+    latent_covariance,
+    parameters,
+    rows,
+    textbook,
+)
 
 ALGEBRA = 1e-8
 """Two orders of summation and factorisation of matrices with condition numbers up to about 10⁶."""
@@ -67,6 +78,25 @@ def test_equals_the_exact_posterior_where_inducing_points_are_the_data() -> None
     assert torch.allclose(posterior.covariance(test), covariance, atol=1e-6, rtol=0)
 
 
+@pytest.mark.skipif(not is_extended(), reason="numpy.longdouble is no more than float64 here")
+@pytest.mark.parametrize("stronger", [0.0, 1.5, 3.0, 4.0, 6.0])
+def test_a_strong_prior_leaves_right_variances_or_is_refused(stronger: float) -> None:
+    """Long length-scales and a force up to e¹² times the noise, where the missed variance is a difference."""
+    block, params = rows(25), parameters()
+    params = {k: v + stronger * (k.endswith("std") + 0.3 * k.endswith("scale")) for k, v in params.items()}
+    test = rows_of(block, slice(10))
+    _, _, exact = dense(PROCESSES, params, [block], test)
+    found = condition_sparse(PROCESSES, params, [block], first(block, 25))
+    assert float(found.moments.missed.min()) >= 0.0
+    try:
+        found.require_resolved()
+        variance = found.covariance(test).diagonal(dim1=-2, dim2=-1).numpy()
+    except NumericalError:
+        assert stronger == 6.0
+    else:
+        assert np.abs(np.sqrt(variance / exact) - 1.0).max() < 0.01
+
+
 def test_a_process_that_no_row_shows_keeps_its_prior_and_needs_no_points() -> None:
     shown, params = rows(20), parameters()
     hidden = Block(shown.features, (shown.operators[0], torch.zeros_like(shown.operators[1])), shown.target)
@@ -75,7 +105,7 @@ def test_a_process_that_no_row_shows_keeps_its_prior_and_needs_no_points() -> No
     assert posterior.measured == (True, False)
     test = rows(6, seed=2)
     assert torch.equal(posterior.latent_mean(1, test.features[1]), torch.zeros(6, 1, dtype=torch.float64))
-    latent = posterior.latent_covariance(test.features)
+    latent = latent_covariance(posterior, test)
     prior = PROCESSES[1].kernel.diagonal(sub(params, "contact"), test.features[1])[0]
     assert torch.allclose(latent[:, 2, 2], prior, rtol=ROUNDING)
     assert float(latent[:, 2, :2].abs().max()) == 0.0

@@ -154,6 +154,21 @@ def test_an_arm_pressed_on_a_table_holds_still() -> None:
     assert float(gone.qd[-1].abs().max()) > 1e-3
 
 
+def test_stopping_a_joint_adds_no_energy_to_the_others(pendulum) -> None:
+    """Runge-Kutta leaves a stopping joint with a part of its speed, which the others feel as it goes."""
+    system = dataclasses.replace(pendulum, robot=pendulum.robot.replace(gravity=torch.zeros(3).double()))
+    generator = torch.Generator().manual_seed(0)
+    q0 = 3.0 * torch.randn(200, 2, generator=generator, dtype=torch.float64)
+    qd0 = 2.0 * torch.randn(200, 2, generator=generator, dtype=torch.float64)
+    options = RolloutOptions(dt=0.02, method="rk4")
+    found = rollout(ANALYTICAL, system, q0, qd0, lambda t, q, qd: torch.zeros_like(q), 0.2, options=options)
+    M = forcegp.dynamics.mass_matrix(system.robot, found.q)
+    energy = 0.5 * (found.qd[..., None, :] @ M @ found.qd[..., None])[..., 0, 0]
+    stopped = ((found.qd[:, 1:] == 0.0) & (found.qd[:, :-1] != 0.0)).any(-1)
+    assert int(stopped.sum()) > 50
+    assert float(energy.diff(dim=1)[stopped].max()) <= 1e-6 * float(energy.max())
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31 - 1), st.sampled_from([0.0, 1e-4, 1e-2]))
 def test_friction_opposes_as_much_as_it_can(seed: int, h: float) -> None:

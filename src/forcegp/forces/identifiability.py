@@ -45,7 +45,7 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
     covariance = posterior.latent.covariance(dataclasses.replace(rows, operators=tuple(operators)))
     nq = system.robot.nq
     cross = covariance[:, :nq, nq:].diagonal(dim1=-2, dim2=-1)
-    own = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)
+    own = covariance.diagonal(dim1=-2, dim2=-1)
     scale = (own[:, :nq] * own[:, nq:]).sqrt()
     return torch.where(scale > 0.0, cross / scale.where(scale > 0.0, 1.0), 0.0).clamp(-1.0, 1.0)
 
@@ -81,7 +81,7 @@ def doubts_of(posterior: ForcePosterior, system: ConstrainedSystem, training: Tr
         mean, covariance = posterior.read(system, at, affine_map(system, at, "multiplier"))
         own = system.active_rows(m.active, m.active.shape[:-1])
         means.append(mean[own])
-        variances.append(covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)[own])
+        variances.append(covariance.diagonal(dim1=-2, dim2=-1)[own])
         if {JOINT, CONTACT} <= targets:
             correlations.append(force_correlation(posterior, system, at))
     correlation = float(torch.cat(correlations).mean()) if correlations else None

@@ -25,16 +25,23 @@ from forcegp.forces.priors.base import ANALYTICAL, MIXING, ForcePrior
 from forcegp.forces.projection import WhitenedRows
 from forcegp.forces.torque_noise import initial_torque_noise
 from forcegp.gp.kernels import Parameters
-from forcegp.gp.optimise import Learned, LearningOptions, Objective, Progress, minimise
+from forcegp.gp.optimise import Bounds, Learned, LearningOptions, Objective, Progress, minimise
 from forcegp.gp.structured_covariance import Block
 
-LOG_LENGTHSCALE_BOUNDS = (math.log(0.03), math.log(3e4))
-LOG_STD_BOUNDS = (math.log(1e-6), math.log(1e6))
-LOG_NOISE_BOUNDS = (math.log(1e-6), math.log(1e4))
-LOG_COEFFICIENT_BOUNDS = (math.log(1e-3), math.log(2.0))
-LOG_SPEED_BOUNDS = (math.log(1e-3), math.log(1.0))
-LOG_TIME_BOUNDS = (math.log(1e-3), math.log(1e4))
-LOG_SMOOTHING_BOUNDS = (math.log(1e-4), math.log(0.1))
+LIMITS = {
+    "log_coefficient": (math.log(1e-3), math.log(2.0)),
+    "log_speed": (math.log(1e-3), math.log(1.0)),
+    "log_time": (math.log(1e-3), math.log(1e4)),
+    "log_smoothing": (math.log(1e-4), math.log(0.1)),
+    MIXING: (-10.0, 10.0),
+}
+"""Bounds of what has a scale of its own, whatever the start."""
+REACH = {"log_lengthscale": (4.0, 8.0)}
+"""How far the others may move below and above their start, in e-folds; `FAR` where not named. An input with a
+length-scale 8 e-folds above its start no longer matters."""
+FAR = (7.0, 7.0)
+AT_BOUND = 1e-6
+"""Distance from a bound below which learning ended there, in e-folds."""
 WIDTH = {
     "log_coefficient": (2.0, 1.0),
     "log_smoothing": (2.0, 1.0),
@@ -88,7 +95,7 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
     like = problem.system.robot.mass
     known = initial_coulomb(problem.priors, like)
-    limits = below_jamming(problem.system, problem.training.measurements, problem.priors, bounds_of(known))
+    limits = below_jamming(problem.system, problem.training.measurements, problem.priors, limits_of(known))
 
     def start_at(x: float) -> tuple[Tensors, WhitenedRows]:
         own = {
@@ -154,25 +161,63 @@ def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
     return parallel.to(torch.uint8).argmax(0)
 
 
-def bounds_of(params: Parameters) -> dict[str, tuple[float, float]]:
-    """Box of each hyperparameter, for the optimiser."""
-    kinds = {
-        "log_lengthscale": LOG_LENGTHSCALE_BOUNDS,
-        "log_noise_std": LOG_NOISE_BOUNDS,
-        "log_coefficient": LOG_COEFFICIENT_BOUNDS,
-        "log_smoothing": LOG_SMOOTHING_BOUNDS,
-        "log_speed": LOG_SPEED_BOUNDS,
-        "log_time": LOG_TIME_BOUNDS,
-        MIXING: (-10.0, 10.0),
-    }
-    return {key: kinds.get(key.rsplit(".", 1)[-1], LOG_STD_BOUNDS) for key in params}
+def limits_of(params: Parameters) -> dict[str, tuple[float, float]]:
+    """Bounds of the hyperparameters that have a scale of their own."""
+    return {key: LIMITS[_kind(key)] for key in params if _kind(key) in LIMITS}
+
+
+def box_around(
+    start: Parameters, begin: Parameters | None = None
+) -> dict[str, tuple[float | Tensor, float | Tensor]]:
+    """Box of each hyperparameter, for the optimiser.
+
+    Far from the start, a likelihood in double precision is rounding: a force a million times as strong as its
+    noise leaves nothing of it.
+
+    Args:
+        start: default initial values.
+        begin: where learning begins, if not there; the box contains it.
+    """
+    box: dict[str, tuple[float | Tensor, float | Tensor]] = {}
+    for key, x in start.items():
+        below, above = REACH.get(_kind(key), FAR)
+        y = x if begin is None else begin[key]
+        box[key] = torch.minimum(x - below, y), torch.maximum(x + above, y)
+    return {**box, **limits_of(start)}
+
+
+def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, ...]:
+    """Warnings where learning ended at a bound that it should not need.
+
+    A force may vanish and an input may not matter; a noise at a bound, or a force at its upper one, is
+    in doubt.
+    """
+    doubts = []
+    for key, (low, high) in box.items():
+        at = {"lower": low, "upper": high}
+        sides = {"log_lengthscale": ("lower",), "log_noise_std": ("lower", "upper")}.get(
+            _kind(key), () if _kind(key) in LIMITS else ("upper",)
+        )
+        for side in sides:
+            count = int((tensors[key] - at[side]).abs().lt(AT_BOUND).sum())
+            if count:
+                doubts.append(
+                    f"{count} of {tensors[key].numel()} values of {key} ended at their {side} bound, "
+                    "far from where learning began: look for outliers, or state the noise"
+                )
+    return tuple(doubts)
+
+
+def _kind(key: str) -> str:
+    """What a hyperparameter is, the last part of its name."""
+    return key.rsplit(".", 1)[-1]
 
 
 def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tensor | float:
     """Σ ½ ((θ − θ_start)/width)², the weak prior on log-hyperparameters up to a constant."""
     total: Tensor | float = 0.0
     for key, value in params.items():
-        below, above = WIDTH.get(key.rsplit(".", 1)[-1], (3.0, 3.0))
+        below, above = WIDTH.get(_kind(key), (3.0, 3.0))
         apart = value - start[key]
         total = total + (0.5 * (apart / torch.where(apart < 0.0, below, above)) ** 2).sum()
     return total
@@ -284,9 +329,11 @@ class Search:
 
     def _minimise(self, problem: Problem, begin: Tensors, progress: Progress | None) -> Learned:
         analytical = frozenset(key for key in begin if key.startswith(ANALYTICAL + "."))
-        bounds = bounds_of({key: value for key, value in begin.items() if key not in analytical})
+        hyper = {key: value for key, value in self.start.items() if key not in analytical}
+        bounds = box_around(hyper, begin)
         if problem.has_coulomb:
-            bounds = below_jamming(problem.system, problem.training.measurements, problem.priors, bounds)
+            limits = limits_of(self.start)
+            bounds |= below_jamming(problem.system, problem.training.measurements, problem.priors, limits)
         # The tolerance is relative to the objective, so the part that no hyperparameter changes is left out.
         constant = float(problem.fixed_rows.constant)
 
@@ -300,4 +347,5 @@ class Search:
         report = None if progress is None else whole
         learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report)
         history = [value + constant for value in learned.history]
-        return dataclasses.replace(learned, value=learned.value + constant, history=history)
+        doubts = doubts_at_bounds(learned.tensors, bounds)
+        return dataclasses.replace(learned, value=learned.value + constant, history=history, doubts=doubts)

@@ -109,9 +109,10 @@ def posterior_of(
     """Forces conditioned on the samples of totals.
 
     Raises:
-        NumericalError: the sums are not finite.
+        NumericalError: the sums are not finite, or the noise is rounding beside the prior.
     """
     latent = SparsePosterior.of(basis, total.sums)
+    latent.require_resolved()
     central = None if total.central is None else SparsePosterior.of(basis, total.central)
     scales, coulomb = problem.training.scales, problem.coulomb(hyperparameters)
     priors = problem.priors_at(hyperparameters)

@@ -134,6 +134,24 @@ class ProcessBasis:
         on_kernel = self.roots @ filled[:, :width] if self.spectra else filled[:, :0]
         return on_kernel, filled[:, width:]
 
+    def prior_variance(self, features: Features, values: Tensor) -> Tensor:
+        """k(x, x) of the whole kernel `(components, n)`.
+
+        Args:
+            features: kernel inputs.
+            values: V(x), as `values` gives it.
+        """
+        exact = values[..., values.shape[-1] - self.finite_size :]
+        return self.rest_variance(features) + torch.linalg.vecdot(exact, exact)
+
+    def missed(self, variance: Tensor, explained: Tensor) -> Tensor:
+        """k(x, x) − |V(x)|² ≥ 0 of what inducing points approximate, `(components, n)`.
+
+        A projection is no longer than what is projected: what is below zero is rounding of the variance, and
+        less than `SMALLEST_FRACTION` of it where a posterior is resolved.
+        """
+        return (variance - explained).clamp(min=0.0)
+
     def rest_variance(self, features: Features) -> Tensor:
         """Prior variance of the part that inducing points approximate, `(components, n)`."""
         if self._variance is None:
@@ -155,7 +173,7 @@ class ProcessBasis:
         values, explained = self.values(features)
         V = values.transpose(0, 1).reshape(points(features), -1).index_select(1, self.columns)
         prior = self.rest_variance(features)
-        return V, prior.mT, (prior - explained).mT
+        return V, prior.mT, self.missed(prior, explained).mT
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from forcegp.gp.kernel_terms import kernel_terms
 from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.likelihood import Conditioned, condition, require_exact_fits, target_of
 from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors
+from forcegp.gp.rounding import require_resolved_noise, require_resolved_variance
 from forcegp.gp.structured_covariance import Block, Process, add_rows, chunked, cross_gram, gram, offsets
 
 CHUNK_COLUMNS = 700
@@ -42,9 +43,12 @@ class ExactPosterior:
         """Condition on rows.
 
         Raises:
-            NumericalError: the covariance of the rows is not positive definite.
+            NumericalError: the covariance of the rows is not positive definite, or its noise is rounding.
         """
         fitted = condition(processes, params, blocks)
+        if len(fitted.L):
+            # K_ii + 1 is the square of a row of the factor.
+            require_resolved_noise(torch.linalg.vecdot(fitted.L, fitted.L).max())
         result = cls(tuple(processes), params, blocks, fitted.alpha)
         result.__dict__["conditioned"] = fitted
         return result
@@ -135,7 +139,11 @@ class ExactPosterior:
         return mean
 
     def covariance(self, block: Block) -> Tensor:
-        """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise."""
+        """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise.
+
+        Raises:
+            NumericalError: a variance is rounding.
+        """
         n, d = block.target.shape
         if d == 0:  # such as the multiplier of a system without contacts
             return block.target.new_zeros(n, 0, 0)
@@ -143,13 +151,14 @@ class ExactPosterior:
         for own in chunked([block], max(1, CHUNK_COLUMNS // d)):
             V = torch.linalg.solve_triangular(self.conditioned.L, self._cross(own).mT, upper=False)
             V = V.reshape(len(V), -1, d).transpose(0, 1)
-            prior = V.new_zeros(())
+            prior = V.new_zeros(V.shape[0], d, d)
             for process, params, x, W in zip(
                 self.processes, self._own, own.features, own.operators, strict=True
             ):
                 variance = process.kernel.diagonal(params, x)
                 prior = prior + torch.einsum("nak,kn,nbk->nab", W, variance, W)
-            parts.append(prior - V.mT @ V)
+            posterior = prior - V.mT @ V
+            parts.append(require_resolved_variance(posterior, prior.diagonal(dim1=-2, dim2=-1)))
         covariance = torch.cat(parts)
         return 0.5 * (covariance + covariance.mT)
 

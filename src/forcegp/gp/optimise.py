@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,8 +18,12 @@ from forcegp.errors import ModelError, NumericalError, UnknownNameError
 Objective = Callable[[dict[str, Tensor]], Tensor]
 Progress = Callable[[int, float, dict[str, Tensor]], None]
 """Called after each evaluation with their number, the objective, and the best tensors so far."""
+Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
+"""Box of each tensor: a lower and an upper bound of all its entries, or of each."""
 
 OPTIMIZERS = ("lbfgs", "adam")
+FIRST_STEP = 2.0
+"""Largest change of an entry in the first step of L-BFGS in a box; of logarithms, two e-folds."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,7 @@ class Learned:
         seconds: how long they took.
         message: why learning stopped.
         history: the objective at each evaluation.
+        doubts: about where learning ended, each with a remedy.
     """
 
     tensors: dict[str, Tensor]
@@ -86,6 +92,7 @@ class Learned:
     seconds: float
     message: str
     history: list[float] = field(default_factory=list)
+    doubts: tuple[str, ...] = ()
 
 
 class _SpentError(Exception):
@@ -120,7 +127,7 @@ def minimise(
     start: Mapping[str, Tensor],
     options: LearningOptions,
     analytical: frozenset[str] = frozenset(),
-    bounds: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Bounds | None = None,
     progress: Progress | None = None,
 ) -> Learned:
     """Minimise an objective over tensors.
@@ -153,7 +160,7 @@ def _lbfgs(
     start: Mapping[str, Tensor],
     options: LearningOptions,
     analytical: frozenset[str],
-    bounds: Mapping[str, tuple[float, float]],
+    bounds: Bounds,
 ) -> tuple[bool, str]:
     shapes = {key: value.shape for key, value in start.items()}
     like = next(iter(start.values()))
@@ -172,13 +179,31 @@ def _lbfgs(
         flat = torch.cat([grads[key].reshape(-1) for key in shapes])
         return value, flat.to("cpu", torch.float64).numpy()
 
-    box = [bounds.get(key, (None, None)) for key, shape in shapes.items() for _ in range(shape.numel())]
     x = torch.cat([value.detach().reshape(-1) for value in start.values()]).cpu().double().numpy()
+    low, high = (_flat_bounds(start, bounds, side) for side in (0, 1))
+    x = np.clip(x, low, high)
+    first = function(x)
+    steepest = np.abs(first[1]).max(initial=0.0)
+    if not np.isfinite(first[0]) or not np.isfinite(steepest):
+        return False, "not finite at the start"
+    # In a box, L-BFGS-B's first step is the whole gradient, to the corners of the box where that is steep. In
+    # units of √(first step ÷ gradient) the gradient is that step.
+    unit = min(1.0, math.sqrt(FIRST_STEP / max(steepest, 1e-300)))
+
+    def scaled(u: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = function(np.clip(x + unit * u, low, high)) if u.any() else first
+        return value, unit * gradient
+
     limits = {"maxfun": options.max_evaluations, "maxiter": options.max_evaluations}
-    tolerances = {"ftol": options.tolerance, "gtol": 1e-5, "maxcor": 30}
+    tolerances = {"ftol": options.tolerance, "gtol": 1e-5 * unit, "maxcor": 30}
     try:
         result = scipy.optimize.minimize(
-            function, x, jac=True, method="L-BFGS-B", bounds=box, options=limits | tolerances
+            scaled,
+            np.zeros_like(x),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=scipy.optimize.Bounds((low - x) / unit, (high - x) / unit),  # pyright: ignore[reportArgumentType]
+            options=limits | tolerances,
         )
     except _SpentError:
         return False, f"stopped after {options.max_evaluations} evaluations"
@@ -186,12 +211,19 @@ def _lbfgs(
     return bool(result.success), message
 
 
+def _flat_bounds(start: Mapping[str, Tensor], bounds: Bounds, side: int) -> np.ndarray:
+    """The lower or upper bound of every entry."""
+    free = (-math.inf, math.inf)
+    parts = (torch.zeros_like(value) + bounds.get(key, free)[side] for key, value in start.items())
+    return torch.cat([part.detach().reshape(-1) for part in parts]).cpu().double().numpy()
+
+
 def _adam(
     recorder: _Recorder,
     start: Mapping[str, Tensor],
     options: LearningOptions,
     analytical: frozenset[str],
-    bounds: Mapping[str, tuple[float, float]],
+    bounds: Bounds,
 ) -> tuple[bool, str]:
     tensors = {key: value.detach().clone() for key, value in start.items()}
     optimizers = [

@@ -20,6 +20,7 @@ from forcegp.gp.drift import drifted
 from forcegp.gp.factor import cholesky, extended
 from forcegp.gp.features import Features
 from forcegp.gp.pathwise import FunctionSamples
+from forcegp.gp.rounding import require_resolved_noise, require_resolved_variance
 from forcegp.gp.sparse_draws import FEATURES, draw_functions
 from forcegp.gp.structured_covariance import Block, chunked
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
@@ -119,29 +120,45 @@ class SparsePosterior:
             blocks.append(filled.unflatten(0, part.used.shape))
         return blocks
 
-    def latent_covariance(self, features: Sequence[Features]) -> Tensor:
-        """Posterior covariance of all components at each sample, `(n, components, components)`."""
-        T, missed = [], []
+    def _latent(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
+        """Of all components at each sample: T with the covariance T Tᵀ of what the basis explains
+        `(n, components, size)`; the variance that it misses and that of the prior `(n, components)`."""
+        T, missed, prior = [], [], []
         for part, inverse, x in zip(self.basis.parts, self._inverse_factor, features, strict=True):
             V, explained = part.values(x)
             T.append(V @ inverse)
-            missed.append(part.rest_variance(x) - explained)
-        whole = torch.cat(T).transpose(0, 1)
-        return whole @ whole.mT + torch.diag_embed(torch.cat(missed).mT)
+            missed.append(part.missed(part.rest_variance(x), explained))
+            prior.append(part.prior_variance(x, V))
+        return torch.cat(T).transpose(0, 1), torch.cat(missed).mT, torch.cat(prior).mT
 
     def covariance(self, block: Block) -> Tensor:
         """Posterior covariance of rows at each sample, without noise, `(n, d, d)`.
 
         Args:
             block: kernel inputs and operators of each process; the targets are not read.
+
+        Raises:
+            NumericalError: a variance is rounding.
         """
         d = block.target.shape[1]
         parts = [block.target.new_zeros(0, d, d)]
         for own in chunked([block], CHUNK_PREDICTIONS):
             W = torch.cat(own.operators, dim=-1)
-            parts.append(W @ self.latent_covariance(own.features) @ W.mT)
+            T, missed, prior = self._latent(own.features)
+            root = W @ T
+            posterior = root @ root.mT + (W * missed[:, None]) @ W.mT
+            parts.append(require_resolved_variance(posterior, (W.square() @ prior[..., None])[..., 0]))
         covariance = torch.cat(parts)
         return 0.5 * (covariance + covariance.mT)
+
+    def require_resolved(self) -> None:
+        """Refuse a prior beside which the noise is rounding.
+
+        Raises:
+            NumericalError: the prior of what inducing points approximate is too strong.
+        """
+        if float(self.moments.rows) > 0.0:
+            require_resolved_noise(self.moments.prior.sum() / self.moments.rows)
 
     @cached_property
     def diagnostics(self) -> Diagnostics:

@@ -5,6 +5,7 @@ q̈_j ~ GP(0, k_j(x, x′)) with x = (q, q̇, τ) and squared-exponential k_j (s
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from forcegp.forces.inference import require_double
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import FlatStates
-from forcegp.forces.start import bounds_of, initial_hyperparameters, negative_log_prior
+from forcegp.forces.start import box_around, doubts_at_bounds, initial_hyperparameters, negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
@@ -202,7 +203,9 @@ def _learn(
         return value + constant + (negative_log_prior(tensors, start) if options.hyperpriors else 0.0)
 
     recorded = objective if saved is None else saved.recorded(objective)
-    return minimise(recorded, start, options, bounds=bounds_of(start), progress=report)
+    box = box_around(start)
+    learned = minimise(recorded, start, options, bounds=box, progress=report)
+    return dataclasses.replace(learned, doubts=doubts_at_bounds(learned.tensors, box))
 
 
 def _record(
@@ -250,6 +253,7 @@ def fitted(
         constant_inputs=training.scale.constant,
         message="; ".join(f"{joint}: {part.message}" for joint, part in ended),
         history=tuple(value for part in parts for value in part.history),
+        warnings=tuple(doubt for part in parts for doubt in part.doubts),
     )
     return IndependentFit(system, noise_std, training, hyperparameters, posteriors, result, standardize)
 
@@ -300,4 +304,4 @@ def _variance(posterior: ExactPosterior, features: dict[str, Tensor]) -> Tensor:
     """Variance of a scalar process, `(n,)`."""
     n, like = len(features["q"]), posterior.alpha
     rows = Block((features,), (like.new_ones(n, 1, 1),), like.new_zeros(n, 1))
-    return posterior.covariance(rows)[:, 0, 0].clamp(min=0.0)
+    return posterior.covariance(rows)[:, 0, 0]

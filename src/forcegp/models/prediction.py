@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
+from forcegp.gp.rounding import require_semidefinite
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,10 +34,10 @@ class Prediction:
     parts: dict[str, slice] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are not finite.
+        """Refuse numbers that are not finite, and covariances that are none.
 
         Raises:
-            NumericalError: the mean or the covariance holds one.
+            NumericalError: the mean or the covariance is not finite, or an eigenvalue is clearly negative.
         """
         for name, value in (("mean", self.mean), ("covariance", self.covariance)):
             if value is not None and not bool(torch.isfinite(value).all()):
@@ -45,6 +46,8 @@ class Prediction:
                     got=f"{int((~torch.isfinite(value)).sum())} of {value.numel()} numbers",
                     hint="states beyond what a robot can do overflow; check q, qd and tau",
                 )
+        if self.covariance is not None:
+            require_semidefinite(self.covariance)
 
     @property
     def variance(self) -> Tensor | None:

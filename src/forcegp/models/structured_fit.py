@@ -340,7 +340,7 @@ def conditioned(
             for name in scale.constant
         ),
         force_correlation=doubts.correlation,
-        warnings=(*warnings, *doubts.warnings, *more_points),
+        warnings=(*warnings, *learned.doubts, *doubts.warnings, *more_points),
         samples=training.all_samples,
         learned_on=learned_on,
         **lost,

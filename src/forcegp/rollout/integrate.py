@@ -22,7 +22,7 @@ from forcegp.constraints.gauss import Equations
 from forcegp.constraints.system import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError, NumericalError
 from forcegp.rollout.events import ContactEvent, advance, settle
-from forcegp.rollout.law import Instant, RolloutProblem, State, Step
+from forcegp.rollout.law import REGULARIZATION, STILL, Instant, RolloutProblem, State, Step
 from forcegp.rollout.trajectory import Divergence, Rollout
 from forcegp.types import ActiveContacts, JointVector
 
@@ -256,9 +256,26 @@ def _stopping(step: Step) -> Step:
         if first.held is None:
             return reached
         slowed = (reached.qd.abs() <= 0.5 * state.qd.abs()) | (state.qd == 0.0)
-        return reached._replace(qd=torch.where(first.held & slowed & (h > 0.0), 0.0, reached.qd))
+        held = first.held & slowed & (h > 0.0)
+        if bool((held & (reached.qd.abs() > STILL)).any()):
+            reached = _braked(problem, reached, held)
+        return reached._replace(qd=torch.where(held, 0.0, reached.qd))
 
     return stopped
+
+
+def _braked(problem: RolloutProblem, state: State, held: Tensor) -> State:
+    """The state after the impulse of friction that stops joints.
+
+    It changes the speed of the others too. Without that, stopping a joint alone can add kinetic energy.
+    """
+    G = problem.system.equations(state.q, state.qd, state.active).H
+    own = G.diagonal(dim1=-2, dim2=-1)
+    compliance = own.clamp(min=1e-3 * own.amax(-1, keepdim=True))
+    eye = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device)
+    sticks = torch.where(held[..., None], G + torch.diag_embed(REGULARIZATION * compliance), eye)
+    impulse = torch.linalg.solve(sticks, torch.where(held, -state.qd, 0.0)[..., None])
+    return state._replace(qd=state.qd + (G @ impulse)[..., 0])
 
 
 def _survivors(

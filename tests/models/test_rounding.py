@@ -1,0 +1,112 @@
+"""Standard deviations are those of a dense posterior in 80-bit arithmetic, or the fit is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import pytest
+import torch
+
+import forcegp
+from extended import deviation_errors, is_extended
+from forcegp.errors import NumericalError
+from forcegp.gp.kernels import Matern52
+from forcegp.gp.rounding import require_semidefinite
+from forcegp.models.prediction import Prediction
+from forcegp.models.registry import create
+from forcegp.models.structured_fit import StructuredFit
+from forcegp.simulate import simulate
+
+WITHIN = 0.01
+"""Largest relative error of a standard deviation."""
+FEW = forcegp.LearningOptions(max_evaluations=12)
+"""Rounding depends on where learning ends, and not on whether it is done."""
+OUTLIER = 1e8
+
+pytestmark = pytest.mark.skipif(not is_extended(), reason="numpy.longdouble is no more than float64 here")
+
+
+@cache
+def log_of(name: str) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset]:
+    scene = forcegp.load_scene(name)
+    return scene.system(), simulate(scene.system(), dataclasses.replace(scene.simulation, duration=3.0)).data
+
+
+def drawn(name: str, count: int) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset, forcegp.Dataset]:
+    """Random training samples of a scene, and test samples of which some are among them."""
+    system, data = log_of(name)
+    rows = torch.randperm(len(data), generator=torch.Generator().manual_seed(count))
+    return system, data[rows[:count].sort().values], data[rows[count - 4 : count + 6]]
+
+
+CASES = [
+    ("pendulum_wire", "sgp-zero", 20, {}),
+    ("pendulum_wire", "sgp-mean", 80, {}),
+    ("pendulum_wire", "sgp-zero", 40, {"noise_std": 1e-3}),
+    ("pendulum_wire", "sgp-zero", 60, {}),
+    ("pendulum_wire", "sgp-mean", 40, {"learn_noise": True}),
+    ("pendulum_wire", "sgp-zero-se", 60, {}),
+    ("pendulum_wire", "sgp-real", 40, {}),
+    ("kuka_plane", "sgp-zero", 20, {}),
+    ("kuka_plane", "sgp-zero", 40, {"noise_std": 1e-3}),
+    ("kuka_plane", "sgp-mean", 40, {}),
+    ("kuka_plane", "sgp-mean", 25, {"noise_std": 1e-4}),
+    ("kuka_plane", "sgp-contact", 40, {}),
+    ("kuka_plane", "sgp-real", 40, {}),
+    ("kuka_plane", "sgp-mean-se", 20, {}),
+    ("ur5_free", "sgp-zero", 30, {}),
+    ("ur5_free", "sgp-mean", 40, {"force_priors": (forcegp.JointForcePrior(Matern52()),)}),
+    ("ur5_free", "sgp-real", 60, {}),
+    ("ur5_wiping", "sgp-zero", 30, {}),
+    ("ur5_wiping", "sgp-mean", 30, {}),
+    ("ur5_wiping", "sgp-real", 60, {}),
+]
+
+
+@pytest.mark.parametrize(("scene", "model", "count", "options"), CASES)
+def test_standard_deviations_are_right(scene: str, model: str, count: int, options: dict) -> None:
+    system, train, test = drawn(scene, count)
+    fit = create(model, system, **options).fit(train, options=FEW)
+    assert isinstance(fit, StructuredFit)
+    assert deviation_errors(fit, test) < WITHIN
+
+
+@pytest.mark.parametrize("scene", ["kuka_plane", "ur5_wiping"])
+@pytest.mark.parametrize("mean", ["zero", "analytical"])
+def test_an_acceleration_of_1e8_is_refused(scene: str, mean: str) -> None:
+    system, train, _ = drawn(scene, 40)
+    qdd = train.qdd.clone()
+    qdd[7, 1] = OUTLIER
+    with pytest.raises(NumericalError, match="does not resolve the noise beside the prior"):
+        forcegp.StructuredGP(system, mean).fit(dataclasses.replace(train, qdd=qdd), options=FEW)
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-8])
+def test_a_noise_below_rounding_is_refused(noise: float) -> None:
+    system, train, _ = drawn("kuka_plane", 30)
+    with pytest.raises(NumericalError, match=r"noise at least [\d.e+]+ times as large"):
+        forcegp.StructuredGP(system, noise_std=noise).fit(train, options=FEW)
+
+
+def test_noise_learned_from_noise_free_accelerations_warns_and_is_right() -> None:
+    system, data, test = drawn("pendulum_wire", 40)
+    clean = dataclasses.replace(data, qdd=data.extras["qdd_clean"])
+    fit = forcegp.StructuredGP(system, "analytical", learn_noise=True).fit(clean)
+    assert any("ended at their lower bound" in doubt for doubt in fit.result.warnings)
+    assert deviation_errors(fit, test) < WITHIN
+
+
+def test_a_variance_that_is_rounding_and_a_negative_eigenvalue_are_refused() -> None:
+    system, train, test = drawn("pendulum_wire", 40)
+    model = forcegp.StructuredGP(system)
+    fit = model.fit(train, options=FEW)
+    strong = {k: v + 16.0 if k.endswith("_std") else v for k, v in fit.hyperparameters.items()}
+    with pytest.raises(NumericalError, match="does not resolve"):
+        model.condition(train, strong)
+    covariance = torch.tensor([[1.0, 1.1], [1.1, 1.0]], dtype=torch.float64).expand(3, 2, 2)
+    with pytest.raises(NumericalError, match=r"3 of 3 covariances .* not positive"):
+        Prediction(torch.zeros(3, 2), covariance)
+    require_semidefinite(torch.ones(4, 3, 3, dtype=torch.float64))
+    require_semidefinite(torch.zeros(4, 3, 3, dtype=torch.float64))
+    assert fit.predict(test.q, test.qd, test.tau).std is not None
