@@ -16,11 +16,18 @@ import torch
 from torch import Tensor
 
 from forcegp.forces.inference import force_posterior
-from forcegp.forces.learn import Problem
+from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.quantities import affine_map
-from forcegp.forces.torque_noise import stick_variance
+from forcegp.forces.torque_noise import (
+    GROWTH,
+    RELATIVE,
+    TORQUE_NOISE,
+    distance_beyond,
+    stick_variance,
+    trained_region,
+)
 
 STRETCHES = 8
 """Contiguous stretches that a log of fewer than three segments is divided into."""
@@ -38,6 +45,10 @@ NEGLIGIBLE = 0.05
 """Autocorrelation below which the rest is noise of the estimate."""
 SIGNIFICANT = 2.0
 """Standard errors of a covariance of neighbours beyond which samples are correlated."""
+REGIME = 0.25
+"""Share of the samples that the fastest or most loaded regime has."""
+PRIOR_SAMPLES = 4.0
+"""Independent samples that the prior of `growth` is worth."""
 WINDOW, WINDOWS = 10.0, 20
 """Length of the windows of `correlation_times` in units of the autocorrelation time, and how many there are
 at least."""
@@ -189,6 +200,16 @@ def _torque_noise(
     return (G @ r[..., None])[..., 0] / S.sqrt(), (G.square() @ white[..., None])[..., 0] / S
 
 
+def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Torque noise as held-out samples ask for it, the trained region, and the growth of errors beyond it."""
+    load, training = problem.typical_load(), problem.training
+    learned = hyperparameters[TORQUE_NOISE].exp().maximum(problem.hidden_torque())
+    noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
+    qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
+    region = trained_region(qd, tau, load)
+    return {**noise, **region, GROWTH: growth(problem, {**hyperparameters, **noise}, load)}
+
+
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
     """Standard deviation of torque noise `(nq,)` with which held-out stretches have unit normalised errors.
 
@@ -201,22 +222,57 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
         hyperparameters: learned tensors.
         least: the learned standard deviation, which is kept where the errors ask for less.
     """
-    training = problem.training
     parts = []
-    for i in _motions(training):
-        m = training.measurements[i]
-        group = stretches(m.segment)
+    for i in _motions(problem.training):
+        group = stretches(problem.training.measurements[i].segment)
         for g in group.unique().tolist():
-            own = (group == g).nonzero()[:, 0]
-            rest = dataclasses.replace(problem, training=training.without(i, own))
-            found = _held_out(rest, hyperparameters, m[own], problem.noise_at(hyperparameters, i))
-            if training.weights is not None:
-                found = (training.weights[i][own].sqrt()[:, None] * found[0], *found[1:])
-            parts.append(found)
+            parts.append(_held_out(problem, hyperparameters, i, (group == g).nonzero()[:, 0]))
     if sum(len(residual) for residual, _, _ in parts) < FEWEST:
         return least
     residual, variance, P = (torch.cat(part) for part in zip(*parts, strict=True))
     return unit_scales(residual**2, variance, P**2, least)
+
+
+def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
+    """g `(nq,)`: by how much the standard deviation of each torque grows beyond the trained region.
+
+    The fastest and the most loaded quarter of the training samples are predicted from the rest. With
+    g = c · load, one c for all joints, and D the distance beyond the region of the rest, c is most probable
+    under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the likelihood, and a scaled
+    inverse-χ² prior, which decides where the log has only one regime.
+
+    Args:
+        problem: what was learned, with the power of its likelihood.
+        hyperparameters: with the noise of the torque as it is predicted.
+        load: typical torque of each joint `(nq,)` [N m, N].
+    """
+    s2, square, known, slope = hyperparameters[TORQUE_NOISE].exp() ** 2, [], [], []
+    for i in _motions(problem.training):
+        m = problem.training.measurements[i]
+        for x in (m.qd, m.tau):
+            intensity = ((x - x.mean(0)) / x.std(0).clamp(min=1e-12)).abs().amax(-1)
+            top = intensity > intensity.quantile(1.0 - REGIME)
+            if min(int(top.sum()), int((~top).sum())) < FEWEST:
+                continue
+            rest = trained_region(m.qd[~top], m.tau[~top], load)
+            own = top.nonzero()[:, 0]
+            residual, V, P = _held_out(problem, hyperparameters, i, own)
+            D = distance_beyond(rest, m.qd[own], m.tau[own])
+            reached = (P.diagonal(dim1=-2, dim2=-1) > 0.5) & (D > 0.0)
+            square.append(residual.square()[reached])
+            known.append((V + P.square() @ s2)[reached])
+            slope.append((P.square() @ (load * D).square()[..., None])[..., 0][reached])
+    r2, V, a = (torch.cat(x) if x else load[:0] for x in (square, known, slope))
+
+    def objective(log_c2: float) -> float:
+        c2 = math.exp(log_c2)
+        v = V + c2 * a
+        misfit = 0.5 * problem.power * float((v.log() + r2 / v).sum())
+        return misfit + 0.5 * PRIOR_SAMPLES * (log_c2 + RELATIVE**2 / c2)
+
+    bounds = (2.0 * math.log(1e-2 * RELATIVE), 2.0 * math.log(1e2 * RELATIVE))
+    found = scipy.optimize.minimize_scalar(objective, bounds=bounds, method="bounded")
+    return math.exp(0.5 * float(found.x)) * load
 
 
 def stretches(segment: Tensor) -> Tensor:
@@ -229,19 +285,25 @@ def stretches(segment: Tensor) -> Tensor:
 
 
 def _held_out(
-    problem: Problem, hyperparameters: Mapping[str, Tensor], m: Measurement, noise_std: Tensor
+    problem: Problem, hyperparameters: Mapping[str, Tensor], i: int, own: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Torque residuals of unseen samples, their variance but for torque noise, `(n, nq)` each, and P."""
-    posterior, system = force_posterior(problem, hyperparameters), problem.system
+    """Torque residuals of samples of measurement i that are predicted from all others, their variance but
+    for torque noise, `(n, nq)` each, and P."""
+    training, std = problem.training, problem.noise_at(hyperparameters, i)
+    m, system = training.measurements[i][own], problem.system
+    posterior = force_posterior(
+        dataclasses.replace(problem, training=training.without(i, own)), hyperparameters
+    )
     at = m.at(system)
     z = affine_map(system, at, "qdd")
     M, P = at.eom.M, at.eom.P
     mean, covariance = posterior.read(system, at, z)
     residual = (M @ (m.values - mean)[..., None])[..., 0]
+    if training.weights is not None:
+        residual = training.weights[i][own].sqrt()[:, None] * residual
     spread = (M @ covariance @ M.mT).diagonal(dim1=-2, dim2=-1)
-    std = noise_std if noise_std.ndim == 1 else noise_std.square().mean(0).sqrt()
     stick = (P**2 @ stick_variance(hyperparameters, at)[..., None])[..., 0]
-    return residual, spread + (M**2 @ std**2) + stick, P
+    return residual, spread + (M**2 @ typical(std) ** 2) + stick, P
 
 
 def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:

@@ -26,11 +26,16 @@ class Prediction:
         covariance: `(*batch, d, d)`, of the noise-free quantity unless noise was asked for; `None` where the
             model gives none or it was not asked for.
         parts: the slice of each quantity, where several were asked for.
+        beyond: `(*batch, nq)` how far the speed and torque of each joint lie beyond those of the training
+            data, in training standard deviations; `None` for models that do not know.
+        warnings: doubts about the prediction, each with a remedy.
     """
 
     mean: Tensor
     covariance: Tensor | None = None
     parts: dict[str, slice] = field(default_factory=dict)
+    beyond: Tensor | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not finite.
