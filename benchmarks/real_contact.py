@@ -26,6 +26,7 @@ from scipy.signal import savgol_filter
 import forcegp
 from forcegp import kinematics
 from forcegp.errors import DataError
+from forcegp.models.structured_fit import StructuredFit
 
 LOGS = Path(__file__).resolve().parents[2] / "shared" / "real"
 DT, ORDER, WINDOW = 1e-3, 3, 61
@@ -84,7 +85,7 @@ def between(data: forcegp.Dataset, half: tuple[float, float]) -> forcegp.Dataset
     return data[(data.t >= half[0]) & (data.t < half[1])]
 
 
-def scores(fit: forcegp.StructuredFit, test: forcegp.Dataset) -> dict[str, object]:
+def scores(fit: StructuredFit, test: forcegp.Dataset) -> dict[str, object]:
     """Errors, error bars and coverage of the vertical force where the foot is on the ground."""
     found = fit.predict(test.q, test.qd, test.tau, "multiplier", active=test.active(("ground",)), noise=True)
     assert found.std is not None

@@ -12,6 +12,7 @@ from torch import Tensor
 import forcegp
 from forcegp import dynamics, kinematics
 from forcegp.forces.torque_noise import GROWTH, RELATIVE, STICKING, distance_beyond, trained_region
+from forcegp.models.structured_fit import StructuredFit
 
 LEG = """<robot name="leg">
   <link name="root"/>
@@ -71,7 +72,7 @@ def pendulum() -> forcegp.RobotModel:
     return robot.replace(damping=torch.zeros_like(robot.damping), friction=torch.zeros_like(robot.friction))
 
 
-def fitted(robot: forcegp.RobotModel, drag: float) -> forcegp.StructuredFit:
+def fitted(robot: forcegp.RobotModel, drag: float) -> StructuredFit:
     model = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", noise_std=0.01)
     return model.fit(swing(robot, 600, 0.5, drag, 0))
 
@@ -153,7 +154,7 @@ def squats(
     return data, multiplier
 
 
-def coverage(fit: forcegp.StructuredFit, data: forcegp.Dataset, force: Tensor) -> float:
+def coverage(fit: StructuredFit, data: forcegp.Dataset, force: Tensor) -> float:
     found = fit.predict(data.q, data.qd, data.tau, "multiplier", noise=True)
     return float(((found.mean[:, 0] - force).abs() <= 2.0 * found.std[:, 0]).double().mean())
 

@@ -187,18 +187,19 @@ class Problem:
         In contact, a force along the constraint changes no acceleration. A joint that pushes there has P_ii
         near zero, and neither its noise nor its friction can be told from that of other joints. At most, it
         explains all of the residual of its acceleration at such samples, s² = Σ r_i² / Σ H_ii². That counts
-        for joints with P_ii below a half at most samples and above it at fewer than `SHOWN` independent ones.
+        for joints with P_ii below a half at most samples and above it at fewer than `SHOWN` independent ones,
+        unless forces were measured too.
         """
+        if set(self.training.quantities) != {"qdd"}:
+            return torch.zeros_like(self.system.robot.mass)
         squares, responses, shown = [], [], []
-        for m in (m for m in self.training.measurements if m.quantity == "qdd"):
+        for m in self.training.measurements:
             at = m.at(self.system)
             residual = m.values - at.eom.acceleration(self.mean(self.system, at))
             H, P = (X.diagonal(dim1=-2, dim2=-1) for X in (at.eom.H, at.eom.P))
             squares.append(residual**2)
             responses.append(H**2)
             shown.append((P > 0.5).to(P))
-        if not squares:
-            return torch.zeros_like(self.system.robot.mass)
         r2, H2, visible = (torch.cat(x) for x in (squares, responses, shown))
         unseen = 1.0 - visible
         most = (unseen * r2).sum(0) / (unseen * H2).sum(0).clamp(min=1e-300)
