@@ -11,6 +11,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp import dynamics, kinematics
+from forcegp.cli.common import warn_beyond
 from forcegp.forces.torque_noise import GROWTH, RELATIVE, STICKING, distance_beyond, trained_region
 from forcegp.models.structured_fit import StructuredFit
 
@@ -77,7 +78,9 @@ def fitted(robot: forcegp.RobotModel, drag: float) -> StructuredFit:
     return model.fit(swing(robot, 600, 0.5, drag, 0))
 
 
-def test_growth_is_learned_from_regimes(pendulum: forcegp.RobotModel, tmp_path: Path) -> None:
+def test_growth_is_learned_from_regimes(
+    pendulum: forcegp.RobotModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Where fast motion was worse predicted than noise allows, faster motion is less certain."""
     dragged, exact = fitted(pendulum, 3.0), fitted(pendulum, 0.0)
     growth = [fit.hyperparameters[GROWTH] / fit.problem.typical_load() for fit in (dragged, exact)]
@@ -91,6 +94,8 @@ def test_growth_is_learned_from_regimes(pendulum: forcegp.RobotModel, tmp_path: 
     assert found.beyond is not None and float(found.beyond.max()) > 3.0
     (warning,) = found.warnings
     assert "of 400 states lie beyond the trained speeds and torques" in warning and "train on" in warning
+    warn_beyond(dragged, test)
+    assert " ".join(capsys.readouterr().err.split()) == f"warning: {warning}"
     inside = swing(pendulum, 600, 0.5, 3.0, 0)
     assert not dragged.predict(inside.q, inside.qd, inside.tau, covariance=False).warnings
 

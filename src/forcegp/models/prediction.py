@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
+from forcegp.forces.torque_noise import warnings_beyond
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,14 +29,14 @@ class Prediction:
         parts: the slice of each quantity, where several were asked for.
         beyond: `(*batch, nq)` how far the speed and torque of each joint lie beyond those of the training
             data, in training standard deviations; `None` for models that do not know.
-        warnings: doubts about the prediction, each with a remedy.
+        joint_names: the joints, in the order of `beyond`.
     """
 
     mean: Tensor
     covariance: Tensor | None = None
     parts: dict[str, slice] = field(default_factory=dict)
     beyond: Tensor | None = None
-    warnings: tuple[str, ...] = ()
+    joint_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not finite.
@@ -61,6 +62,11 @@ class Prediction:
         """`(*batch, d)` standard deviation."""
         variance = self.variance
         return None if variance is None else variance.sqrt()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Doubts about the prediction, each with a remedy: states far beyond the training data."""
+        return () if self.beyond is None else warnings_beyond(self.beyond, self.joint_names)
 
     def __repr__(self) -> str:
         """One line with shapes, without the numbers."""

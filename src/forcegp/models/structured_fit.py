@@ -22,14 +22,7 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
 from forcegp.forces.samples import draw_samples
 from forcegp.forces.state_noise import learned_slopes
-from forcegp.forces.torque_noise import (
-    LOW,
-    STICK_NOISE,
-    TORQUE_NOISE,
-    distance_beyond,
-    unknown_variance,
-    warnings_beyond,
-)
+from forcegp.forces.torque_noise import LOW, STICK_NOISE, TORQUE_NOISE, distance_beyond, unknown_variance
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel, ForceField, Prediction
@@ -129,7 +122,7 @@ class StructuredFit(FittedModel):
             None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
             parts,
             None if beyond is None else beyond.reshape(*batch, system.robot.nq),
-            () if beyond is None else warnings_beyond(beyond, system.robot.joint_names),
+            system.robot.joint_names,
         )
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
