@@ -39,7 +39,7 @@ def existing(path: Path) -> Path:
     if not path.exists():
         raise DataError(
             f"{path}: this log is not here",
-            expected="kuka_iiwa14 and double_pendulum with their published files",
+            expected="the published files of the log",
             hint="say where the logs are with --logs; examples/data has a part of one of them",
         )
     return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -9,6 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from log_files import REAL, real_logs
 
 ROOT = Path(__file__).resolve().parents[1]
 SECONDS = 180.0  # an example takes under 20 s on one thread; the machine may be busy
@@ -121,9 +124,25 @@ def test_real_iiwa_friction(tmp_path: Path) -> None:
     assert all(88.0 <= share <= 98.0 for share in covered)
 
 
-def test_missing_logs_are_named() -> None:
-    done = run("benchmarks/real_logs.py", "--logs", "/nowhere")
+@pytest.mark.parametrize(
+    ("script", "log"), [("real_logs", "kuka_iiwa14"), ("real_contact", "hopper/teststand.urdf")]
+)
+def test_missing_logs_are_named(script: str, log: str) -> None:
+    done = run(f"benchmarks/{script}.py", "--logs", "/nowhere")
     assert done.returncode == 1
-    assert "/nowhere/kuka_iiwa14: this log is not here" in done.stderr
+    assert f"/nowhere/{log}: this log is not here" in done.stderr
     assert "--logs" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@real_logs
+@pytest.mark.slow
+def test_standing_does_not_teach_a_leg_how_to_jump(tmp_path: Path) -> None:
+    """Trained on standing and squatting, tested on a jump: forces up to 17 N are wrong by 5 N."""
+    done = run("benchmarks/real_contact.py", "--logs", str(REAL), "--json", str(tmp_path / "result.json"))
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
+    found = result["first half trains, second half tests"]
+    assert found["coverage"] >= 0.8
+    (warning,) = found["warnings"]
+    assert "(KFE)" in warning

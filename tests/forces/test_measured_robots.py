@@ -11,7 +11,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp import dynamics
-from forcegp.forces.calibration import autocorrelation_time
+from forcegp.forces.calibration import autocorrelation_time, correlation_times
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.identification import regressor
@@ -149,6 +149,41 @@ def test_autocorrelation_time_of_a_known_process() -> None:
             x[k, i] = a * x[k - 1, i] + noise[k, i]
     found = autocorrelation_time(x, torch.zeros(len(x), dtype=torch.int64))
     torch.testing.assert_close(found, torch.tensor([1.0, 9.0], dtype=torch.float64), rtol=0.15, atol=0.1)
+
+
+def first_order(n: int, a: float, generator: torch.Generator) -> Tensor:
+    """AR(1) processes of unit variance with coefficient a `(n, 2)`."""
+    x = torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    for k in range(1, n):
+        x[k] = a * x[k - 1] + (1.0 - a * a) ** 0.5 * x[k]
+    return x
+
+
+def test_white_noise_does_not_hide_a_correlation() -> None:
+    generator = torch.Generator().manual_seed(1)
+    x = first_order(40000, 0.9, generator)
+    noise = torch.randn(x.shape, generator=generator, dtype=torch.float64)
+    segment = torch.zeros(len(x), dtype=torch.int64)
+    white = torch.tensor([0.0, 4.0], dtype=torch.float64)
+    both = torch.tensor([19.0, 19.0], dtype=torch.float64)
+    found = autocorrelation_time(x + white.sqrt() * noise, segment, white)
+    torch.testing.assert_close(found, both, rtol=0.2, atol=0.0)
+    found = correlation_times(x + white.sqrt() * noise, segment, 400, white)
+    torch.testing.assert_close(found, both + white, rtol=0.2, atol=0.0)
+    # All of it is white: what is left of the variance says nothing.
+    assert torch.equal(autocorrelation_time(noise, segment, 1.0), torch.ones(2, dtype=torch.float64))
+
+
+def test_white_noise_of_accelerations_does_not_hide_correlated_torques(file: forcegp.RobotModel) -> None:
+    """Torque noise with 19 samples of autocorrelation time, and as much torque in white accelerations."""
+    data, generator = log(file, 1000, 3), torch.Generator().manual_seed(3)
+    clean = dynamics.inverse_dynamics(file, data.q, data.qd, data.qdd)
+    friction = VISCOUS * data.qd + COULOMB * torch.tanh(data.qd / 0.02)
+    tau = clean + friction + 0.1 * first_order(1000, 0.9, generator)
+    qdd = data.qdd + 0.1 * torch.randn(1000, 2, generator=generator, dtype=torch.float64)
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical", noise_std=0.1)
+    fit = model.fit(data.replace(tau=tau, qdd=qdd))
+    assert fit.problem.power == pytest.approx(1.0 / 19.0, rel=0.5)
 
 
 def test_samples_at_rest_are_left_out(file: forcegp.RobotModel) -> None:

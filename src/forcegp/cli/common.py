@@ -14,6 +14,7 @@ import typer
 if TYPE_CHECKING:
     from forcegp.constraints import ConstrainedSystem
     from forcegp.data import Dataset
+    from forcegp.models.base import Predictor
     from forcegp.robot import RobotModel
     from forcegp.scene import ModelTable
 
@@ -177,3 +178,14 @@ def model_table(config: Path | None, scene: str | None) -> ModelTable:
     if config is not None:
         return load_model_table(config)
     return default_model_table() if scene is None else load_scene(scene).model
+
+
+def warn_beyond(model: Predictor, data: Dataset) -> None:
+    """Print a warning where a model is asked for states far from those that it was trained on."""
+    from forcegp.evaluation.predicted import structured_fit_of
+    from forcegp.forces.torque_noise import warnings_beyond
+
+    fit = structured_fit_of(model)
+    beyond = None if fit is None else fit.beyond(data.qd, data.tau)
+    for doubt in () if beyond is None else warnings_beyond(beyond, data.joint_names):
+        typer.secho(f"warning: {doubt}", fg="yellow", err=True)

@@ -16,6 +16,7 @@ from forcegp.cli.common import (
     progress_bar,
     read_data,
     show,
+    warn_beyond,
 )
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def evaluate(
     known = None if train is None else data_of_robot(read_data(train), robot)
     with progress_bar("evaluating", len(test)) as progress:
         found = run(regression, test, train=known, progress=progress)
+    warn_beyond(regression, test)
     result: dict[str, object] = {"verdict": found.verdict or "too few samples", **found.summary()}
     if out is not None:
         names = str(model or config or scene), str(data), None if train is None else str(train)

@@ -16,6 +16,7 @@ from forcegp.cli.common import (
     progress_bar,
     read_data,
     show,
+    warn_beyond,
 )
 
 if TYPE_CHECKING:
@@ -85,6 +86,7 @@ def predict(
             rows = slice(first, first + CHUNK)
             found.append(_predicted(regression, test[rows], quantity, active[rows], noise, sensor))
             progress(min(first + CHUNK, len(test)))
+    warn_beyond(regression, test)
     means = [mean for mean, _ in found]
     stds = [std for _, std in found if std is not None]
     test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", torch.cat(means))

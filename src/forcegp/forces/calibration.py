@@ -9,18 +9,25 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import scipy
 import torch
 from torch import Tensor
 
 from forcegp.forces.inference import force_posterior
-from forcegp.forces.learn import Problem
+from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.quantities import affine_map
-from forcegp.forces.torque_noise import stick_variance
+from forcegp.forces.torque_noise import (
+    GROWTH,
+    RELATIVE,
+    TORQUE_NOISE,
+    distance_beyond,
+    stick_variance,
+    trained_region,
+)
 
 STRETCHES = 8
 """Contiguous stretches that a log of fewer than three segments is divided into."""
@@ -36,58 +43,72 @@ CHUNK_STATES = 2000
 """States whose residuals are computed at a time, which bounds the memory."""
 NEGLIGIBLE = 0.05
 """Autocorrelation below which the rest is noise of the estimate."""
+SIGNIFICANT = 2.0
+"""Standard errors of a covariance of neighbours beyond which samples are correlated."""
+REGIME = 0.25
+"""Share of the samples that the fastest or most loaded regime has."""
+PRIOR_SAMPLES = 4.0
+"""Independent samples that the prior of `growth` is worth."""
 WINDOW, WINDOWS = 10.0, 20
 """Length of the windows of `correlation_times` in units of the autocorrelation time, and how many there are
 at least."""
 
 
-def autocorrelation_time(residual: Tensor, segment: Tensor) -> Tensor:
+def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0) -> Tensor:
     """Integrated autocorrelation time of each column, 1 + 2 Σ ρ_k, in samples `(d,)`.
 
-    The sum ends where ρ falls below 0.05, and at half the longest segment.
+    The sum ends where ρ falls below 0.05, and at half the longest segment. It is 1 for a column whose
+    neighbours have no significant covariance (two standard errors of that of white noise).
 
     Args:
-        residual: `(n, d)` in the order of time.
+        x: `(n, d)` in the order of time, with mean zero.
         segment: `(n,)`.
+        white: variance of white noise in x, which is not counted.
     """
-    parts = [residual[segment == s] for s in segment.unique()]
-    longest = max(len(part) for part in parts)
-    variance = (residual**2).mean(0).clamp(min=1e-300)
-    total, open_ = torch.ones_like(variance), torch.ones_like(variance, dtype=torch.bool)
+    longest = int(segment.unique(return_counts=True)[1].max())
+    variance, first = _variance_in_time(x, segment, white)
+    total = torch.ones_like(variance)
+    open_ = first > SIGNIFICANT * x.square().mean(0) / math.sqrt(len(x))
     for lag in range(1, longest // 2):
-        pairs = [(part[:-lag], part[lag:]) for part in parts if len(part) > lag]
-        count = sum(len(a) for a, _ in pairs)
-        rho = sum(((a * b).sum(0) for a, b in pairs), start=torch.zeros_like(variance)) / (count * variance)
-        open_ &= rho > NEGLIGIBLE
+        rho = (first if lag == 1 else _covariance(x, segment, lag)) / variance
+        open_ = open_ & (rho > NEGLIGIBLE)
         if not bool(open_.any()):
             break
         total = total + torch.where(open_, 2.0 * rho, 0.0)
     return total
 
 
-def correlation_times(residual: Tensor, segment: Tensor, length: int) -> Tensor:
+def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | float = 0.0) -> Tensor:
     """Spectral density of each column at low frequencies over its variance, in samples `(d,)`.
 
-    L · mean(r̄²) / mean(r²) over windows of L samples with means r̄ (batch means, Flegal and Jones 2010). In
-    contrast to `autocorrelation_time` it contains the negative lobes of a residual that oscillates, such as
-    noise of differentiated positions or the ringing of a gear, which hardly move a robot.
+    L · mean(x̄²) / (mean(x²) − white) over windows of L samples with means x̄ (batch means, Flegal and Jones
+    2010). In contrast to `autocorrelation_time` it contains the negative lobes of a residual that oscillates,
+    such as noise of differentiated positions or the ringing of a gear, which hardly move a robot.
 
     Args:
-        residual: `(n, d)` in the order of time.
+        x: `(n, d)` in the order of time, with mean zero.
         segment: `(n,)`.
         length: L, several times the autocorrelation time.
+        white: variance of white noise in x, which is not counted.
     """
     squares = []
     for s in segment.unique():
-        part = residual[segment == s]
+        part = x[segment == s]
         windows = len(part) // length
         squares.append(part[: windows * length].unflatten(0, (windows, length)).mean(1).square())
-    return length * torch.cat(squares).mean(0) / residual.square().mean(0).clamp(min=1e-300)
+    return length * torch.cat(squares).mean(0) / _variance_in_time(x, segment, white)[0]
 
 
-def _free(m: Measurement) -> Tensor:
-    """Rows of samples without a closed contact."""
-    return (~m.active.any(-1)).nonzero()[:, 0]
+def _variance_in_time(x: Tensor, segment: Tensor, white: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Variance without white noise `(d,)`, and the covariance of neighbours, which it is not less than."""
+    first = _covariance(x, segment, 1)
+    return (x.square().mean(0) - white).clamp(min=1e-300).maximum(first), first
+
+
+def _covariance(x: Tensor, segment: Tensor, lag: int) -> Tensor:
+    """Mean product of samples of one segment that are a lag apart `(d,)`."""
+    same = segment[:-lag] == segment[lag:]
+    return ((x[:-lag] * x[lag:]) * same[:, None]).sum(0) / same.sum().clamp(min=1)
 
 
 def _motions(training: Training) -> list[int]:
@@ -96,7 +117,7 @@ def _motions(training: Training) -> list[int]:
 
 
 def likelihood_power(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> float:
-    """κ = 1/τ̄, τ̄ the geometric mean over the joints of the autocorrelation time of torque residuals.
+    """κ = 1/τ̄, τ̄ the geometric mean over the joints of the autocorrelation time of their torque noise.
 
     The n samples of a log hold as much evidence as n/τ̄ independent ones.
 
@@ -116,7 +137,7 @@ def residual_times(
     """κ as in `likelihood_power`, and `correlation_times` of joints `(nq,)` [s], `None` for too few samples.
 
     Args:
-        problem: what is conditioned on.
+        problem: what is conditioned on, with learned torque noise.
         hyperparameters: learned tensors.
         training: samples whose residuals are looked at, at their own rate.
     """
@@ -124,43 +145,69 @@ def residual_times(
     logs, times = [], []
     for i in _motions(training):
         m = training.measurements[i]
-        m = m[_some(_free(m))]
-        if len(m.q) < FEWEST:
+        rows = _some(len(m.q)).to(m.q.device)
+        if len(rows) < FEWEST:
             continue
-        residual = torch.cat([_residual(posterior, problem, hyperparameters, part) for part in _chunks(m)])
-        logs.append(autocorrelation_time(residual, m.segment).log())
-        own = math.exp(float(logs[-1].mean()))
-        longest_part = int(m.segment.unique(return_counts=True)[1].max())
-        length = max(1, min(round(WINDOW * own), len(residual) // WINDOWS, longest_part))
-        times.append(training.period * correlation_times(residual, m.segment, length))
+        std = dataclasses.replace(problem, training=training).noise_at(hyperparameters, i)
+        parts = [
+            _torque_noise(posterior, problem, hyperparameters, m[own], std if std.ndim == 1 else std[own])
+            for own in rows.split(CHUNK_STATES)
+        ]
+        noise, white = (torch.cat(part) for part in zip(*parts, strict=True))
+        segment, white = m.segment[rows], white.mean(0)
+        logs.append(autocorrelation_time(noise, segment, white).log())
+        longest_part = int(segment.unique(return_counts=True)[1].max())
+        wanted = round(WINDOW * math.exp(float(logs[-1].mean())))
+        length = max(1, min(wanted, len(rows) // WINDOWS, longest_part))
+        times.append(training.period * correlation_times(noise, segment, length, white))
     if not logs:
         return 1.0, None
     return min(1.0, math.exp(-float(torch.stack(logs).mean()))), torch.stack(times).mean(0)
 
 
-def _some(rows: Tensor) -> Tensor:
-    """At most `MOST_RESIDUALS` rows in a few contiguous stretches, as neighbours show the correlation."""
-    if len(rows) <= MOST_RESIDUALS:
-        return rows
+def _some(n: int) -> Tensor:
+    """At most `MOST_RESIDUALS` of n rows in contiguous stretches, as neighbours show the correlation."""
+    if n <= MOST_RESIDUALS:
+        return torch.arange(n)
     length = MOST_RESIDUALS // STRETCHES
-    first = torch.linspace(0, len(rows) - length, STRETCHES).round().long()
-    return rows[(first[:, None] + torch.arange(length)).flatten().to(rows.device)]
+    first = torch.linspace(0, n - length, STRETCHES).round().long()
+    return (first[:, None] + torch.arange(length)).flatten()
 
 
-def _chunks(m: Measurement) -> Iterator[Measurement]:
-    for i in range(0, len(m.q), CHUNK_STATES):
-        yield m[torch.arange(i, min(i + CHUNK_STATES, len(m.q)), device=m.q.device)]
+def _torque_noise(
+    posterior: ForcePosterior,
+    problem: Problem,
+    hyperparameters: Mapping[str, Tensor],
+    m: Measurement,
+    std: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Estimated torque noise of each joint over its standard deviation, and the variance that white noise of
+    the accelerations has in it, `(n, nq)` each.
 
-
-def _residual(
-    posterior: ForcePosterior, problem: Problem, hyperparameters: Mapping[str, Tensor], m: Measurement
-) -> Tensor:
-    """M q̈ − Q̄ of the posterior mean over the noise of the force, `(n, nq)`: joints that stick count less."""
-    system, noise = problem.system, problem.force_noise(hyperparameters)
+    Residuals of accelerations are r = H ε + e with torque noise ε ~ N(0, S) and white e ~ N(0, Σ), which
+    hides the correlation of ε. In E[ε | r] = G r it has the least share.
+    """
+    system, force_noise = problem.system, problem.force_noise(hyperparameters)
+    assert force_noise is not None
     at = m.at(system)
-    z = affine_map(system, at, "total_force")
-    residual = (at.eom.M @ m.values[..., None])[..., 0] - posterior.read_mean(system, at, z)
-    return residual if noise is None else residual / noise(at).sqrt()
+    z = affine_map(system, at, "qdd")
+    r = m.values - posterior.read_mean(system, at, z)
+    # G = S Hᵀ (H S Hᵀ + Σ)⁻¹
+    S, H = force_noise(at), at.eom.H
+    white = std.square().expand_as(r)
+    SH = S[..., None] * H.mT
+    G = torch.linalg.solve(H @ SH + torch.diag_embed(white), SH, left=False)
+    return (G @ r[..., None])[..., 0] / S.sqrt(), (G.square() @ white[..., None])[..., 0] / S
+
+
+def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Torque noise as held-out samples ask for it, the trained region, and the growth of errors beyond it."""
+    load, training = problem.typical_load(), problem.training
+    learned = hyperparameters[TORQUE_NOISE].exp().maximum(problem.hidden_torque())
+    noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
+    qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
+    region = trained_region(qd, tau, load)
+    return {**noise, **region, GROWTH: growth(problem, {**hyperparameters, **noise}, load)}
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
@@ -175,22 +222,57 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
         hyperparameters: learned tensors.
         least: the learned standard deviation, which is kept where the errors ask for less.
     """
-    training = problem.training
     parts = []
-    for i in _motions(training):
-        m = training.measurements[i]
-        group = stretches(m.segment)
+    for i in _motions(problem.training):
+        group = stretches(problem.training.measurements[i].segment)
         for g in group.unique().tolist():
-            own = (group == g).nonzero()[:, 0]
-            rest = dataclasses.replace(problem, training=training.without(i, own))
-            found = _held_out(rest, hyperparameters, m[own], problem.noise_at(hyperparameters, i))
-            if training.weights is not None:
-                found = (training.weights[i][own].sqrt()[:, None] * found[0], *found[1:])
-            parts.append(found)
+            parts.append(_held_out(problem, hyperparameters, i, (group == g).nonzero()[:, 0]))
     if sum(len(residual) for residual, _, _ in parts) < FEWEST:
         return least
     residual, variance, P = (torch.cat(part) for part in zip(*parts, strict=True))
     return unit_scales(residual**2, variance, P**2, least)
+
+
+def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
+    """g `(nq,)`: by how much the standard deviation of each torque grows beyond the trained region.
+
+    The fastest and the most loaded quarter of the training samples are predicted from the rest. With
+    g = c · load, one c for all joints, and D the distance beyond the region of the rest, c is most probable
+    under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the likelihood, and a scaled
+    inverse-χ² prior, which decides where the log has only one regime.
+
+    Args:
+        problem: what was learned, with the power of its likelihood.
+        hyperparameters: with the noise of the torque as it is predicted.
+        load: typical torque of each joint `(nq,)` [N m, N].
+    """
+    s2, square, known, slope = hyperparameters[TORQUE_NOISE].exp() ** 2, [], [], []
+    for i in _motions(problem.training):
+        m = problem.training.measurements[i]
+        for x in (m.qd, m.tau):
+            intensity = ((x - x.mean(0)) / x.std(0).clamp(min=1e-12)).abs().amax(-1)
+            top = intensity > intensity.quantile(1.0 - REGIME)
+            if min(int(top.sum()), int((~top).sum())) < FEWEST:
+                continue
+            rest = trained_region(m.qd[~top], m.tau[~top], load)
+            own = top.nonzero()[:, 0]
+            residual, V, P = _held_out(problem, hyperparameters, i, own)
+            D = distance_beyond(rest, m.qd[own], m.tau[own])
+            reached = (P.diagonal(dim1=-2, dim2=-1) > 0.5) & (D > 0.0)
+            square.append(residual.square()[reached])
+            known.append((V + P.square() @ s2)[reached])
+            slope.append((P.square() @ (load * D).square()[..., None])[..., 0][reached])
+    r2, V, a = (torch.cat(x) if x else load[:0] for x in (square, known, slope))
+
+    def objective(log_c2: float) -> float:
+        c2 = math.exp(log_c2)
+        v = V + c2 * a
+        misfit = 0.5 * problem.power * float((v.log() + r2 / v).sum())
+        return misfit + 0.5 * PRIOR_SAMPLES * (log_c2 + RELATIVE**2 / c2)
+
+    bounds = (2.0 * math.log(1e-2 * RELATIVE), 2.0 * math.log(1e2 * RELATIVE))
+    found = scipy.optimize.minimize_scalar(objective, bounds=bounds, method="bounded")
+    return math.exp(0.5 * float(found.x)) * load
 
 
 def stretches(segment: Tensor) -> Tensor:
@@ -203,19 +285,25 @@ def stretches(segment: Tensor) -> Tensor:
 
 
 def _held_out(
-    problem: Problem, hyperparameters: Mapping[str, Tensor], m: Measurement, noise_std: Tensor
+    problem: Problem, hyperparameters: Mapping[str, Tensor], i: int, own: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Torque residuals of unseen samples, their variance but for torque noise, `(n, nq)` each, and P."""
-    posterior, system = force_posterior(problem, hyperparameters), problem.system
+    """Torque residuals of samples of measurement i that are predicted from all others, their variance but
+    for torque noise, `(n, nq)` each, and P."""
+    training, std = problem.training, problem.noise_at(hyperparameters, i)
+    m, system = training.measurements[i][own], problem.system
+    posterior = force_posterior(
+        dataclasses.replace(problem, training=training.without(i, own)), hyperparameters
+    )
     at = m.at(system)
     z = affine_map(system, at, "qdd")
     M, P = at.eom.M, at.eom.P
     mean, covariance = posterior.read(system, at, z)
     residual = (M @ (m.values - mean)[..., None])[..., 0]
+    if training.weights is not None:
+        residual = training.weights[i][own].sqrt()[:, None] * residual
     spread = (M @ covariance @ M.mT).diagonal(dim1=-2, dim2=-1)
-    std = noise_std if noise_std.ndim == 1 else noise_std.square().mean(0).sqrt()
     stick = (P**2 @ stick_variance(hyperparameters, at)[..., None])[..., 0]
-    return residual, spread + (M**2 @ std**2) + stick, P
+    return residual, spread + (M**2 @ typical(std) ** 2) + stick, P
 
 
 def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:

@@ -28,6 +28,8 @@ OWN = tuple(name + "." for name in RESERVED)
 """Prefixes of what is learned besides the hyperparameters of the priors."""
 MIXED = "." + MIXING
 """End of the names of what operators learn."""
+SHOWN = 10.0
+"""Independent samples at which accelerations show the torque of a joint, from which its noise is learned."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -194,6 +196,39 @@ class Problem:
                 force = (at.eom.M @ residual[..., None])[..., 0]
                 total, count = total + (force**2).sum(0), count + len(force)
         return (total / max(count, 1)).sqrt()
+
+    @torch.no_grad()
+    def hidden_torque(self) -> Tensor:
+        """Root mean square of what may act on joints that accelerations hardly show, 0 for others `(nq,)`.
+
+        In contact, a force along the constraint changes no acceleration. A joint that pushes there has P_ii
+        near zero, and neither its noise nor its friction can be told from that of other joints. At most, it
+        explains all of the residual of its acceleration at such samples, s² = Σ r_i² / Σ H_ii². That counts
+        for joints with P_ii below a half at most samples and above it at fewer than `SHOWN` independent ones,
+        unless forces were measured too.
+        """
+        if set(self.training.quantities) != {"qdd"}:
+            return torch.zeros_like(self.system.robot.mass)
+        squares, responses, shown = [], [], []
+        for m in self.training.measurements:
+            at = m.at(self.system)
+            residual = m.values - at.eom.acceleration(self.mean(self.system, at))
+            H, P = (X.diagonal(dim1=-2, dim2=-1) for X in (at.eom.H, at.eom.P))
+            squares.append(residual**2)
+            responses.append(H**2)
+            shown.append((P > 0.5).to(P))
+        r2, H2, visible = (torch.cat(x) for x in (squares, responses, shown))
+        unseen = 1.0 - visible
+        most = (unseen * r2).sum(0) / (unseen * H2).sum(0).clamp(min=1e-300)
+        hidden = (visible.mean(0) < 0.5) & (self.power * visible.sum(0) < SHOWN)
+        return torch.where(hidden, most.sqrt(), 0.0)
+
+    @torch.no_grad()
+    def typical_load(self) -> Tensor:
+        """Root mean square of the torques that act on each joint (motor, weight, bias) `(nq,)` [N m, N]."""
+        states = [m.at(self.system) for m in self.training.measurements]
+        squares = [at.tau**2 + at.eom.Q_G**2 + at.eom.Q_C**2 for at in states]
+        return torch.cat(squares).mean(0).sqrt()
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
         """Of the rows, exact or as the collapsed bound, with their constant."""

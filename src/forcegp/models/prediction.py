@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
+from forcegp.forces.torque_noise import warnings_beyond
 from forcegp.gp.rounding import require_semidefinite
 
 if TYPE_CHECKING:
@@ -27,11 +28,16 @@ class Prediction:
         covariance: `(*batch, d, d)`, of the noise-free quantity unless noise was asked for; `None` where the
             model gives none or it was not asked for.
         parts: the slice of each quantity, where several were asked for.
+        beyond: `(*batch, nq)` how far the speed and torque of each joint lie beyond those of the training
+            data, in training standard deviations; `None` for models that do not know.
+        joint_names: the joints, in the order of `beyond`.
     """
 
     mean: Tensor
     covariance: Tensor | None = None
     parts: dict[str, slice] = field(default_factory=dict)
+    beyond: Tensor | None = None
+    joint_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not finite, and covariances that are none.
@@ -59,6 +65,11 @@ class Prediction:
         """`(*batch, d)` standard deviation."""
         variance = self.variance
         return None if variance is None else variance.sqrt()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Doubts about the prediction, each with a remedy: states far beyond the training data."""
+        return () if self.beyond is None else warnings_beyond(self.beyond, self.joint_names)
 
     def __repr__(self) -> str:
         """One line with shapes, without the numbers."""

@@ -22,7 +22,7 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
 from forcegp.forces.samples import draw_samples
 from forcegp.forces.state_noise import learned_slopes
-from forcegp.forces.torque_noise import STICK_NOISE, TORQUE_NOISE, stick_variance
+from forcegp.forces.torque_noise import LOW, STICK_NOISE, TORQUE_NOISE, distance_beyond, unknown_variance
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel, ForceField, Prediction
@@ -113,14 +113,22 @@ class StructuredFit(FittedModel):
             mean, spread = self.posterior.read(system, at, z)
             z = coupled(system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
             if STICK_NOISE in self.hyperparameters:
-                spread = spread + _carried(z, stick_variance(self.hyperparameters, at))
+                spread = spread + _carried(z, unknown_variance(self.hyperparameters, at))
             if noise:
                 spread = spread + self._noise_covariance(z, parts)
+        beyond = self.beyond(at.qd, at.tau)
         return Prediction(
             mean.reshape(*batch, z.o.shape[-1]),
             None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
             parts,
+            None if beyond is None else beyond.reshape(*batch, system.robot.nq),
+            system.robot.joint_names,
         )
+
+    def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
+        """How far the speed and torque of each joint lie beyond those of the training data, in training
+        standard deviations `(*batch, nq)`; `None` where no torque noise was learned."""
+        return distance_beyond(self.hyperparameters, qd, tau) if LOW in self.hyperparameters else None
 
     def _with_acceleration(self, system: ConstrainedSystem, at: States) -> States:
         """The states with the predicted acceleration, which errors of the inertia are multiplied by."""

@@ -6,7 +6,8 @@
 3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more;
    unless a `DisturbancePrior` explains them.
 4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
-5. The noise of the torque is enlarged to what held-out stretches of the training log ask for.
+5. The noise of the torque is enlarged to what held-out stretches of the training log ask for, and how it
+   grows beyond the trained speeds and torques is learned from held-out regimes.
 6. The posterior is conditioned on all samples.
 """
 
@@ -22,7 +23,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import UnknownNameError
-from forcegp.forces.calibration import held_out_torque_std, likelihood_power, residual_times
+from forcegp.forces.calibration import calibrated_noise, likelihood_power, residual_times
 from forcegp.forces.impacts import without_impacts
 from forcegp.forces.inference import (
     is_finite,
@@ -39,7 +40,7 @@ from forcegp.forces.robot_update import with_updated_robot
 from forcegp.forces.slopes import with_learned_slopes, without_slopes
 from forcegp.forces.start import Search, initial
 from forcegp.forces.student_t import left_out, weighted
-from forcegp.forces.torque_noise import TORQUE_NOISE
+from forcegp.forces.torque_noise import REGION, TORQUE_NOISE
 from forcegp.gp.likelihood import require_exact_fits
 from forcegp.gp.optimise import Learned, LearningOptions, Progress
 from forcegp.models.base import FitProgress
@@ -172,6 +173,8 @@ def search_of(
     start = initial(problem, spec.learn_noise, spec.learns_torque_noise)
     known = {} if before is None or chosen is None else before.hyperparameters
     current = {key: known.get(key, value) for key, value in start.items()}
+    if chosen is not None and NOISE not in chosen:
+        current |= {key: value for key, value in known.items() if key.startswith(REGION)}
 
     def is_held(name: str) -> bool:
         # Residuals of a robot that contains a force do not show the scale of that force.
@@ -322,7 +325,7 @@ def solve(
         values = {**search.held, **learned.tensors}
     if calibrated:
         part = with_updated_robot(part, values)
-        values[TORQUE_NOISE] = held_out_torque_std(part, values, values[TORQUE_NOISE].exp()).log()
+        values |= calibrated_noise(part, values)
     if correlated:
         part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
     training = dataclasses.replace(problem.training, slopes=part.training.slopes)
