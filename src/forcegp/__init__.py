@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     )
     from forcegp.data import Dataset, SavitzkyGolay, StreamedDataset
     from forcegp.evaluation import Evaluation, evaluate
+    from forcegp.forces.noise import Noise
     from forcegp.forces.observations import Observation
     from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
     from forcegp.forces.priors.coregional import CoregionalPrior
@@ -62,6 +63,7 @@ _HOME = {
     "DisturbancePrior": "forces.priors.disturbance",
     "LearningOptions": "gp.optimise",
     "NeuralNetwork": "models.neural",
+    "Noise": "forces.noise",
     "NormalForcePrior": "forces.priors.normal_force",
     "Observation": "forces.observations",
     "OperatorForcePrior": "forces.priors.operator",
@@ -113,6 +115,7 @@ __all__ = [
     "JointFrictionPrior",
     "LearningOptions",
     "NeuralNetwork",
+    "Noise",
     "NormalForcePrior",
     "Observation",
     "OperatorForcePrior",

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.evaluation.predicted import structured_fit_of
 from forcegp.evaluation.uncertainty import share
 from forcegp.models.base import Predictor
 from forcegp.models.sensed import force_from_sensor, has_sensor
+from forcegp.models.structured_fit import StructuredFit
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,15 @@ def multiplier_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[Mult
     names = model.system.contact_names
     if not _comparable(model, data):
         return ()
-    fit, active, means, stds = structured_fit_of(model), data.active(names), [], []
+    active, means, stds = data.active(names), [], []
     for i in range(0, len(data), chunk):
         part, closed = data[i : i + chunk], active[i : i + chunk]
         states = part.q, part.qd, part.tau
         predicted = model.predict(*states, "multiplier", active=closed)
         means.append(predicted.mean)
         variance = predicted.variance
-        if variance is not None and fit is not None:
-            variance = variance + fit.noise_variance(*states, "multiplier", closed, sensor=False)
+        if variance is not None and isinstance(model, StructuredFit):
+            variance = variance + model.noise_variance(*states, "multiplier", closed, sensor=False)
         stds += [] if variance is None else [variance.clamp(min=0.0).sqrt()]
     return _scores(data, names, torch.cat(means), torch.cat(stds) if stds else None)
 
@@ -73,12 +73,11 @@ def sensed_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[Multipli
     Returns:
         Nothing for a model that was not fitted to a sensor, or a log without one.
     """
-    fit = structured_fit_of(model)
-    if fit is None or "multiplier" not in fit.noise or not _comparable(model, data):
+    if not isinstance(model, StructuredFit) or "multiplier" not in model.noise:
         return ()
-    if not has_sensor(data, fit.system):
+    if not _comparable(model, data) or not has_sensor(data, model.system):
         return ()
-    parts = [force_from_sensor(fit, data[i : i + chunk]) for i in range(0, len(data), chunk)]
+    parts = [force_from_sensor(model, data[i : i + chunk]) for i in range(0, len(data), chunk)]
     mean, std = (torch.cat(part) for part in zip(*parts, strict=True))
     return _scores(data, model.system.contact_names, mean[:, None], std[:, None])
 

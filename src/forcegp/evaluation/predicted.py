@@ -13,7 +13,6 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.models.base import Predictor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.models.structured_gp import StructuredGP
 
 CHUNK_STATES = 2000
 """States predicted at a time."""
@@ -65,12 +64,6 @@ def predict_all(
     return Predicted(torch.cat(means), variance, _noise_std(model, data), torch.cat(residuals), seconds)
 
 
-def structured_fit_of(model: Predictor) -> StructuredFit | None:
-    """The structured fit that a predictor is or contains; `None` for other models."""
-    found = model.fitted if isinstance(model, StructuredGP) else model
-    return found if isinstance(found, StructuredFit) else None
-
-
 @torch.no_grad()
 def _residual(system: ConstrainedSystem, data: Dataset, rows: slice, qdd: Tensor) -> Tensor:
     """|A q̈ − b| of the rows of closed contacts, `(k,)`."""
@@ -82,10 +75,9 @@ def _residual(system: ConstrainedSystem, data: Dataset, rows: slice, qdd: Tensor
 
 def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
     """The noise that the model assumes for measured accelerations, or the data's, `(n, nq)`."""
-    fit = structured_fit_of(model)
-    if fit is not None:
+    if isinstance(model, StructuredFit):
         active = data.active(model.system.contact_names)
-        return fit.noise_variance(data.q, data.qd, data.tau, active=active).sqrt()
+        return model.noise_variance(data.q, data.qd, data.tau, active=active).sqrt()
     noise = getattr(model, "noise_std", None)
     noise = data.header.noise_std if noise is None else noise
     if noise is None:
