@@ -32,6 +32,7 @@ from forcegp.forces.priors.default import PAPER, default_priors
 from forcegp.forces.quantities import states
 from forcegp.forces.start import initial
 from forcegp.gp.likelihood import negative_log_likelihood
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_learning import training_for
 from forcegp.simulate import simulate
 
@@ -50,12 +51,12 @@ def training_data(folder: Path, samples: int) -> tuple[forcegp.Dataset, forcegp.
     return data[split.train], data[split.test]
 
 
-def unfitted(mean: str = "zero") -> forcegp.StructuredGP:
+def unfitted(mean: str = "zero") -> StructuredFit:
     """A structured GP with default priors on the paper's task."""
     return forcegp.StructuredGP(forcegp.load_scene("kuka_plane").system(), mean=mean)
 
 
-def start_of(data: forcegp.Dataset) -> tuple[forcegp.StructuredGP, Problem, dict[str, Tensor]]:
+def start_of(data: forcegp.Dataset) -> tuple[StructuredFit, Problem, dict[str, Tensor]]:
     system = forcegp.load_scene("kuka_plane").system()
     # The dense formula is the paper's, kernel included.
     model = forcegp.StructuredGP(system, force_priors=default_priors(system, "zero", PAPER))

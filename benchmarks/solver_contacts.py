@@ -27,7 +27,7 @@ from forcegp.data import Dataset
 from forcegp.files import write_text
 from forcegp.logs import import_log
 from forcegp.models.registry import create
-from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.paper.foreign_log import mapping_of, write_foreign_log
 from forcegp.paper.real_contact import MODEL, rows_right, selected
 from forcegp.scene import load_scene
@@ -103,7 +103,7 @@ def recorded(case: Case, seed: int) -> tuple[ConstrainedSystem, Dataset]:
     return system, log.replace(header=log.header.model_copy(update={"robot_fingerprint": None}))
 
 
-def scores(model: StructuredGP, test: Dataset) -> dict[str, float]:
+def scores(model: StructuredFit, test: Dataset) -> dict[str, float]:
     """Bias, standard deviation and correlation of the normal force where the contact is closed; coverage."""
     (name,) = model.system.contact_names
     closed = test.contact[name]
@@ -132,11 +132,11 @@ def run(case: Case, seed: int) -> dict[str, float]:
         log = import_log(folder / "run.csv", system, folder / "mapping.toml").data
     train, test = selected(log, truth, system)
     model = create(MODEL, system)
-    assert isinstance(model, StructuredGP)
+    assert isinstance(model, StructuredFit)
     began = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model.fit(train)
+        model = model.fit(train)
     seconds = time.perf_counter() - began
     return {"rows_right": rows_right(log, truth, system), **scores(model, test), "fit_seconds": seconds}
 

@@ -74,7 +74,7 @@ def walks() -> dict[str, dict[str, Any]]:
     """The four walks."""
     log = _log(1.0)
     chosen = log[select_points(log, POINTS)]
-    model = StructuredGP(load_scene("kuka_plane").system(), mean="analytical", noise_std=0.1)
+    model = StructuredGP(load_scene("kuka_plane").system(), mean="analytical", noise=0.1)
     calls: dict[str, Callable[[], Any]] = {
         "system": lambda: load_scene("kuka_plane").system(),
         "fit": lambda: model.fit(chosen),

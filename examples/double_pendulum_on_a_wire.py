@@ -47,7 +47,7 @@ def log(system: forcegp.ConstrainedSystem, duration: float) -> forcegp.Dataset:
 train, test = log(free, 4.0)[::10], log(wire, 2.0)
 
 # %% A prior on the friction of each joint, fitted to 40 samples of free motion
-fit = forcegp.StructuredGP(free, "analytical", [forcegp.JointFrictionPrior()], noise_std=0.1).fit(train)
+fit = forcegp.StructuredGP(free, "analytical", [forcegp.JointFrictionPrior()], noise=0.1).fit(train)
 
 # %% The force of the wire, and whether the predicted accelerations keep the bead on it
 force = fit.predict(test.q, test.qd, test.tau, "multiplier", system=wire)

@@ -43,16 +43,16 @@ prior = forcegp.OperatorForcePrior(
     "mass", 1, weight, lambda system, at: {"one": torch.zeros_like(at.q[:, :1])}, Constant(group=1)
 )
 model = forcegp.StructuredGP(
-    system, "analytical", [prior], noise_std=0.01, torque_noise=0.5, inference="sparse"
+    system, "analytical", [prior], noise=forcegp.Noise(acceleration=0.01, torque=0.5), inference="sparse"
 )
-model.fit(data[:50], learn=[])
+model = model.fit(data[:50], learn=[])
 
 # %% Follow the log, ten samples at a time
 found = []
 for first in range(50, len(data), 10):
     now = data[first : first + 10]
-    model.forget(math.exp(-10 * DT / MEMORY))
-    model.update(now)
+    model = model.forget(math.exp(-10 * DT / MEMORY))
+    model = model.update(now)
     q, qd, tau = now.q[-1:], now.qd[-1:], now.tau[-1:]
     force = model.predict(q, qd, tau, "joint_force")
     E = -9.81 * kinematics.point_jacobian(system.robot, q, "tip")[0, 2]

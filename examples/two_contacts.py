@@ -54,7 +54,7 @@ data = forcegp.Dataset(
 
 # %% Learn the friction from 40 samples of two seconds; predict both forces in the third
 train, test = data[:400:10], data[400:]
-model = forcegp.StructuredGP(system, "analytical", [forcegp.JointFrictionPrior()], noise_std=0.1)
+model = forcegp.StructuredGP(system, "analytical", [forcegp.JointFrictionPrior()], noise=0.1)
 fit = model.fit(train)
 force = fit.predict(test.q, test.qd, test.tau, "multiplier")
 file = forcegp.AnalyticalModel(system).predict(test.q, test.qd, test.tau, "multiplier")

@@ -56,7 +56,7 @@ def test_names_of_a_robot_file_are_text() -> None:
 
 
 def test_a_fit_says_how_it_went() -> None:
-    model = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1)
+    model = forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1)
     assert repr(model).endswith("not fitted>")
     fit = model.fit(logged(two_contacts(), 8), learn=[])
     assert repr(fit) == (
@@ -86,7 +86,7 @@ def test_a_fit_shows_its_progress_in_a_notebook(monkeypatch: pytest.MonkeyPatch)
 
     shell = types.SimpleNamespace(get_ipython=object, display=types.SimpleNamespace(display=display))
     monkeypatch.setitem(sys.modules, "IPython", shell)
-    fit = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1).fit(
+    fit = forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1).fit(
         logged(two_contacts(), 8), progress=FitBar()
     )
     assert len(outputs) == 1

@@ -58,8 +58,8 @@ def test_other_threads_and_later_calls_keep_their_number() -> None:
 
 def test_threads_that_predict_get_the_same_numbers() -> None:
     system = table_system()
-    model = forcegp.StructuredGP(system, noise_std=0.1)
-    model.fit(random_data(system, 12), options=forcegp.LearningOptions(max_evaluations=2))
+    model = forcegp.StructuredGP(system, noise=0.1)
+    model = model.fit(random_data(system, 12), options=forcegp.LearningOptions(max_evaluations=2))
     test = random_data(system, 20, seed=1)
     alone = model.predict(test.q, test.qd, test.tau)
     found: list[forcegp.Prediction | BaseException] = []

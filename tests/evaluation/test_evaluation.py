@@ -149,14 +149,18 @@ def test_everything_fits_into_json() -> None:
 
 
 def test_a_structured_gp_with_learned_noise_is_held_against_that() -> None:
-    model = forcegp.StructuredGP(system, mean="analytical", learn_noise=True, noise_std=0.3)
-    model.fit(data[:30], options=LearningOptions(max_evaluations=12))
+    model = forcegp.StructuredGP(
+        system,
+        mean="analytical",
+        noise=forcegp.Noise(learn=True, acceleration=0.3),
+    )
+    model = model.fit(data[:30], options=LearningOptions(max_evaluations=12))
     found = evaluate(model, data[40:60])
     learned = model.hyperparameters["noise.0.log_noise_std"].exp()
     assert found.noise_std == pytest.approx(learned.tolist())
     assert max(found.noise_std or ()) < 0.29
     # A fit is held against the same noise as the model that contains it.
-    assert evaluate(model.fitted, data[40:60]).uncertainty == found.uncertainty
+    assert evaluate(model, data[40:60]).uncertainty == found.uncertainty
 
 
 def test_wrong_use_is_refused() -> None:

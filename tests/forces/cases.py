@@ -88,11 +88,11 @@ def conditioned(
     """A model with hyperparameters drawn at random around the start, conditioned, nothing learned."""
     settings = {"mean": "analytical", "force_priors": all_priors(), **settings}
     model = forcegp.StructuredGP(two_contacts(), **settings)  # type: ignore[arg-type]
-    model.fit(observations, learn=["noise"], options=forcegp.LearningOptions(max_evaluations=1))
+    model = model.fit(observations, learn=["noise"], options=forcegp.LearningOptions(max_evaluations=1))
     generator = torch.Generator().manual_seed(seed)
     values = {}
     for key, value in model.hyperparameters.items():
         step = 0.4 * torch.randn(value.shape, generator=generator, dtype=torch.float64)
         values[key] = value.clamp(min=-3.0) + step if "noise" not in key else value
-    model.condition(observations, values)
+    model = model.condition(observations, values)
     return model

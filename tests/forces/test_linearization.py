@@ -42,13 +42,13 @@ def test_jacobians_are_central_differences(kind: str) -> None:
     system, active = two_contacts(), mixed_contacts(STATES)
     data = logged(system, 30)
     if kind == "analytical":
-        fit = forcegp.AnalyticalModel(system).fitted
+        fit = forcegp.AnalyticalModel(system)
     elif kind == "measured":
         priors = measured_priors(system)
         fit = forcegp.StructuredGP(system, "analytical", priors, 0.1).fit(data, learn=[])
     else:
         inference = "sparse" if kind == "sparse" else "exact"
-        fit = forcegp.StructuredGP(system, "zero", noise_std=0.1, inference=inference).fit(data, learn=[])
+        fit = forcegp.StructuredGP(system, "zero", noise=0.1, inference=inference).fit(data, learn=[])
     q, qd, tau = draw(STATES, 7)
     at = fit.linearize(q, qd, tau, active=active)
     assert torch.allclose(at.qdd, fit.predict(q, qd, tau, active=active, covariance=False).mean)

@@ -95,7 +95,7 @@ def test_a_simulated_log_keeps_the_smooth_prior(file: forcegp.RobotModel) -> Non
     data = log(file, 40, 0)
     simulated = data.replace(header=data.header.model_copy(update={"seed": 3}))
     model = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical")
-    model.fit(simulated, learn=[])
+    model = model.fit(simulated, learn=[])
     assert [prior.name for prior in model.force_priors] == ["joint"]
 
 

@@ -53,7 +53,7 @@ def test_other_quantities_have_no_state_noise() -> None:
 
 def model(**settings: object) -> forcegp.StructuredGP:
     return forcegp.StructuredGP(
-        two_contacts(), "analytical", [forcegp.JointForcePrior()], noise_std=0.1, **settings
+        two_contacts(), "analytical", [forcegp.JointForcePrior()], noise=0.1, **settings
     )  # type: ignore[arg-type]
 
 

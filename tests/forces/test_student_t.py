@@ -27,8 +27,7 @@ def test_likelihood_with_weights_is_the_dense_one() -> None:
         two_contacts(),
         "analytical",
         [forcegp.JointForcePrior()],
-        noise_std=0.1,
-        torque_noise=tuple(std.tolist()),
+        noise=forcegp.Noise(acceleration=0.1, torque=tuple(std.tolist())),
         inference="exact",
     )
     fit = model.fit(logged(two_contacts(), N), learn=[])
@@ -65,9 +64,12 @@ def error(impacts: bool, degrees: float | None) -> tuple[float, forcegp.Structur
     system, data = with_friction(impacts)
     priors = [forcegp.JointFrictionPrior(load=False)]
     model = forcegp.StructuredGP(
-        system, "analytical", priors, noise_std=0.1, torque_noise=None, degrees_of_freedom=degrees
+        system,
+        "analytical",
+        priors,
+        noise=forcegp.Noise(acceleration=0.1, torque=None, degrees_of_freedom=degrees),
     )
-    model.fit(data)
+    model = model.fit(data)
     q, qd, tau = torch.randn(3, 300, 2, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     truth = system.equations(q, qd).Q_K + tau - 0.8 * torch.tanh(qd / 0.02) - 0.3 * qd
     return float((model.predict(q, qd, tau, "joint_force").mean - truth).abs().mean()), model
@@ -83,7 +85,7 @@ def test_planted_impacts_hardly_count(tmp_path: Path) -> None:
     weights = model.training.weights[0]
     assert float(weights[::EVERY].max()) < 0.1
     assert float(weights.median()) > 0.8
-    assert any("hardly count" in warning for warning in model.fitted.result.warnings)
+    assert any("hardly count" in warning for warning in model.result.warnings)
     model.save(tmp_path / "model")
     again = forcegp.load_model(tmp_path / "model")
     q, qd, tau = torch.randn(3, 5, 2, dtype=torch.float64)
@@ -102,4 +104,4 @@ def test_without_impacts_little_is_lost() -> None:
 @pytest.mark.parametrize("degrees", [2.0, -1.0, float("nan")])
 def test_degrees_that_are_not_valid(degrees: float) -> None:
     with pytest.raises(ModelError, match="degrees of freedom"):
-        forcegp.StructuredGP(two_contacts(), degrees_of_freedom=degrees)
+        forcegp.StructuredGP(two_contacts(), noise=forcegp.Noise(degrees_of_freedom=degrees))

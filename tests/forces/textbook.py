@@ -14,7 +14,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.quantities import affine_map, states
 from forcegp.gp.kernels import Kernel, Linear, Product, SquaredExponential, Stationary, Sum, sub
-from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_fit import StructuredFit
 
 
 def covariance(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict) -> Tensor:
@@ -62,7 +62,7 @@ class Textbook:
 
     def __init__(
         self,
-        model: StructuredGP,
+        model: StructuredFit,
         params: dict[str, Tensor] | None = None,
         system: ConstrainedSystem | None = None,
     ) -> None:

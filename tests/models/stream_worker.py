@@ -22,8 +22,7 @@ def model(inference: str = "sparse") -> forcegp.StructuredGP:
         two_contacts(),
         "analytical",
         [JointFrictionPrior()],
-        noise_std=0.1,
-        torque_noise=0.2,
+        noise=forcegp.Noise(acceleration=0.1, torque=0.2),
         inference=inference,
     )
 

@@ -61,7 +61,7 @@ def test_several_quantities_and_any_batch(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_mass_and_damping_are_found_again() -> None:
     names = ("lbr_iiwa_joint_6", "lbr_iiwa_joint_7")
-    model = AnalyticalModel(system, learn={"mass": names, "damping": names}, seed=3)
+    model = AnalyticalModel(system, analytical_parameters={"mass": names, "damping": names}, seed=3)
     result = model.fit(frictionless, options=LBFGS)
     assert result.converged and result.history[0] > 10.0 * result.objective
     robot, true = model.system.robot, system.robot
@@ -90,8 +90,8 @@ def test_every_link_is_learned_and_stays_physical(options: LearningOptions | Bat
 
 def test_the_start_is_random_wide_and_repeatable() -> None:
     def start(seed: int, window: Window) -> torch.Tensor:
-        model = AnalyticalModel(system, learn={"mass": "all"}, seed=seed, window=window)
-        model.fit(frictionless, options=LearningOptions("lbfgs", max_evaluations=1))
+        model = AnalyticalModel(system, analytical_parameters={"mass": "all"}, seed=seed, window=window)
+        model = model.fit(frictionless, options=LearningOptions("lbfgs", max_evaluations=1))
         return model.system.robot.mass / system.robot.mass
 
     wide = start(0, Window(relative=1.0))
@@ -103,7 +103,7 @@ def test_the_start_is_random_wide_and_repeatable() -> None:
 
 def test_wrong_use_is_refused() -> None:
     with pytest.raises(UnknownNameError, match="'weight'"):
-        AnalyticalModel(system, learn={"weight": "all"})
+        AnalyticalModel(system, analytical_parameters={"weight": "all"})
     with pytest.raises(ModelError, match="no samples to learn from"):
         AnalyticalModel(system).fit(frictionless[:0])
     with pytest.raises(ModelError, match="epochs of training"):

@@ -20,12 +20,13 @@ from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.gp import kernels
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
 from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
-from forcegp.models.analytical import ADAM, AnalyticalModel, Window
+from forcegp.models.analytical import ADAM, AnalyticalFit, AnalyticalModel, Window
 from forcegp.models.configured import COMMON, KEYS, Configured, configured
-from forcegp.models.independent_gp import IndependentGP
+from forcegp.models.independent_gp import IndependentFit, IndependentGP
 from forcegp.models.minibatch import BatchOptions
-from forcegp.models.neural import SHALLOW, NeuralNetwork
+from forcegp.models.neural import SHALLOW, NetworkFit, NeuralNetwork
 from forcegp.models.registry import MODELS
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
@@ -115,15 +116,15 @@ hyperpriors = false
 
 def test_the_other_models(made) -> None:
     network = made('name = "nn"\nhidden = [30, 20]\nseed = 4\n[model.learning]\nepochs = 7\n')
-    assert isinstance(network.model, NeuralNetwork) and network.model.hidden == (30, 20)
+    assert isinstance(network.model, NetworkFit) and network.model.hidden == (30, 20)
     assert network.model.seed == 4
     assert network.options == BatchOptions(7, SHALLOW.batch, SHALLOW.learning_rate, patience=SHALLOW.patience)
     independent = made('name = "gp"\nnoise_std = 0.3\n[model.learning]\nmax_evaluations = 5\n')
-    assert isinstance(independent.model, IndependentGP) and independent.model.noise_std == 0.3
+    assert isinstance(independent.model, IndependentFit) and independent.model.noise_std == 0.3
     assert independent.options == LearningOptions(max_evaluations=5)
     text = 'name = "analytical"\nanalytical = { friction = "all" }\nwindow = { relative = 0.2 }\n'
     analytical = made(text + "[model.learning]\nbatch = 64\n").model
-    assert isinstance(analytical, AnalyticalModel)
+    assert isinstance(analytical, AnalyticalFit)
     assert list(analytical.parameters.joints) == ["friction"] and analytical.window == Window(relative=0.2)
     assert made(text + "[model.learning]\nbatch = 64\n").options == BatchOptions(
         ADAM.epochs, 64, ADAM.learning_rate, patience=ADAM.patience
@@ -228,7 +229,7 @@ def test_the_template_is_valid_and_shows_every_key() -> None:
     for name in (*ModelSection.model_fields, *LearningSection.model_fields):
         assert re.search(rf"\b{name}\b", text), name
     found = configured(load_model_table(path), load_scene(ROOT / "scenes" / "kuka_sphere.toml").system())
-    assert isinstance(found.model, StructuredGP)
+    assert isinstance(found.model, StructuredFit)
     assert [type(prior) for prior in found.model.force_priors][-1] is SlidingFrictionPrior
 
 

@@ -27,8 +27,8 @@ OPTIONS: dict[str, object] = {"nn": BatchOptions(epochs=2)}
 
 
 def fitted(name: str) -> Model:
-    model = create(name, system, noise_std=0.1, seed=2)
-    model.fit(data, options=OPTIONS.get(name, SHORT))  # type: ignore[call-arg]
+    model = create(name, system, noise=0.1, seed=2)
+    model = model.fit(data, options=OPTIONS.get(name, SHORT))  # type: ignore[call-arg]
     return model
 
 
@@ -200,7 +200,7 @@ def test_inputs_of_a_sparse_model_keep_their_order(tmp_path: Path, monkeypatch: 
     """A file does not keep the order of its tensors; kernels that read all inputs depend on theirs."""
     priors = [forcegp.JointForcePrior()]
     model = forcegp.StructuredGP(system, "analytical", priors, 0.1, inference="sparse")
-    model.fit(data, options=SHORT)
+    model = model.fit(data, options=SHORT)
     model.save(tmp_path / "model")
     expected = model.predict(test.q, test.qd, test.tau).mean
     read = safetensors.torch.load

@@ -12,6 +12,7 @@ from forcegp import LearningOptions, Observation
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.normal_force import NormalForcePrior
+from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 
 SHORT = LearningOptions(max_evaluations=3)
@@ -23,12 +24,12 @@ def theta() -> forcegp.AnalyticalParameters:
     return forcegp.AnalyticalParameters(robot, {"mass": robot.joint_names[-2:]})
 
 
-def model(**settings: object) -> forcegp.StructuredGP:
+def model(**settings: object) -> StructuredFit:
     return forcegp.StructuredGP(
         two_contacts(),
         "analytical",
         [JointForcePrior(), ContactForcePrior("table")],
-        noise_std=0.1,
+        noise=0.1,
         **settings,  # type: ignore[arg-type]
     )
 
@@ -54,8 +55,8 @@ def test_a_loaded_model_goes_on_learning_analytical_parameters(tmp_path: Path) -
     mass = one.fit(data, learn=["analytical"], options=SHORT).system.robot.mass
     one.save(tmp_path / "model")
     read = forcegp.load_model(tmp_path / "model")
-    assert isinstance(read, forcegp.StructuredGP)
-    assert torch.equal(read.fitted.system.robot.mass, mass)
+    assert isinstance(read, StructuredFit)
+    assert torch.equal(read.system.robot.mass, mass)
     again = read.fit(data, learn=["analytical"], options=LearningOptions(max_evaluations=10))
     assert not torch.equal(again.system.robot.mass, mass)
 
@@ -66,9 +67,9 @@ def test_a_fit_stays_as_it_is() -> None:
     first = one.fit(data, learn=[])
     q, qd, tau = draw(3)
     before = first.predict(q, qd, tau, active=mixed_contacts(3)).mean
-    one.fit(data[:6], options=SHORT)
+    one = one.fit(data[:6], options=SHORT)
     assert torch.equal(first.predict(q, qd, tau, active=mixed_contacts(3)).mean, before)
-    assert one.fitted is not first
+    assert one is not first
     with pytest.raises(AttributeError):
         first.system = two_contacts()  # type: ignore[misc]
 
@@ -82,7 +83,7 @@ def test_the_normal_force_is_no_contact_friction() -> None:
     q, qd, tau = draw(4, seed=5)
     read = {}
     for name, one in (("bare", bare), ("normal", normal)):
-        one.fit(data, learn=[])
+        one = one.fit(data, learn=[])
         read[name] = {
             quantity: one.predict(q, qd, tau, quantity, active=mixed_contacts(4)).covariance
             for quantity in ("contact_friction", "qdd", "multiplier")
@@ -90,7 +91,7 @@ def test_the_normal_force_is_no_contact_friction() -> None:
     for quantity in ("contact_friction", "qdd"):
         torch.testing.assert_close(read["bare"][quantity], read["normal"][quantity])
     assert bool((read["normal"]["multiplier"][0] > read["bare"]["multiplier"][0]).any())
-    assert normal.fitted.force_correlation == pytest.approx(bare.fitted.force_correlation, abs=1e-9)
+    assert normal.force_correlation == pytest.approx(bare.force_correlation, abs=1e-9)
 
 
 def test_the_correlation_does_not_depend_on_the_order_of_observations() -> None:
@@ -107,7 +108,7 @@ def test_an_undetermined_multiplier_is_a_warning() -> None:
     """Free joint forces of any size along the normal leave the multiplier open."""
     closed = data[data.active(two_contacts().contact_names)[:, 0].nonzero()[:, 0]]
     wide = {"joint.log_std": torch.full((7,), 12.0, dtype=torch.float64)}
-    one = forcegp.StructuredGP(two_contacts(), "analytical", [JointForcePrior()], noise_std=0.1)
+    one = forcegp.StructuredGP(two_contacts(), "analytical", [JointForcePrior()], noise=0.1)
     quiet = one.fit(closed, learn=[])
     assert not any("multiplier" in warning for warning in quiet.result.warnings)
     loud = one.condition(closed, {**quiet.hyperparameters, **wide})

@@ -10,6 +10,7 @@ import torch
 import forcegp
 from forcegp.errors import ModelError
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 
 SAME = 1e-8
@@ -17,13 +18,12 @@ SAME = 1e-8
 data = logged(two_contacts(), 24)
 
 
-def model(inference: str = "sparse") -> forcegp.StructuredGP:
+def model(inference: str = "sparse") -> StructuredFit:
     return forcegp.StructuredGP(
         two_contacts(),
         "analytical",
         [JointFrictionPrior()],
-        noise_std=0.1,
-        torque_noise=0.2,
+        noise=forcegp.Noise(acceleration=0.1, torque=0.2),
         inference=inference,
     )
 
@@ -32,8 +32,8 @@ def model(inference: str = "sparse") -> forcegp.StructuredGP:
 def test_an_update_is_a_refit(inference: str, tmp_path: Path) -> None:
     reference, grown = model(inference), model(inference)
     for one in (reference, grown):
-        one.fit(data[:16], learn=[])
-    reference.condition(data)  # keeps the input scales of the first samples, as an update does
+        one = one.fit(data[:16], learn=[])
+    reference = reference.condition(data)  # keeps the input scales of the first samples, as an update does
     grown.update(data[16:20])
     grown.update(data[20:])
     grown.save(tmp_path / "grown")
@@ -58,12 +58,12 @@ def test_forgetting_returns_to_the_prior() -> None:
 
 def test_what_cannot_be_updated() -> None:
     exact = model("exact")
-    exact.fit(data, learn=[])
+    exact = exact.fit(data, learn=[])
     with pytest.raises(ModelError, match="exact inference cannot forget"):
-        exact.forget(0.5)
+        exact = exact.forget(0.5)
     sparse = model()
-    sparse.fit(data, learn=[])
+    sparse = sparse.fit(data, learn=[])
     with pytest.raises(ModelError, match="invalid forgetting factor"):
-        sparse.forget(0.0)
+        sparse = sparse.forget(0.0)
     with pytest.raises(ModelError, match="measures other quantities"):
-        sparse.update([forcegp.Observation(data[:2], "multiplier", 1.0)])
+        sparse = sparse.update([forcegp.Observation(data[:2], "multiplier", 1.0)])

@@ -13,6 +13,7 @@ import torch
 
 import forcegp
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.models.structured_fit import StructuredFit
 from random_data import random_data, table_system
 
 DATA = random_data(table_system(), 12)
@@ -28,14 +29,14 @@ def pool() -> Iterator[ProcessPoolExecutor]:
             yield workers
 
 
-def predicted(model: forcegp.StructuredGP, quantity: str) -> torch.Tensor:
+def predicted(model: StructuredFit, quantity: str) -> torch.Tensor:
     """What a worker predicts, as a tensor that is sent back by value."""
     return model.predict(DATA.q, DATA.qd, DATA.tau, quantity).mean.clone()
 
 
 def test_a_worker_predicts_the_same_bits_and_raises_the_same_error(pool: ProcessPoolExecutor) -> None:
-    model = forcegp.StructuredGP(table_system(), noise_std=0.1)
-    model.fit(DATA, options=FEW)
+    model = forcegp.StructuredGP(table_system(), noise=0.1)
+    model = model.fit(DATA, options=FEW)
     here = predicted(model, "qdd")
     assert pool.submit(predicted, model, "qdd").result(timeout=120).tolist() == here.tolist()
     with pytest.raises(ForceGPError, match="unknown quantity") as there:

@@ -51,7 +51,7 @@ def test_noise_seed_and_options_arrive() -> None:
     assert isinstance(analytical, forcegp.AnalyticalModel)
     assert analytical.seed == 6 and set(analytical.parameters.joints) == {"mass"}
     for name in ("gp", "sgp-zero", "sgp-mean", "sgp-contact"):
-        assert create(name, system, noise_std=0.3).noise_std == 0.3  # type: ignore[attr-defined]
+        assert create(name, system, noise=0.3).noise_std == 0.3  # type: ignore[attr-defined]
 
 
 def test_an_unknown_name_lists_the_models() -> None:

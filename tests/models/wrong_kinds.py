@@ -16,8 +16,8 @@ from raw_errors import outcomes
 SYSTEM = table_system()
 DATA = random_data(SYSTEM, 8)
 Q, QD, TAU = DATA.q, DATA.qd, DATA.tau
-MODEL = forcegp.StructuredGP(SYSTEM, noise_std=0.1)
-MODEL.fit(DATA, options=forcegp.LearningOptions(max_evaluations=1))
+MODEL = forcegp.StructuredGP(SYSTEM, noise=0.1)
+MODEL = MODEL.fit(DATA, options=forcegp.LearningOptions(max_evaluations=1))
 ROBOT = SYSTEM.robot
 
 
@@ -41,8 +41,8 @@ CALLS = {
     "noise_std=text": lambda: fit_with(noise_std="loud"),
     "noise_std=negative": lambda: fit_with(noise_std=-0.1),
     "noise_std=[None]": lambda: fit_with(noise_std=[None] * 7),
-    "data=list": lambda: forcegp.StructuredGP(SYSTEM, noise_std=0.1).fit([1, 2]),
-    "data=None": lambda: forcegp.StructuredGP(SYSTEM, noise_std=0.1).fit(None),
+    "data=list": lambda: forcegp.StructuredGP(SYSTEM, noise=0.1).fit([1, 2]),
+    "data=None": lambda: forcegp.StructuredGP(SYSTEM, noise=0.1).fit(None),
     "checkpoint=folder": lambda: MODEL.fit(DATA, checkpoint=tempfile.gettempdir()),
     "mass_matrix(list)": lambda: forcegp.dynamics.mass_matrix(ROBOT, [0.0] * 7),
     "frame_pose(list)": lambda: forcegp.kinematics.frame_pose(ROBOT, [0.0] * 7, ROBOT.frame_names[-1]),
@@ -55,7 +55,7 @@ def copies() -> None:
     expected = MODEL.predict(Q, QD, TAU)
     for name, copied in (
         ("pickle", lambda: pickle.loads(pickle.dumps(MODEL))),
-        ("pickle of the fit", lambda: pickle.loads(pickle.dumps(MODEL.fitted))),
+        ("pickle of the fit", lambda: pickle.loads(pickle.dumps(MODEL))),
         ("deepcopy", lambda: copy.deepcopy(MODEL)),
     ):
         found = copied().predict(Q, QD, TAU)

@@ -15,6 +15,7 @@ from matplotlib.collections import FillBetweenPolyCollection
 
 import forcegp
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.rollout.trajectory import FIELDS
 from forces.cases import logged, two_contacts
 from logs import JOINTS, random_log
@@ -31,9 +32,9 @@ def closed_figures() -> Iterator[None]:
 
 
 @cache
-def fitted() -> forcegp.StructuredGP:
-    model = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1)
-    model.fit(logged(two_contacts(), 12), learn=[])
+def fitted() -> StructuredFit:
+    model = forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1)
+    model = model.fit(logged(two_contacts(), 12), learn=[])
     return model
 
 

@@ -16,6 +16,7 @@ from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import Model
 from forcegp.models.registry import create
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.rollout_data import RolloutData, rollout_data
 from forcegp.report.rollouts import PAGE, animation_source, write_rollouts
@@ -41,9 +42,9 @@ def log() -> Dataset:
 
 
 @cache
-def fitted(mean: str = "analytical") -> StructuredGP:
-    model = StructuredGP(arm(Baumgarte()), mean=mean, noise_std=0.1)
-    model.fit(log()[torch.arange(0, 288, 7)], options=LearningOptions(max_evaluations=15))
+def fitted(mean: str = "analytical") -> StructuredFit:
+    model = StructuredGP(arm(Baumgarte()), mean=mean, noise=0.1)
+    model = model.fit(log()[torch.arange(0, 288, 7)], options=LearningOptions(max_evaluations=15))
     return model
 
 
@@ -132,8 +133,8 @@ def test_a_contact_that_is_open_is_lost() -> None:
 
 @pytest.mark.parametrize("name", ["gp", "nn"])
 def test_a_model_of_accelerations_stays_on_its_own_system(name: str) -> None:
-    data, model = log(), create(name, arm(Baumgarte()), noise_std=0.1)
-    model.fit(data[torch.arange(0, 288, 24)])
+    data, model = log(), create(name, arm(Baumgarte()), noise=0.1)
+    model = model.fit(data[torch.arange(0, 288, 24)])
     free = ConstrainedSystem(model.system.robot)
     with pytest.raises(ModelError, match="predicts accelerations of the system that it was fitted on"):
         model.rollout(data.q[0], data.qd[0], data, 0.02, system=free)

@@ -34,9 +34,9 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
     root, found = tmp_path_factory.mktemp("models"), {}
     for name in ("nn", "gp", "sgp-mean"):
-        model = create(name, SYSTEM, noise_std=0.1, seed=2)
+        model = create(name, SYSTEM, noise=0.1, seed=2)
         options = BatchOptions(epochs=1) if name == "nn" else LearningOptions(max_evaluations=1)
-        model.fit(DATA, options=options)  # type: ignore[call-arg]
+        model = model.fit(DATA, options=options)  # type: ignore[call-arg]
         model.save(root / name)
         found[name] = root / name
     return found

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 import forcegp
 from forcegp.cli import app
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.view.motion import Motion, at_rest, of_log, pictures, with_rollout
 from forcegp.view.page import write_view
 from forcegp.view.shapes import shapes_of
@@ -24,9 +25,9 @@ viser = pytest.importorskip("viser")
 
 
 @cache
-def fitted() -> forcegp.StructuredGP:
-    model = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1)
-    model.fit(logged(two_contacts(), 12), learn=[])
+def fitted() -> StructuredFit:
+    model = forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1)
+    model = model.fit(logged(two_contacts(), 12), learn=[])
     return model
 
 

@@ -16,7 +16,9 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.errors import ModelError
 from forcegp.forces.inference import require_double
+from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import FlatStates

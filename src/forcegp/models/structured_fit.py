@@ -20,6 +20,7 @@ from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Training
 from forcegp.forces.observations import Observation
 from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
 from forcegp.forces.samples import draw_samples
@@ -73,6 +74,11 @@ class StructuredFit(FittedModel):
     def training(self) -> Training:
         """What the posterior is conditioned on."""
         return self.problem.training
+
+    @property
+    def force_priors(self) -> tuple[ForcePrior, ...]:
+        """Priors on the unknown forces, those that were left to the data filled in."""
+        return self.posterior.priors
 
     @torch.no_grad()
     def predict(

@@ -147,7 +147,7 @@ def _fit(
     data, progress = task.train(split, points), fit_progress(advance)
     smaller = None if before is None else before.load()
     if isinstance(model, StructuredGP) and isinstance(smaller, StructuredGP):
-        result = model.fit(data, begin=smaller.hyperparameters, progress=progress, **settings)
+        result = model.fit(data, after=smaller, progress=progress, **settings)
     else:
         result = model.fit(data, progress=progress, **settings)
     model.save(folder / MODEL)
@@ -161,7 +161,7 @@ def make_model(name: str, task: Task) -> Model:
     """An unfitted model by its registry name, or one of the paper's other networks."""
     if name in NETWORKS:
         return NeuralNetwork(task.system, NETWORKS[name], task.seed)
-    return create(name, task.system, noise_std=noise_std_of(task), seed=task.seed)
+    return create(name, task.system, noise=noise_std_of(task), seed=task.seed)
 
 
 def exact_model(name: str, task: Task) -> Model:

@@ -132,10 +132,10 @@ def identify_structured(
         system.with_robot(theta.start),
         mean="analytical",
         force_priors=force_priors,
-        noise_std=noise_std,
+        noise=noise_std,
         analytical_parameters=theta,
     )
-    model.fit(data, options=_options(evaluations), progress=evaluated)
+    model = model.fit(data, options=_options(evaluations), progress=evaluated)
     return trace.run(system.robot, name, seed)
 
 

@@ -167,7 +167,7 @@ def force_of(stage: Stage, test: Dataset) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean and standard deviation of the normal force of a fitted model at states, `(n,)` each [N]."""
     model = load_model(stage / "model")
     assert isinstance(model, StructuredGP)
-    fit, active = model.fitted, test.active(model.system.contact_names)
+    fit, active = model, test.active(model.system.contact_names)
     if "multiplier" in fit.noise:
         return force_from_sensor(fit, test)
     states = test.q, test.qd, test.tau
