@@ -32,7 +32,6 @@ from forcegp.forces.priors.default import PAPER, default_priors
 from forcegp.forces.quantities import states
 from forcegp.forces.start import initial
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_learning import training_for
 from forcegp.simulate import simulate
 
@@ -51,12 +50,12 @@ def training_data(folder: Path, samples: int) -> tuple[forcegp.Dataset, forcegp.
     return data[split.train], data[split.test]
 
 
-def unfitted(mean: str = "zero") -> StructuredFit:
+def unfitted(mean: str = "zero") -> forcegp.StructuredGP:
     """A structured GP with default priors on the paper's task."""
     return forcegp.StructuredGP(forcegp.load_scene("kuka_plane").system(), mean=mean)
 
 
-def start_of(data: forcegp.Dataset) -> tuple[StructuredFit, Problem, dict[str, Tensor]]:
+def start_of(data: forcegp.Dataset) -> tuple[forcegp.StructuredGP, Problem, dict[str, Tensor]]:
     system = forcegp.load_scene("kuka_plane").system()
     # The dense formula is the paper's, kernel included.
     model = forcegp.StructuredGP(system, force_priors=default_priors(system, "zero", PAPER))
@@ -167,7 +166,7 @@ def fit_and_predict(folder: Path, samples: int, mean: str) -> dict:
     one = [x[:1] for x in (test.q, test.qd, test.tau)]
     many = (test.q, test.qd, test.tau)
     began = time.perf_counter()
-    prediction = model.predict(*many)
+    prediction = fit.predict(*many)
     all_seconds = time.perf_counter() - began
     clean, noisy = (prediction.mean - test.qdd_clean).abs(), (prediction.mean - test.qdd).abs()
     std = prediction.variance
@@ -177,8 +176,8 @@ def fit_and_predict(folder: Path, samples: int, mean: str) -> dict:
         "fit_seconds": fit_seconds,
         "evaluations": fit.evaluations,
         "converged": fit.converged,
-        "one_mean_ms": 1e3 * median_seconds(lambda: model.predict(*one, covariance=False), 50),
-        "one_covariance_ms": 1e3 * median_seconds(lambda: model.predict(*one), 5),
+        "one_mean_ms": 1e3 * median_seconds(lambda: fit.predict(*one, covariance=False), 50),
+        "one_covariance_ms": 1e3 * median_seconds(lambda: fit.predict(*one), 5),
         "thousand_seconds": all_seconds,
         "clean_mae": float(clean.mean()),
         "noisy_mae": float(noisy.mean()),

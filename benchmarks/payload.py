@@ -55,16 +55,15 @@ def error(model: StructuredFit, data: Dataset) -> float:
     return float((predicted - data.extras["qdd_clean"]).abs().mean())
 
 
-def fading(model: StructuredFit, data: Dataset) -> None:
+def fading(fit: StructuredFit, data: Dataset) -> StructuredFit:
     """Forget the payload at a constant rate."""
-    model = model.forget(math.exp(-STEP / RATE / MEMORY), priors=["payload"])
-    model = model.update(data)
+    return fit.forget(math.exp(-STEP / RATE / MEMORY), priors=["payload"]).update(data)
 
 
-WAYS: dict[str, Callable[[StructuredGP, Dataset], object]] = {
-    "frozen": lambda model, data: None,
+WAYS: dict[str, Callable[[StructuredFit, Dataset], StructuredFit]] = {
+    "frozen": lambda fit, data: fit,
     "fading memory": fading,
-    "on evidence": lambda model, data: follow(model, data, ["payload"]),
+    "on evidence": lambda fit, data: follow(fit, data, ["payload"]).fit,
 }
 
 
@@ -76,13 +75,13 @@ def measure(system: ConstrainedSystem) -> dict[str, dict[str, float]]:
     found = {}
     for name, way in WAYS.items():
         model = StructuredGP(system, "analytical", priors, noise=0.1, inference="sparse")
-        model = model.fit(known[::EVERY], learn=[])
-        before, errors, began = error(model, known[1::EVERY]), [], time.perf_counter()
+        fit = model.fit(known[::EVERY], learn=[])
+        before, errors, began = error(fit, known[1::EVERY]), [], time.perf_counter()
         for first in range(0, int(1.5 * RATE), STEP):
-            errors.append(error(model, loaded[first : first + STEP]))
-            way(model, loaded[first : first + STEP])
+            errors.append(error(fit, loaded[first : first + STEP]))
+            fit = way(fit, loaded[first : first + STEP])
         per = 1e3 * (time.perf_counter() - began) / len(errors)
-        latent, one = model.posterior.latent, {"one": torch.zeros(1, 1, dtype=torch.float64)}
+        latent, one = fit.posterior.latent, {"one": torch.zeros(1, 1, dtype=torch.float64)}
         mass = float(latent.latent_mean(len(priors) - 1, one)[0, 0])
         found[name] = {
             "before": before,

@@ -51,10 +51,8 @@ def model_and_run(points: int, seconds: float) -> tuple[StructuredFit, Dataset, 
     system = load_scene("kuka_plane").system()
     train = simulate(system, SimulationConfig(duration=max(10.0, points / 20.0), seed=1)).data
     chosen = train[select_points(train, points)]
-    model = StructuredGP(system, mean="analytical", noise=0.1)
-    model = model.fit(chosen[:DRIFT_POINTS])
-    model = model.condition(chosen)
-    return model, chosen, simulate(system, _test_run(seconds))
+    fit = StructuredGP(system, mean="analytical", noise=0.1).fit(chosen[:DRIFT_POINTS])
+    return fit.condition(chosen), chosen, simulate(system, _test_run(seconds))
 
 
 def _test_run(seconds: float) -> SimulationConfig:

@@ -132,13 +132,13 @@ def run(case: Case, seed: int) -> dict[str, float]:
         log = import_log(folder / "run.csv", system, folder / "mapping.toml").data
     train, test = selected(log, truth, system)
     model = create(MODEL, system)
-    assert isinstance(model, StructuredFit)
     began = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model = model.fit(train)
+        fit = model.fit(train)
     seconds = time.perf_counter() - began
-    return {"rows_right": rows_right(log, truth, system), **scores(model, test), "fit_seconds": seconds}
+    assert isinstance(fit, StructuredFit)
+    return {"rows_right": rows_right(log, truth, system), **scores(fit, test), "fit_seconds": seconds}
 
 
 def main() -> None:

@@ -57,7 +57,7 @@ train, test = data[:400:10], data[400:]
 model = forcegp.StructuredGP(system, "analytical", [forcegp.JointFrictionPrior()], noise=0.1)
 fit = model.fit(train)
 force = fit.predict(test.q, test.qd, test.tau, "multiplier")
-file = forcegp.AnalyticalModel(system).predict(test.q, test.qd, test.tau, "multiplier")
+file = forcegp.AnalyticalModel(system).nominal().predict(test.q, test.qd, test.tau, "multiplier")
 for i, name in enumerate(system.contact_names):
     true = test.multiplier[name]
     error, before = (force.mean[:, i] - true).abs(), (file.mean[:, i] - true).abs()

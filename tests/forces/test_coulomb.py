@@ -143,7 +143,7 @@ def test_accelerations_follow_from_the_force_field() -> None:
 
 def test_gradient_for_the_friction() -> None:
     priors = [JointFrictionPrior(), SlidingFrictionPrior("table", coupled=True)]
-    model = forcegp.StructuredGP(two_contacts(), "analytical", priors, 0.1, noise=forcegp.Noise(torque=0.3))
+    model = forcegp.StructuredGP(two_contacts(), "analytical", priors, forcegp.Noise(0.1, torque=0.3))
     fit = model.fit(logged(two_contacts(), 8), learn=[])
     problem = dataclasses.replace(fit.problem, inducing=None)
     keys = coulomb_keys("table")

@@ -33,7 +33,7 @@ def two_runs() -> forcegp.Dataset:
     return data.replace(t=0.1 * (torch.arange(N, dtype=torch.float64) - 6 * SEGMENT), segment=SEGMENT)
 
 
-def model(priors: list, **settings: Any) -> StructuredFit:
+def model(priors: list, **settings: Any) -> forcegp.StructuredGP:
     return forcegp.StructuredGP(
         two_contacts(), "analytical", priors, noise=forcegp.Noise(acceleration=0.1, torque=None), **settings
     )
@@ -41,13 +41,11 @@ def model(priors: list, **settings: Any) -> StructuredFit:
 
 def conditioned(others: list) -> StructuredFit:
     """With a disturbance of `STD` and `TIME` at every joint."""
-    found = model([*others, DisturbancePrior()])
-    found = found.fit(two_runs(), learn=[])
+    found = model([*others, DisturbancePrior()]).fit(two_runs(), learn=[])
     values = dict(found.hyperparameters)
     values["disturbance.log_std"] = torch.full((7,), math.log(STD), dtype=torch.float64)
     values["disturbance.log_time"] = torch.full((7,), math.log(TIME), dtype=torch.float64)
-    found = found.condition(two_runs(), values)
-    return found
+    return found.condition(two_runs(), values)
 
 
 def dense(B: Tensor) -> Tensor:
@@ -58,8 +56,8 @@ def dense(B: Tensor) -> Tensor:
 
 
 def test_likelihood_is_the_dense_one() -> None:
-    found, plain = conditioned([JointFrictionPrior()]), model([JointFrictionPrior()], inference="exact")
-    plain = plain.fit(two_runs(), learn=[])
+    found = conditioned([JointFrictionPrior()])
+    plain = model([JointFrictionPrior()], inference="exact").fit(two_runs(), learn=[])
     plain = plain.condition(two_runs(), {k: v for k, v in found.hyperparameters.items() if "friction" in k})
     y, noise, maps = (book := Textbook(plain)).data()
     m = found.training.measurements[0]

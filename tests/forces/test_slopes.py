@@ -80,11 +80,13 @@ def measured(seed: int, samples: int = SAMPLES, noisy: bool = True) -> tuple[for
     return forcegp.Dataset(t, q, qd, tau, truth + 0.1 * normal[5], system.robot.joint_names), truth
 
 
-def fitted(seed: int, mean: str = "analytical", **settings: object) -> StructuredFit:
-    given = {"noise_std": 0.1, "torque_noise": None, "state_noise": (Q_STD, QD_STD), **settings}
-    model = forcegp.StructuredGP(pendulum(), mean, **given)  # type: ignore[arg-type]
-    model = model.fit(measured(seed)[0])
-    return model
+def model(mean: str = "analytical", inference: str = "auto") -> forcegp.StructuredGP:
+    noise = forcegp.Noise(0.1, torque=None, state=(Q_STD, QD_STD))
+    return forcegp.StructuredGP(pendulum(), mean, noise=noise, inference=inference)
+
+
+def fitted(seed: int, mean: str = "analytical", inference: str = "auto") -> StructuredFit:
+    return model(mean, inference).fit(measured(seed)[0])
 
 
 def error_of(model: StructuredFit, seed: int) -> float:
@@ -144,7 +146,7 @@ def test_forces_without_slopes_are_told(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_fit_that_learns_nothing_conditions_as_it_was_learned() -> None:
-    model, more = fitted(1), measured(8, 20)[0]
-    value = model.condition(more).log_marginal_likelihood
-    again = fitted(1).fit(more, learn=[])
+    fit, more = fitted(1), measured(8, 20)[0]
+    value = fit.condition(more).log_marginal_likelihood
+    again = model().fit(more, learn=[], after=fit)
     assert again.training.slopes is not None and again.log_marginal_likelihood == value

@@ -49,7 +49,7 @@ def test_likelihood_with_torque_noise_is_the_dense_one(priors: list) -> None:
         inference="exact",
     )
     fit = model.fit(logged(two_contacts(), 8), learn=[])
-    y, noise, maps = (book := Textbook(model)).data()
+    y, noise, maps = (book := Textbook(fit)).data()
     m = fit.training.measurements[0]
     B = affine_map(fit.system, m.at(fit.system), "qdd").B_Q
     K = book.gram(maps) + torch.diag(noise) + torch.block_diag(*((B * STD**2) @ B.mT))

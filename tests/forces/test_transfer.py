@@ -51,9 +51,7 @@ def fitted(kind: str) -> StructuredFit:
         "any force": [forcegp.ContactForcePrior("table")],
         "defaults": None,
     }
-    model = forcegp.StructuredGP(on("learned"), "analytical", priors[kind], noise=0.1)
-    model = model.fit(few, options=SHORT)
-    return model
+    return forcegp.StructuredGP(on("learned"), "analytical", priors[kind], noise=0.1).fit(few, options=SHORT)
 
 
 def score(kind: str, surface: str, quantity: str = "qdd") -> tuple[float, float]:

@@ -77,7 +77,7 @@ class Textbook:
         system = self.system
         at = states(system, q, qd, tau, active)
         z = affine_map(system, at, quantity)
-        mean = z.o + torch.einsum("nab,nb->na", z.B_Q, self.model.mean(system, at))
+        mean = z.o + torch.einsum("nab,nb->na", z.B_Q, self.model.problem.mean(system, at))
         operators, inputs = [], []
         for p, prior in enumerate(self.model.force_priors):
             B = z.B_z if prior.target == "contact" else z.B_Q

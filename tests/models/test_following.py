@@ -60,8 +60,7 @@ def test_a_payload_is_followed_within_a_second() -> None:
         changes += [first] if found.changed else []
     assert changes, "the payload is not noticed"
     assert changes[0] - JUMP < RATE // 4
-    reference = _model()
-    reference = reference.fit(loaded[:JUMP], learn=[])
+    reference = _model().fit(loaded[:JUMP], learn=[])
     now = _error(model, after)
     assert now < AS_GOOD * _error(reference, after) + 0.02
     assert now < FIRST_ORDER * stale
@@ -75,8 +74,7 @@ def test_nothing_changes_where_nothing_does() -> None:
     model = model.fit(free[:JUMP], learn=[])
     found = [follow(model, free[i : i + STEP], ["payload"]) for i in range(JUMP, JUMP + 100, STEP)]
     assert not any(one.changed for one in found)
-    reference = _model()
-    reference = reference.fit(free[:JUMP], learn=[])
+    reference = _model().fit(free[:JUMP], learn=[])
     reference = reference.update(free[JUMP : JUMP + 100])
     test = free[300:]
     got, want = (m.predict(test.q, test.qd, test.tau) for m in (model, reference))

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from forcegp import IndependentGP
+from forcegp import IndependentGP, Noise
 from forcegp.errors import DataError, ModelError, ShapeError
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import LearningOptions
@@ -28,9 +28,7 @@ test = random_data(system, 25, seed=1)
 
 @pytest.fixture(scope="module")
 def model() -> IndependentFit:
-    fitted = IndependentGP(system, noise=NOISE_STD)
-    fitted = fitted.fit(data, options=FEW)
-    return fitted
+    return IndependentGP(system, noise=NOISE_STD).fit(data, options=FEW)
 
 
 def standardized(x: Tensor) -> Tensor:
@@ -92,8 +90,7 @@ def test_gradient_is_that_of_the_textbook_formula(model: IndependentFit) -> None
 
 def test_it_has_154_hyperparameters_and_learning_raises_the_likelihood(model: IndependentFit) -> None:
     assert sum(value.numel() for value in model.hyperparameters.values()) == 154
-    start = IndependentGP(system, noise=NOISE_STD)
-    start = start.fit(data, options=LearningOptions(max_evaluations=1))
+    start = IndependentGP(system, noise=NOISE_STD).fit(data, options=LearningOptions(max_evaluations=1))
     assert model.log_marginal_likelihood > start.log_marginal_likelihood + 10.0
 
 
@@ -127,10 +124,8 @@ def test_batches_of_any_shape_and_chunks_agree(
 
 
 def test_wrong_use_is_refused(model: IndependentFit) -> None:
-    with pytest.raises(ModelError, match="has not been fitted"):
-        IndependentGP(system).predict(test.q, test.qd, test.tau)
-    with pytest.raises(ModelError, match="has not been fitted"):
-        IndependentGP(system).log_marginal_likelihood
+    with pytest.raises(ModelError, match="white noise of accelerations alone"):
+        IndependentGP(system, noise=Noise(0.1, torque="learn"))
     with pytest.raises(ModelError, match="predicts accelerations only"):
         model.predict(test.q, test.qd, test.tau, "multiplier")
     with pytest.raises(ShapeError, match="qd does not fit"):
@@ -138,4 +133,4 @@ def test_wrong_use_is_refused(model: IndependentFit) -> None:
     with pytest.raises(ModelError, match="must be positive"):
         IndependentGP(system, noise=0.0).fit(data)
     with pytest.raises(DataError, match="joint"):
-        model = model.fit(data.select(tuple(reversed(data.joint_names))))
+        IndependentGP(system).fit(data.select(tuple(reversed(data.joint_names))))

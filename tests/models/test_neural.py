@@ -23,9 +23,7 @@ test = random_data(system, 20, seed=1)
 
 @pytest.fixture(scope="module")
 def model() -> NetworkFit:
-    fitted = NeuralNetwork(system, (30, 20))
-    fitted = fitted.fit(data, options=FEW)
-    return fitted
+    return NeuralNetwork(system, (30, 20)).fit(data, options=FEW)
 
 
 def by_hand(model: NetworkFit, x: Tensor) -> Tensor:
@@ -56,20 +54,19 @@ def test_derivatives_of_the_network_match_differences(model: NetworkFit) -> None
 
 @pytest.mark.parametrize("hidden", PAPER_ARCHITECTURES, ids=str)
 def test_the_networks_of_the_paper_learn(hidden: tuple[int, ...]) -> None:
-    network = NeuralNetwork(system, hidden)
     # Four layers of 200 units move slowly in the few steps of a test.
-    result = network.fit(data, options=BatchOptions(epochs=25, batch=20, learning_rate=0.005))
-    assert result.evaluations == len(result.history) == 25
-    assert result.objective == min(result.history) < 0.9 * result.history[0]
-    widths = [layer.out_features for layer in network.network if isinstance(layer, torch.nn.Linear)]
+    options = BatchOptions(epochs=25, batch=20, learning_rate=0.005)
+    fit = NeuralNetwork(system, hidden).fit(data, options=options)
+    assert fit.evaluations == len(fit.history) == 25
+    assert fit.objective == min(fit.history) < 0.9 * fit.history[0]
+    widths = [layer.out_features for layer in fit.network if isinstance(layer, torch.nn.Linear)]
     assert widths == [*hidden, 7]
 
 
 def test_the_seed_decides_and_nothing_else() -> None:
     def weights(seed: int) -> Tensor:
-        network = NeuralNetwork(system, seed=seed)
-        network = network.fit(data, options=FEW)
-        return next(network.network.parameters()).detach()
+        fit = NeuralNetwork(system, seed=seed).fit(data, options=FEW)
+        return next(fit.network.parameters()).detach()
 
     first = weights(0)
     torch.rand(5)
@@ -112,12 +109,10 @@ def test_held_out_samples_are_not_trained_on() -> None:
 def test_wrong_use_is_refused(model: NetworkFit) -> None:
     with pytest.raises(ModelError, match="at least one unit"):
         NeuralNetwork(system, (80, 0))
-    with pytest.raises(ModelError, match="has not been fitted"):
-        NeuralNetwork(system).predict(test.q, test.qd, test.tau)
     with pytest.raises(ModelError, match="predicts accelerations only"):
         model.predict(test.q, test.qd, test.tau, "joint_force")
     with pytest.raises(ModelError, match="too few samples"):
-        model = model.fit(data[:1])
+        NeuralNetwork(system).fit(data[:1])
     nan = {"x": torch.full((1,), float("inf"), dtype=torch.float64)}
     with pytest.raises(NumericalError, match="diverged in epoch 1"):
         train(quadratic, nan, 10, FEW, torch.Generator().manual_seed(0))

@@ -10,7 +10,6 @@ import torch
 import forcegp
 from forcegp.errors import ModelError
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
-from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 
 SAME = 1e-8
@@ -18,7 +17,7 @@ SAME = 1e-8
 data = logged(two_contacts(), 24)
 
 
-def model(inference: str = "sparse") -> StructuredFit:
+def model(inference: str = "sparse") -> forcegp.StructuredGP:
     return forcegp.StructuredGP(
         two_contacts(),
         "analytical",
@@ -30,12 +29,9 @@ def model(inference: str = "sparse") -> StructuredFit:
 
 @pytest.mark.parametrize("inference", ["sparse", "exact"])
 def test_an_update_is_a_refit(inference: str, tmp_path: Path) -> None:
-    reference, grown = model(inference), model(inference)
-    for one in (reference, grown):
-        one = one.fit(data[:16], learn=[])
-    reference = reference.condition(data)  # keeps the input scales of the first samples, as an update does
-    grown.update(data[16:20])
-    grown.update(data[20:])
+    first = model(inference).fit(data[:16], learn=[])
+    reference = first.condition(data)  # keeps the input scales of the first samples, as an update does
+    grown = first.update(data[16:20]).update(data[20:])
     grown.save(tmp_path / "grown")
     grown = forcegp.load_model(tmp_path / "grown")
     q, qd, tau = draw(5, seed=3)
@@ -46,9 +42,8 @@ def test_an_update_is_a_refit(inference: str, tmp_path: Path) -> None:
 
 
 def test_forgetting_returns_to_the_prior() -> None:
-    one = model()
-    before = one.fit(data, learn=[])
-    after = one.forget(1e-9)
+    before = model().fit(data, learn=[])
+    after = before.forget(1e-9)
     q, qd, tau = draw(5, seed=3)
     spread = [fit.predict(q, qd, tau, "joint_force").variance for fit in (before, after)]
     assert bool((spread[1] > spread[0]).all())
@@ -57,13 +52,11 @@ def test_forgetting_returns_to_the_prior() -> None:
 
 
 def test_what_cannot_be_updated() -> None:
-    exact = model("exact")
-    exact = exact.fit(data, learn=[])
+    exact = model("exact").fit(data, learn=[])
     with pytest.raises(ModelError, match="exact inference cannot forget"):
-        exact = exact.forget(0.5)
-    sparse = model()
-    sparse = sparse.fit(data, learn=[])
+        exact.forget(0.5)
+    sparse = model().fit(data, learn=[])
     with pytest.raises(ModelError, match="invalid forgetting factor"):
-        sparse = sparse.forget(0.0)
+        sparse.forget(0.0)
     with pytest.raises(ModelError, match="measures other quantities"):
-        sparse = sparse.update([forcegp.Observation(data[:2], "multiplier", 1.0)])
+        sparse.update([forcegp.Observation(data[:2], "multiplier", 1.0)])

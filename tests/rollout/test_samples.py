@@ -13,8 +13,8 @@ from forcegp.errors import DataError, ModelError
 from forcegp.forces.quantities import states
 from forcegp.forces.samples import draw_samples
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.analytical import AnalyticalModel
-from forcegp.models.base import Model
+from forcegp.models.analytical import AnalyticalFit, AnalyticalModel
+from forcegp.models.base import FittedModel
 from forcegp.models.registry import create
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
@@ -153,7 +153,7 @@ def test_a_learned_model_loses_no_contact_while_it_slides() -> None:
 
 
 def test_models_without_a_posterior_say_so() -> None:
-    data, plain = log(), AnalyticalModel(arm(Baumgarte()))
+    data, plain = log(), AnalyticalModel(arm(Baumgarte())).nominal()
     with pytest.raises(ModelError, match="no uncertainty of the multiplier"):
         contact_loss_probability(plain, data.q[0], data.qd[0], data.tau[0])
     with pytest.raises(ModelError, match="no function samples"):
@@ -162,21 +162,22 @@ def test_models_without_a_posterior_say_so() -> None:
         plain.rollout(data.q[0], data.qd[0], data, 0.02).need_samples()
 
 
-class Freefloating(AnalyticalModel):
+class Freefloating(AnalyticalFit):
     """A model of accelerations alone, that knows of no surface."""
 
     def force_field(self) -> None:
         return None
 
-    def predict(self, q, qd, tau, quantity="qdd", *, active=None, covariance=True):
+    def predict(self, q, qd, tau, quantity="qdd", *, active=None, covariance=True, system=None):
         return super().predict(q, qd, tau, "qdd_free", active=active, covariance=covariance)
 
 
 def test_comparison_tells_models_apart_and_the_page_holds_them(tmp_path, monkeypatch) -> None:
     system = arm(Baumgarte())
-    models: dict[str, Model] = {
-        "analytical": AnalyticalModel(system),
-        "nn": Freefloating(system),
+    plain = AnalyticalModel(system).nominal()
+    models: dict[str, FittedModel] = {
+        "analytical": plain,
+        "nn": Freefloating(**vars(plain)),
         "sgp-mean": fitted(),
     }
     found = compare(models, log(), 0.3, starts=2, samples=3)
@@ -217,7 +218,7 @@ def test_a_rollout_beside_its_log() -> None:
 
 def test_a_selected_log_cannot_be_compared_with() -> None:
     data = log()
-    models: dict[str, Model] = {"analytical": AnalyticalModel(arm(Baumgarte()))}
+    models: dict[str, FittedModel] = {"analytical": AnalyticalModel(arm(Baumgarte())).nominal()}
     with pytest.raises(DataError, match="too short"):
         compare(models, data, 50.0)
     with pytest.raises(DataError, match="too short"):

@@ -118,8 +118,8 @@ def test_a_standard_deviation_that_is_not_positive_is_named(
 
 
 def test_a_negative_noise_in_the_settings_is_refused(saved: dict[str, Path], tmp_path: Path) -> None:
-    place = repaired(saved["sgp-mean"], tmp_path / "a", settings__noise_std=-0.1)
-    with pytest.raises(ModelError, match="noise_std"):
+    place = repaired(saved["sgp-mean"], tmp_path / "a", settings__noise__acceleration=-0.1)
+    with pytest.raises(ModelError, match=r"noise\.acceleration"):
         forcegp.load_model(place)
 
 

@@ -26,9 +26,9 @@ viser = pytest.importorskip("viser")
 
 @cache
 def fitted() -> StructuredFit:
-    model = forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1)
-    model = model.fit(logged(two_contacts(), 12), learn=[])
-    return model
+    return forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1).fit(
+        logged(two_contacts(), 12), learn=[]
+    )
 
 
 def log() -> forcegp.Dataset:
@@ -99,8 +99,12 @@ def test_one_file_without_references(tmp_path: Path, capfd: pytest.CaptureFixtur
 def test_paths_of_a_rollout_are_added() -> None:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
     q = torch.tensor([0.3, -0.2], dtype=torch.float64)
-    path = forcegp.AnalyticalModel(system).rollout(
-        q, 0.0 * q, torch.zeros(1, 2, dtype=torch.float64), 0.1, options=forcegp.RolloutOptions(0.01)
+    path = (
+        forcegp.AnalyticalModel(system)
+        .nominal()
+        .rollout(
+            q, 0.0 * q, torch.zeros(1, 2, dtype=torch.float64), 0.1, options=forcegp.RolloutOptions(0.01)
+        )
     )
     motion = with_rollout(Motion(system, np.zeros(1), q[None]), path)
     assert [p.kind for p in motion.paths] == ["predicted"]

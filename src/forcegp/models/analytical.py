@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -102,19 +102,11 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         window: Window | None = None,
         seed: int = 0,
     ) -> None:
+        self._keep(locals())
         self.system = system
         self.window = window or Window()
         self.seed = seed
         self.parameters = AnalyticalParameters(system.robot, analytical_parameters)
-        self._given = analytical_parameters
-
-    def get_params(self) -> dict[str, Any]:
-        return {
-            "system": self.system,
-            "analytical_parameters": self._given,
-            "window": self.window,
-            "seed": self.seed,
-        }
 
     def fit(
         self,

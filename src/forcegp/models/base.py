@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -232,6 +232,19 @@ class Model(ABC, Generic[F]):
     system: ConstrainedSystem
     """Robot and contacts."""
 
+    _params: dict[str, Any]
+
+    def _keep(self, arguments: Mapping[str, Any]) -> None:
+        """Keep the arguments of the constructor: its `locals()`."""
+        self._params = {name: x for name, x in arguments.items() if name not in ("self", "__class__")}
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> None:
+            """Raise `AttributeError`, which says how to get the fit that has the attribute."""
+            hint = "; call fit = model.fit(data), which has it" if hasattr(FittedModel, name) else ""
+            raise AttributeError(f"a {type(self).__name__} has no attribute {name!r}{hint}")
+
     def __repr__(self) -> str:
         """One line: robot and contacts."""
         return model_line(type(self).__name__, self.system, None)
@@ -240,9 +253,10 @@ class Model(ABC, Generic[F]):
         """A table for notebooks."""
         return fit_table(repr(self), None, list(self.get_params().items()))
 
-    @abstractmethod
     def get_params(self) -> dict[str, Any]:
-        """Arguments of the constructor: `type(model)(**model.get_params())` is a copy."""
+        """Arguments of the constructor as the caller passed them: `type(model)(**model.get_params())` is a
+        copy."""
+        return dict(self._params)
 
     @abstractmethod
     def fit(

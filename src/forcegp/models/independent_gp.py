@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from pydantic import PositiveFloat
@@ -107,6 +106,7 @@ class IndependentGP(Model["IndependentFit"]):
     def __init__(
         self, system: ConstrainedSystem, noise: NoiseStd | Noise | None = None, standardize: bool = True
     ) -> None:
+        self._keep(locals())
         require_double(system)
         self.system = system
         stated = Noise.of(noise)
@@ -116,11 +116,8 @@ class IndependentGP(Model["IndependentFit"]):
                 expected="a number, one per joint, or Noise(acceleration)",
                 got=noise,
             )
-        self._given, self.noise = noise, stated.acceleration
+        self.noise = stated.acceleration
         self.standardize = standardize
-
-    def get_params(self) -> dict[str, Any]:
-        return {"system": self.system, "noise": self._given, "standardize": self.standardize}
 
     def fit(
         self,

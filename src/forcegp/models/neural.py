@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -70,14 +69,12 @@ class NeuralNetwork(Model["NetworkFit"]):
     kind = KIND
 
     def __init__(self, system: ConstrainedSystem, hidden: Sequence[int] = (80,), seed: int = 0) -> None:
+        self._keep(locals())
         if any(width < 1 for width in hidden):
             raise ModelError("a hidden layer needs at least one unit", got=tuple(hidden))
         self.system = system
         self.hidden = tuple(hidden)
         self.seed = seed
-
-    def get_params(self) -> dict[str, Any]:
-        return {"system": self.system, "hidden": self.hidden, "seed": self.seed}
 
     def fit(
         self,

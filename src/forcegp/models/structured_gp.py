@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from torch import nn
 
@@ -92,7 +91,7 @@ class StructuredGP(Model[StructuredFit]):
         inertia: str | None = None,
         standardize: bool = True,
     ) -> None:
-        self._params = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        self._keep(locals())
         require_double(system)
         form, stated = mean_of(mean), Noise.of(noise)
         priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
@@ -121,9 +120,6 @@ class StructuredGP(Model[StructuredFit]):
     def force_priors(self) -> tuple[ForcePrior, ...]:
         """Priors on the unknown forces."""
         return self.specification.priors
-
-    def get_params(self) -> dict[str, Any]:
-        return dict(self._params)
 
     def fit(
         self,
