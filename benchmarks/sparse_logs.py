@@ -125,7 +125,7 @@ def trajectories(folder: Path) -> dict:
 
 
 def updates(folder: Path) -> dict:
-    """Milliseconds of `model.update` with one sample and with ten, equations of motion and whitening
+    """Milliseconds of `fit.update` with one sample and with ten, equations of motion and whitening
     included, and of what of it is the posterior."""
     train, _ = parts(folder, 0)
     model = _sparse(train, UPDATE_POINTS)

@@ -63,7 +63,7 @@ Options = LearningOptions | BatchOptions
 
 @dataclass(frozen=True, eq=False)
 class Configured:
-    """An unfitted model, and how it learns.
+    """A model, and how it learns.
 
     Attributes:
         name: of the model.

@@ -106,7 +106,7 @@ def create(
     seed: int = 0,
     **options: Any,
 ) -> Model:
-    """An unfitted model by its short name.
+    """A model by its short name.
 
     Args:
         name: a key of `MODELS`.

@@ -94,7 +94,14 @@ class ModelSection(Section):
     @classmethod
     def _of_accelerations(cls, value: object) -> object:
         """A number, or a list of them, is the noise of accelerations."""
-        return {"acceleration": value} if isinstance(value, int | float | list | tuple) else value
+        return _tuples({"acceleration": value} if isinstance(value, int | float | list) else value)
+
+
+def _tuples(value: Any) -> Any:
+    """Lists as tuples, which strict validation asks for after a validator in Python."""
+    if isinstance(value, dict):
+        return {key: _tuples(part) for key, part in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 class ModelFile(Section):
