@@ -80,10 +80,10 @@ def imports(path: Path) -> set[str]:
             package, _, base = (node.module or "").partition(".")
             if package == "forcegp":
                 full = [f"{base}.{alias.name}".strip(".") for alias in node.names]
-                found = found.update(name if name in known else base for name in full)
+                found.update(name if name in known else base for name in full)
         elif isinstance(node, ast.Import):
             own = [alias.name for alias in node.names if alias.name.startswith("forcegp.")]
-            found = found.update(name.partition(".")[2] for name in own)
+            found.update(name.partition(".")[2] for name in own)
     return found - {""}
 
 
