@@ -40,7 +40,8 @@ def torque(t: torch.Tensor, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
     return force - (system.equations(q, qd).A.mT @ torch.tensor([[40.0], [60.0]]).double())[..., 0]
 
 
-path = forcegp.AnalyticalModel(truth).rollout(q0, qd0, torque, 3.0, options=forcegp.RolloutOptions(0.005))
+arm = forcegp.AnalyticalModel(truth).nominal()
+path = arm.rollout(q0, qd0, torque, 3.0, options=forcegp.RolloutOptions(0.005))
 data = forcegp.Dataset(
     t=path.t,
     q=path.q,

@@ -119,7 +119,7 @@ def test_the_residual_is_that_of_closed_contacts() -> None:
     assert found.residual == pytest.approx(float(expected.mean()), rel=1e-9)
     assert found.residual_max == pytest.approx(float(expected.max()), rel=1e-9)
     free = data.replace(contact={"table": torch.zeros(3000, dtype=torch.bool)})
-    plain = forcegp.AnalyticalModel(system)
+    plain = forcegp.AnalyticalModel(system).nominal()
     assert evaluate(plain, free[:10]).residual is None
 
 
@@ -136,7 +136,7 @@ def test_chunks_do_not_matter_and_progress_is_reported(monkeypatch: pytest.Monke
 
 
 def test_without_clean_accelerations() -> None:
-    found = evaluate(forcegp.AnalyticalModel(system), data[:20].replace(extras={}))
+    found = evaluate(forcegp.AnalyticalModel(system).nominal(), data[:20].replace(extras={}))
     assert found.clean is None and found.clean_mae is None and found.coverage_clean is None
     assert found.noise_std == pytest.approx((NOISE_STD,) * 7, rel=1e-12)  # a root of a mean of squares
 
@@ -183,7 +183,7 @@ def test_a_perfect_model_is_better_than_every_trivial_predictor() -> None:
 
 
 def test_the_robot_file_is_not_better_than_itself() -> None:
-    found = evaluate(forcegp.AnalyticalModel(system), data[:100], train=data[100:200])
+    found = evaluate(forcegp.AnalyticalModel(system).nominal(), data[:100], train=data[100:200])
     against = {v.against: v for v in found.verdicts}
     assert against["robot file"].torque == pytest.approx(1.0) and not against["robot file"].better
     assert "but is not better than" in found.verdict

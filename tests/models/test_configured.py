@@ -163,7 +163,10 @@ def test_options_of_the_caller_override_the_table(made) -> None:
         ),
         ("[model.noise]\ntorqe = 0.1", r"model\.toml:3: model\.noise\.torqe: unknown key(.|\n)*'torque'"),
         ("noise = { torque = -1.0 }", r"model\.toml:2: model\.noise\.torque"),
-        ('name = "gp"\nnoise = { torque = 1.0 }', r"model\.toml:1: model: (.|\n)*noise of accelerations alone"),
+        (
+            'name = "gp"\nnoise = { torque = 1.0 }',
+            r"model\.toml:1: model: (.|\n)*noise of accelerations alone",
+        ),
         ('mean = ["gravty"]', r"model\.toml:2: model\.mean: (.|\n)*did you mean 'gravity'"),
         (
             '[[model.priors]]\ntype = "join"',

@@ -99,13 +99,8 @@ def test_one_file_without_references(tmp_path: Path, capfd: pytest.CaptureFixtur
 def test_paths_of_a_rollout_are_added() -> None:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
     q = torch.tensor([0.3, -0.2], dtype=torch.float64)
-    path = (
-        forcegp.AnalyticalModel(system)
-        .nominal()
-        .rollout(
-            q, 0.0 * q, torch.zeros(1, 2, dtype=torch.float64), 0.1, options=forcegp.RolloutOptions(0.01)
-        )
-    )
+    tau, options = torch.zeros(1, 2, dtype=torch.float64), forcegp.RolloutOptions(0.01)
+    path = forcegp.AnalyticalModel(system).nominal().rollout(q, 0.0 * q, tau, 0.1, options=options)
     motion = with_rollout(Motion(system, np.zeros(1), q[None]), path)
     assert [p.kind for p in motion.paths] == ["predicted"]
     np.testing.assert_allclose(motion.paths[0].points, path.tip("tip").numpy())
