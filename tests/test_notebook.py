@@ -62,7 +62,7 @@ def test_a_fit_says_how_it_went() -> None:
     assert repr(fit) == (
         "<StructuredFit of 'kuka_iiwa': 7 joints, contact table, ball; conditioned, nothing learned>"
     )
-    words = Tags(model._repr_html_()).words
+    words = Tags(fit._repr_html_()).words
     assert words[words.index("training samples") + 1] == "8"
     assert words[words.index("noise of qdd") + 1].startswith("0.1, 0.1")
     assert words[words.index("log marginal likelihood") + 1] == f"{fit.log_marginal_likelihood:.4g}"
