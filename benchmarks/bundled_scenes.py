@@ -17,6 +17,7 @@ import dataclasses
 from forcegp import ConstrainedSystem, Dataset, LearningOptions, StructuredGP
 from forcegp.data import split_by_stretches
 from forcegp.evaluation import Evaluation, evaluate
+from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.registry import create
 from forcegp.scene import BUNDLED, load_scene
 from forcegp.simulate import simulate
@@ -59,7 +60,7 @@ def main() -> None:
         model = create(kind, system)
         assert isinstance(model, StructuredGP)
         after = evaluate(model.fit(train, options=options), test, compare=False)
-        before = evaluate(create("analytical", system), test, compare=False)
+        before = evaluate(AnalyticalModel(system).nominal(), test, compare=False)
         print(report(name, before, after), flush=True)
 
 

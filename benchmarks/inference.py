@@ -166,7 +166,7 @@ def fit_and_predict(folder: Path, samples: int, mean: str) -> dict:
     one = [x[:1] for x in (test.q, test.qd, test.tau)]
     many = (test.q, test.qd, test.tau)
     began = time.perf_counter()
-    prediction = model.predict(*many)
+    prediction = fit.predict(*many)
     all_seconds = time.perf_counter() - began
     clean, noisy = (prediction.mean - test.qdd_clean).abs(), (prediction.mean - test.qdd).abs()
     std = prediction.variance
@@ -176,8 +176,8 @@ def fit_and_predict(folder: Path, samples: int, mean: str) -> dict:
         "fit_seconds": fit_seconds,
         "evaluations": fit.evaluations,
         "converged": fit.converged,
-        "one_mean_ms": 1e3 * median_seconds(lambda: model.predict(*one, covariance=False), 50),
-        "one_covariance_ms": 1e3 * median_seconds(lambda: model.predict(*one), 5),
+        "one_mean_ms": 1e3 * median_seconds(lambda: fit.predict(*one, covariance=False), 50),
+        "one_covariance_ms": 1e3 * median_seconds(lambda: fit.predict(*one), 5),
         "thousand_seconds": all_seconds,
         "clean_mae": float(clean.mean()),
         "noisy_mae": float(noisy.mean()),

@@ -23,6 +23,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.forces.priors.payload import PayloadPrior
 from forcegp.models.following import follow
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.robot import load_robot
 from forcegp.scene import load_scene
@@ -48,40 +49,39 @@ def logs(system: ConstrainedSystem) -> tuple[Dataset, Dataset]:
     return free[:KNOWN], loaded.replace(header=free.header)[KNOWN:]
 
 
-def error(model: StructuredGP, data: Dataset) -> float:
+def error(model: StructuredFit, data: Dataset) -> float:
     """Mean absolute error of clean accelerations [rad/s²]."""
     predicted = model.predict(data.q, data.qd, data.tau, covariance=False).mean
     return float((predicted - data.extras["qdd_clean"]).abs().mean())
 
 
-def fading(model: StructuredGP, data: Dataset) -> None:
+def fading(fit: StructuredFit, data: Dataset) -> StructuredFit:
     """Forget the payload at a constant rate."""
-    model.forget(math.exp(-STEP / RATE / MEMORY), priors=["payload"])
-    model.update(data)
+    return fit.forget(math.exp(-STEP / RATE / MEMORY), priors=["payload"]).update(data)
 
 
-WAYS: dict[str, Callable[[StructuredGP, Dataset], object]] = {
-    "frozen": lambda model, data: None,
+WAYS: dict[str, Callable[[StructuredFit, Dataset], StructuredFit]] = {
+    "frozen": lambda fit, data: fit,
     "fading memory": fading,
-    "on evidence": lambda model, data: follow(model, data, ["payload"]),
+    "on evidence": lambda fit, data: follow(fit, data, ["payload"]).fit,
 }
 
 
 def measure(system: ConstrainedSystem) -> dict[str, dict[str, float]]:
     """Errors of each way, before and after the payload, and milliseconds of an update."""
     known, loaded = logs(system)
-    default = StructuredGP(system, "analytical", noise_std=0.1).fit(known[::EVERY], learn=[])
+    default = StructuredGP(system, "analytical", noise=0.1).fit(known[::EVERY], learn=[])
     priors = [*default.posterior.priors, PayloadPrior()]
     found = {}
     for name, way in WAYS.items():
-        model = StructuredGP(system, "analytical", priors, noise_std=0.1, inference="sparse")
-        model.fit(known[::EVERY], learn=[])
-        before, errors, began = error(model, known[1::EVERY]), [], time.perf_counter()
+        model = StructuredGP(system, "analytical", priors, noise=0.1, inference="sparse")
+        fit = model.fit(known[::EVERY], learn=[])
+        before, errors, began = error(fit, known[1::EVERY]), [], time.perf_counter()
         for first in range(0, int(1.5 * RATE), STEP):
-            errors.append(error(model, loaded[first : first + STEP]))
-            way(model, loaded[first : first + STEP])
+            errors.append(error(fit, loaded[first : first + STEP]))
+            fit = way(fit, loaded[first : first + STEP])
         per = 1e3 * (time.perf_counter() - began) / len(errors)
-        latent, one = model.posterior.latent, {"one": torch.zeros(1, 1, dtype=torch.float64)}
+        latent, one = fit.posterior.latent, {"one": torch.zeros(1, 1, dtype=torch.float64)}
         mass = float(latent.latent_mean(len(priors) - 1, one)[0, 0])
         found[name] = {
             "before": before,

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from forcegp.control.plan import make_plan
 from forcegp.data import Dataset, select_points
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.rollout import RolloutOptions, TaskSpaceControl
 from forcegp.rollout.integrate import project_state
@@ -45,22 +46,20 @@ DRIFT = [
 """Stabilization, method, and function samples beside the mean."""
 
 
-def model_and_run(points: int, seconds: float) -> tuple[StructuredGP, Dataset, SimulationResult]:
+def model_and_run(points: int, seconds: float) -> tuple[StructuredFit, Dataset, SimulationResult]:
     """A model conditioned on simulated points, those points, and another run to start from."""
     system = load_scene("kuka_plane").system()
     train = simulate(system, SimulationConfig(duration=max(10.0, points / 20.0), seed=1)).data
     chosen = train[select_points(train, points)]
-    model = StructuredGP(system, mean="analytical", noise_std=0.1)
-    model.fit(chosen[:DRIFT_POINTS])
-    model.condition(chosen)
-    return model, chosen, simulate(system, _test_run(seconds))
+    fit = StructuredGP(system, mean="analytical", noise=0.1).fit(chosen[:DRIFT_POINTS])
+    return fit.condition(chosen), chosen, simulate(system, _test_run(seconds))
 
 
 def _test_run(seconds: float) -> SimulationConfig:
     return SimulationConfig(duration=seconds + 0.1, seed=2)
 
 
-def measure(model: StructuredGP, run: SimulationResult, seconds: float, samples: int) -> dict[str, float]:
+def measure(model: StructuredFit, run: SimulationResult, seconds: float, samples: int) -> dict[str, float]:
     """Wall and processor time of one rollout, the growth of memory, and what its result holds."""
     data = run.data
     options = RolloutOptions(on_divergence="keep")
@@ -87,7 +86,7 @@ def measure(model: StructuredGP, run: SimulationResult, seconds: float, samples:
     }
 
 
-def drift(model: StructuredGP, run: SimulationResult, seconds: float) -> list[dict[str, float | str]]:
+def drift(model: StructuredFit, run: SimulationResult, seconds: float) -> list[dict[str, float | str]]:
     """Largest |c(q)| by loop, stabilization and method, with the speed that the joints come to [m, rad/s]."""
     data, system, config = run.data, model.system, _test_run(seconds)
     plan = make_plan(system, config, torch.Generator().manual_seed(config.seed))
@@ -155,7 +154,7 @@ def main() -> None:
     spans = (0.5 * args.seconds, args.seconds)
     with torch.no_grad():
         rows = [measure(model, run, seconds, samples) for samples in TARGETS for seconds in spans]
-        model.condition(chosen[:DRIFT_POINTS])
+        model = model.condition(chosen[:DRIFT_POINTS])
         drifts = drift(model, run, args.seconds)
     result = {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}",

@@ -66,7 +66,9 @@ def friction(samples: int, seed: int, joint_friction: bool) -> Tensor:
     train, test = pressed(system, samples, 2 * seed, dry), pressed(system, TESTS, 2 * seed + 1, dry)
     priors = [forcegp.JointFrictionPrior()] if joint_friction else []
     priors.append(forcegp.SlidingFrictionPrior(name, Linear(), coupled=True))
-    fit = forcegp.StructuredGP(system, "analytical", priors, noise_std=0.01, torque_noise=None).fit(train)
+    fit = forcegp.StructuredGP(
+        system, "analytical", priors, noise=forcegp.Noise(acceleration=0.01, torque=None)
+    ).fit(train)
     found = fit.predict(test.q, test.qd, test.tau, "multiplier")
     assert found.std is not None
     return (found.mean[:, 0] - test.multiplier[name]).abs() <= 2.0 * found.std[:, 0]
@@ -87,7 +89,7 @@ def joints(samples: int, seed: int) -> Tensor:
     t = torch.arange(n, dtype=torch.float64)
     data = forcegp.Dataset(t, q, qd, tau, noisy, system.robot.joint_names)
     prior = forcegp.JointForcePrior(SquaredExponential(("q", "qd")))
-    fit = forcegp.StructuredGP(system, "analytical", [prior], noise_std=0.1).fit(data[:samples])
+    fit = forcegp.StructuredGP(system, "analytical", [prior], noise=0.1).fit(data[:samples])
     test = data[samples:]
     found = fit.predict(test.q, test.qd, test.tau, "joint_force")
     assert found.std is not None

@@ -28,7 +28,7 @@ from forcegp.data import Dataset
 from forcegp.files import write_text
 from forcegp.logs import import_log
 from forcegp.models.registry import create
-from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.scene import load_scene
 from forcegp.simulate import Sensors, simulate
 
@@ -104,7 +104,7 @@ def recorded(case: Case, seed: int) -> tuple[ConstrainedSystem, Dataset]:
     return system, log.replace(header=log.header.model_copy(update={"robot_fingerprint": None}))
 
 
-def scores(model: StructuredGP, test: Dataset) -> dict[str, float]:
+def scores(model: StructuredFit, test: Dataset) -> dict[str, float]:
     """Bias, standard deviation and correlation of the normal force where the contact is closed; coverage."""
     (name,) = model.system.contact_names
     closed = test.contact[name]
@@ -133,13 +133,13 @@ def run(case: Case, seed: int) -> dict[str, float]:
         log = import_log(folder / "run.csv", system, folder / "mapping.toml").data
     train, test = selected(log, truth, system)
     model = create(MODEL, system)
-    assert isinstance(model, StructuredGP)
     began = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model.fit(train)
+        fit = model.fit(train)
     seconds = time.perf_counter() - began
-    return {"rows_right": rows_right(log, truth, system), **scores(model, test), "fit_seconds": seconds}
+    assert isinstance(fit, StructuredFit)
+    return {"rows_right": rows_right(log, truth, system), **scores(fit, test), "fit_seconds": seconds}
 
 
 def main() -> None:

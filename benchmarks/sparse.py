@@ -156,8 +156,8 @@ def update(options: argparse.Namespace) -> tuple[object, list[Bound]]:
     found = alone(sparse_logs.updates, (options.logs,))[0]
     size = f"{found['basis_functions']} basis functions"
     return found, [
-        Bound(f"model.update with one sample, {size}", found["update_1_ms"]["wall"], "ms", most=2.0),
-        Bound(f"model.update with ten samples, {size}", found["update_10_ms"]["wall"], "ms"),
+        Bound(f"fit.update with one sample, {size}", found["update_1_ms"]["wall"], "ms", most=2.0),
+        Bound(f"fit.update with ten samples, {size}", found["update_10_ms"]["wall"], "ms"),
         Bound(f"posterior.updated with one sample, {size}", found["posterior_ms"]["wall"], "ms"),
     ]
 

@@ -15,6 +15,7 @@ from sparse_rows import median_ms
 from forcegp.data import Dataset, complement, split_by_stretches
 from forcegp.evaluation import evaluate
 from forcegp.models.registry import create
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
@@ -51,7 +52,7 @@ def parts(folder: Path, seed: int) -> tuple[Dataset, Dataset]:
 def accuracy(folder: Path, name: str, seed: int) -> dict:
     """Errors and coverage on held-out stretches of a model of all other samples."""
     train, test = parts(folder, seed)
-    model = create(name, load_scene("kuka_plane").system(), noise_std=NOISE)
+    model = create(name, load_scene("kuka_plane").system(), noise=NOISE)
     began, used = time.perf_counter(), time.process_time()
     fit = model.fit(train)
     seconds, processor = time.perf_counter() - began, time.process_time() - used
@@ -73,12 +74,12 @@ def against_exact(folder: Path) -> dict:
     """Seconds of conditioning on all samples, and of an exact fit to a thousand of them."""
     train, _ = parts(folder, 0)
     few = train[torch.linspace(0, len(train) - 1, EXACT).round().long()]
-    model = StructuredGP(load_scene("kuka_plane").system(), "analytical", noise_std=NOISE)
+    model = StructuredGP(load_scene("kuka_plane").system(), "analytical", noise=NOISE)
     began, used = time.perf_counter(), time.process_time()
-    model.fit(few)
+    fit = model.fit(few)
     exact, exact_processor = time.perf_counter() - began, time.process_time() - used
     began, used = time.perf_counter(), time.process_time()
-    result = model.condition(train).result
+    result = fit.condition(train).result
     seconds, processor = time.perf_counter() - began, time.process_time() - used
     return {
         "samples": len(train),
@@ -93,19 +94,17 @@ def against_exact(folder: Path) -> dict:
     }
 
 
-def _sparse(train: Dataset, points: int = 100) -> StructuredGP:
+def _sparse(train: Dataset, points: int = 100) -> StructuredFit:
     """A sparse model of a thousand samples around the analytical mean, learned on 200 of them."""
     few = train[torch.linspace(0, len(train) - 1, EXACT).round().long()]
     model = StructuredGP(
         load_scene("kuka_plane").system(),
         "analytical",
-        noise_std=NOISE,
+        noise=NOISE,
         inference="sparse",
         inducing_points=points,
     )
-    model.fit(few[::5])
-    model.condition(few)
-    return model
+    return model.fit(few[::5]).condition(few)
 
 
 def trajectories(folder: Path) -> dict:
@@ -118,7 +117,7 @@ def trajectories(folder: Path) -> dict:
     seconds, processor = time.perf_counter() - began, time.process_time() - used
     assert path.samples is not None
     return {
-        "basis_functions": model.fitted.result.basis_functions,
+        "basis_functions": model.result.basis_functions,
         "trajectories": len(path.samples.q),
         "seconds": seconds,
         "processor_seconds": processor,
@@ -126,15 +125,15 @@ def trajectories(folder: Path) -> dict:
 
 
 def updates(folder: Path) -> dict:
-    """Milliseconds of `model.update` with one sample and with ten, equations of motion and whitening
+    """Milliseconds of `fit.update` with one sample and with ten, equations of motion and whitening
     included, and of what of it is the posterior."""
     train, _ = parts(folder, 0)
     model = _sparse(train, UPDATE_POINTS)
-    found: dict = {"basis_functions": model.fitted.result.basis_functions}
+    found: dict = {"basis_functions": model.result.basis_functions}
     for size in UPDATE_SIZES:
         samples = [train[first : first + size] for first in range(0, 100 * size, size)]
         found[f"update_{size}_ms"] = median_ms(lambda: model.update(samples.pop()), 60)  # noqa: B023
-    fit = model.fitted
+    fit = model
     one = dataclasses.replace(fit.problem, training=fit.problem.training.evenly(1))
     rows = one.rows(fit.hyperparameters).blocks
     found["posterior_ms"] = median_ms(lambda: fit.posterior.latent.updated(rows), 60)

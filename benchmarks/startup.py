@@ -52,7 +52,7 @@ def save_model(folder: Path) -> Path:
     """A structured model with 100 samples."""
     system = forcegp.load_scene("kuka_plane").system()
     data = simulate(system, SimulationConfig(duration=2.0, seed=1)).data
-    model = forcegp.StructuredGP(system, mean="analytical", noise_std=0.1)
+    model = forcegp.StructuredGP(system, mean="analytical", noise=0.1)
     model.fit(data[:400:4], learn=[]).save(folder / "model")
     return folder / "model"
 

@@ -54,7 +54,7 @@ def run(data: forcegp.Dataset, seed: int, mean: str, samples: int, way: str) -> 
     noise_std = data.header.noise_std
     assert noise_std is not None and test.qdd_clean is not None
     system = forcegp.load_scene("kuka_plane").system()
-    model = forcegp.StructuredGP(system, mean, state_noise=WAYS[way])
+    model = forcegp.StructuredGP(system, mean, noise=forcegp.Noise(state=WAYS[way]))
     fit = model.fit(train if way == "no noise" else with_noise(train, seed))
     found = fit.predict(test.q, test.qd, test.tau, active=test.active(system.contact_names))
     std = found.std

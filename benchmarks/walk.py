@@ -74,12 +74,13 @@ def walks() -> dict[str, dict[str, Any]]:
     """The four walks."""
     log = _log(1.0)
     chosen = log[select_points(log, POINTS)]
-    model = StructuredGP(load_scene("kuka_plane").system(), mean="analytical", noise_std=0.1)
+    model = StructuredGP(load_scene("kuka_plane").system(), mean="analytical", noise=0.1)
+    fit = model.fit(chosen, learn=[])
     calls: dict[str, Callable[[], Any]] = {
         "system": lambda: load_scene("kuka_plane").system(),
         "fit": lambda: model.fit(chosen),
-        "predict": lambda: model.predict(log.q, log.qd, log.tau),
-        "rollout": lambda: model.rollout(log.q[0], log.qd[0], log, duration=0.02),
+        "predict": lambda: fit.predict(log.q, log.qd, log.tau),
+        "rollout": lambda: fit.rollout(log.q[0], log.qd[0], log, duration=0.02),
     }
     return {name: count(walk(call)) for name, call in calls.items()}
 

@@ -43,7 +43,7 @@ pull = forcegp.OperatorForcePrior(
 
 # %% Beside the prior on all joint forces, fitted to the same 20 samples
 fits = {
-    name: forcegp.StructuredGP(system, "analytical", [prior], noise_std=0.1, torque_noise=0.3).fit(train)
+    name: forcegp.StructuredGP(system, "analytical", [prior], forcegp.Noise(0.1, torque=0.3)).fit(train)
     for name, prior in {"the hose": pull, "all joint forces": forcegp.JointForcePrior()}.items()
 }
 for name, fit in fits.items():

@@ -30,7 +30,7 @@ def log(system: forcegp.ConstrainedSystem, duration: float) -> forcegp.Dataset:
     truth = system.with_robot(robot.replace(damping=robot.damping + 0.4, friction=robot.friction + 0.5))
     q0, qd0 = project_state(system, torch.tensor([0.5, -1.0]).double(), torch.zeros(2).double())
     options = forcegp.RolloutOptions(dt=0.01)
-    path = forcegp.AnalyticalModel(truth).rollout(q0, qd0, torque, duration, options=options)
+    path = forcegp.AnalyticalModel(truth).nominal().rollout(q0, qd0, torque, duration, options=options)
     forces = dict(zip(system.contact_names, path.multiplier.unbind(-1), strict=True))
     return forcegp.Dataset(
         t=path.t,
@@ -47,11 +47,11 @@ def log(system: forcegp.ConstrainedSystem, duration: float) -> forcegp.Dataset:
 train, test = log(free, 4.0)[::10], log(wire, 2.0)
 
 # %% A prior on the friction of each joint, fitted to 40 samples of free motion
-fit = forcegp.StructuredGP(free, "analytical", [forcegp.JointFrictionPrior()], noise_std=0.1).fit(train)
+fit = forcegp.StructuredGP(free, "analytical", [forcegp.JointFrictionPrior()], noise=0.1).fit(train)
 
 # %% The force of the wire, and whether the predicted accelerations keep the bead on it
 force = fit.predict(test.q, test.qd, test.tau, "multiplier", system=wire)
-file = forcegp.AnalyticalModel(wire).predict(test.q, test.qd, test.tau, "multiplier")
+file = forcegp.AnalyticalModel(wire).nominal().predict(test.q, test.qd, test.tau, "multiplier")
 error, before = ((x.mean[:, 0] - test.multiplier["wire"]).abs() for x in (force, file))
 eom, qdd = wire.equations(test.q, test.qd), fit.predict(test.q, test.qd, test.tau, system=wire).mean
 print(f"mean error of the wire's force: {error.mean():.3f} N, of the robot file alone {before.mean():.3f} N")

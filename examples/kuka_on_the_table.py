@@ -22,7 +22,7 @@ print(fit)
 # %% Predicted accelerations and normal force on the last second, which the model has not seen
 acceleration = fit.predict(test.q, test.qd, test.tau)
 force = fit.predict(test.q, test.qd, test.tau, quantity="multiplier")
-file = forcegp.AnalyticalModel(system).predict(test.q, test.qd, test.tau)
+file = forcegp.AnalyticalModel(system).nominal().predict(test.q, test.qd, test.tau)
 error, before = ((x.mean - test.qdd_clean).abs().mean() for x in (acceleration, file))
 print(f"acceleration: mean error {error:.3f} rad/s2, of the robot file alone {before:.3f}")
 true = test.multiplier["table"].mean()

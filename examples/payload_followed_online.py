@@ -42,19 +42,17 @@ data = forcegp.Dataset(t=t, q=q, qd=qd, tau=tau, qdd=qdd, joint_names=system.rob
 prior = forcegp.OperatorForcePrior(
     "mass", 1, weight, lambda system, at: {"one": torch.zeros_like(at.q[:, :1])}, Constant(group=1)
 )
-model = forcegp.StructuredGP(
-    system, "analytical", [prior], noise_std=0.01, torque_noise=0.5, inference="sparse"
-)
-model.fit(data[:50], learn=[])
+noise = forcegp.Noise(acceleration=0.01, torque=0.5)
+model = forcegp.StructuredGP(system, "analytical", [prior], noise, inference="sparse")
+fit = model.fit(data[:50], learn=[])
 
 # %% Follow the log, ten samples at a time
 found = []
 for first in range(50, len(data), 10):
     now = data[first : first + 10]
-    model.forget(math.exp(-10 * DT / MEMORY))
-    model.update(now)
+    fit = fit.forget(math.exp(-10 * DT / MEMORY)).update(now)
     q, qd, tau = now.q[-1:], now.qd[-1:], now.tau[-1:]
-    force = model.predict(q, qd, tau, "joint_force")
+    force = fit.predict(q, qd, tau, "joint_force")
     E = -9.81 * kinematics.point_jacobian(system.robot, q, "tip")[0, 2]
     known = (system.equations(q, qd).Q_K + tau)[0]
     std = (E @ force.covariance[0] @ E).sqrt() / (E @ E)

@@ -46,7 +46,7 @@ def main() -> None:
     left = as_torque(fit.system.robot, test, predicted.mean)
     std = (M @ predicted.covariance @ M.mT).diagonal(dim1=-2, dim2=-1).sqrt()
 
-    from_file = forcegp.AnalyticalModel(system).predict(test.q, test.qd, test.tau).mean
+    from_file = forcegp.AnalyticalModel(system).nominal().predict(test.q, test.qd, test.tau).mean
     before = as_torque(robot, test, from_file).square().mean(0).sqrt()
     after = left.square().mean(0).sqrt()
     covered = (left.abs() <= 2.0 * std).to(left.dtype).mean(0)

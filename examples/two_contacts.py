@@ -40,7 +40,8 @@ def torque(t: torch.Tensor, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
     return force - (system.equations(q, qd).A.mT @ torch.tensor([[40.0], [60.0]]).double())[..., 0]
 
 
-path = forcegp.AnalyticalModel(truth).rollout(q0, qd0, torque, 3.0, options=forcegp.RolloutOptions(0.005))
+arm = forcegp.AnalyticalModel(truth).nominal()
+path = arm.rollout(q0, qd0, torque, 3.0, options=forcegp.RolloutOptions(0.005))
 data = forcegp.Dataset(
     t=path.t,
     q=path.q,
@@ -54,10 +55,10 @@ data = forcegp.Dataset(
 
 # %% Learn the friction from 40 samples of two seconds; predict both forces in the third
 train, test = data[:400:10], data[400:]
-model = forcegp.StructuredGP(system, "analytical", [forcegp.JointFrictionPrior()], noise_std=0.1)
+model = forcegp.StructuredGP(system, "analytical", [forcegp.JointFrictionPrior()], noise=0.1)
 fit = model.fit(train)
 force = fit.predict(test.q, test.qd, test.tau, "multiplier")
-file = forcegp.AnalyticalModel(system).predict(test.q, test.qd, test.tau, "multiplier")
+file = forcegp.AnalyticalModel(system).nominal().predict(test.q, test.qd, test.tau, "multiplier")
 for i, name in enumerate(system.contact_names):
     true = test.multiplier[name]
     error, before = (force.mean[:, i] - true).abs(), (file.mean[:, i] - true).abs()

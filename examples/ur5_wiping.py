@@ -31,7 +31,7 @@ closed = test.contact["table"]
 force = fit.predict(test.q, test.qd, test.tau, "multiplier", active=closed[:, None], noise=True)
 error = (force.mean[:, 0] - test.multiplier["table"])[closed]
 inside = error.abs() <= 2.0 * force.std[closed, 0]
-alone = forcegp.AnalyticalModel(system).predict(test.q, test.qd, test.tau, "multiplier")
+alone = forcegp.AnalyticalModel(system).nominal().predict(test.q, test.qd, test.tau, "multiplier")
 before = (alone.mean[:, 0] - test.multiplier["table"])[closed]
 print(f"{int(closed.sum())} samples in contact, {test.multiplier['table'][closed].mean():.1f} N on average")
 print(f"robot file alone: bias {before.mean():+.2f} N, standard deviation {before.std():.2f} N")

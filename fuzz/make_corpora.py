@@ -46,7 +46,7 @@ def scenes_and_robots() -> None:
     """The bundled ones, and small ones of each kind."""
     for scene in (ROOT / "scene" / "bundled").glob("*.toml"):
         keep("scene", scene.stem, scene.read_bytes())
-    keep("scene", "small", b'[robot]\nmodel = "double_pendulum"\n[model]\nnoise_std = 0.1\n')
+    keep("scene", "small", b'[robot]\nmodel = "double_pendulum"\n[model]\nnoise = 0.1\n')
     bundled = ROOT / "robot" / "bundled"
     assert BUNDLED
     for path in sorted(bundled.rglob("*.urdf"))[:2]:
@@ -60,12 +60,12 @@ def models() -> None:
     """A small model of each kind."""
     data = random_data(table_system(), 4)
     for name in ("nn", "gp", "sgp-mean"):
-        model = create(name, table_system(), noise_std=0.1)
+        model = create(name, table_system(), noise=0.1)
         options = BatchOptions(epochs=1) if name == "nn" else LearningOptions(max_evaluations=1)
-        model.fit(data, options=options)  # type: ignore[call-arg]
+        fit = model.fit(data, options=options)  # type: ignore[call-arg]
         with tempfile.TemporaryDirectory() as parent:
             folder = Path(parent) / "model"
-            model.save(folder)
+            fit.save(folder)
             header, tensors = (folder / HEADER_FILE).read_bytes(), (folder / TENSOR_FILE).read_bytes()
         keep("model", name, len(header).to_bytes(4, "little") + header + tensors)
 

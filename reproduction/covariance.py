@@ -19,7 +19,7 @@ from forcegp.forces.quantities import states
 from forcegp.gp.structured_covariance import Block as Rows
 from forcegp.gp.structured_covariance import cross_gram
 from forcegp.models.load import load_model
-from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_fit import StructuredFit
 from reproduction.fits import MODEL
 from reproduction.stages import write_data
 from reproduction.task import Task
@@ -61,13 +61,13 @@ class CovarianceData(Header):
 def make_covariance(folder: Path, run: Path, rows: Path, fit: Path, *, model: str) -> None:
     """Write the figure's data for a fitted model."""
     fitted = load_model(fit / MODEL)
-    assert isinstance(fitted, StructuredGP)
+    assert isinstance(fitted, StructuredFit)
     train = Task.read(run, rows).train("stretches", STATES)
     write_data(folder, covariance_blocks(fitted, train, model))
 
 
 @torch.no_grad()
-def covariance_blocks(model: StructuredGP, data: Dataset, name: str) -> CovarianceData:
+def covariance_blocks(model: StructuredFit, data: Dataset, name: str) -> CovarianceData:
     """H, k_Q and H k_Q Hᵀ (eq. 32) with the learned hyperparameters, at the states of a data set.
 
     Args:

@@ -16,6 +16,7 @@ from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.load import load_model
 from forcegp.models.neural import NeuralNetwork
 from forcegp.models.registry import create
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from reproduction.profiles import Profile
 from reproduction.results import GP_MODELS, PAPER_KERNELS, Score
@@ -132,12 +133,12 @@ def fit_and_score(
     model = exact_model(name, task) if exact else make_model(name, task)
     options: dict[str, Any] = {"options": EXACT_LEARNING} if exact else {}
     smaller = None if before is None else load_model(before / MODEL)
-    if isinstance(model, StructuredGP) and isinstance(smaller, StructuredGP):
-        options["begin"] = smaller.hyperparameters
+    if isinstance(smaller, StructuredFit):
+        options["after"] = smaller
     resettable = reset_peak()
-    result = model.fit(task.train(split, points), **options)
+    fit = model.fit(task.train(split, points), **options)
     peak = peak_memory() if resettable else None
-    model.save(folder / MODEL)
+    fit.save(folder / MODEL)
     found = evaluate(load_model(folder / MODEL), task.test(split, test_samples), compare=False)
     score = Score(
         model=name,
@@ -146,11 +147,11 @@ def fit_and_score(
         seed=task.seed,
         **{measure: getattr(found, measure) for measure in MEASURES},
         test_samples=found.samples,
-        fit_seconds=result.seconds,
+        fit_seconds=fit.seconds,
         predict_seconds=found.seconds_per_state * found.samples,
         peak_memory=peak,
-        evaluations=result.evaluations,
-        converged=result.converged,
+        evaluations=fit.evaluations,
+        converged=fit.converged,
     )
     write_text(folder / SCORE, score.model_dump_json(indent=2))
 
@@ -159,7 +160,7 @@ def make_model(name: str, task: Task) -> Model:
     """An unfitted model by its registry name, or one of the paper's other networks."""
     if name in NETWORKS:
         return NeuralNetwork(task.system, NETWORKS[name], task.seed)
-    return create(name, task.system, noise_std=task.noise_std, seed=task.seed)
+    return create(name, task.system, noise=task.noise_std, seed=task.seed)
 
 
 def exact_model(name: str, task: Task) -> Model:

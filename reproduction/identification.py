@@ -169,7 +169,7 @@ def identify_structured(
         system.with_robot(theta.start),
         mean="analytical",
         force_priors=force_priors,
-        noise_std=noise_std,
+        noise=noise_std,
         analytical_parameters=theta,
     )
     model.fit(data, options=_options(evaluations), progress=lambda _, __, value: trace.evaluated(value))

@@ -22,10 +22,12 @@ from forcegp.data import Dataset
 from forcegp.evaluation import evaluate
 from forcegp.files import write_json, write_text
 from forcegp.logs import import_log
-from forcegp.models.base import Predictor
+from forcegp.models.analytical import AnalyticalModel
+from forcegp.models.base import FittedModel
 from forcegp.models.load import load_model
 from forcegp.models.registry import create
 from forcegp.models.sensed import force_from_sensor, sensor_noise_std, with_sensor
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.report import write_check
 from forcegp.scene import load_scene
@@ -112,9 +114,9 @@ def make_fit(folder: Path, run: Path, log: Path, *, scene: str, variant: str) ->
     write_json(folder / EVALUATED, evaluate(model, test, train=train).to_dict())
 
 
-def _model(variant: str, system: ConstrainedSystem, train: Dataset) -> Predictor:
+def _model(variant: str, system: ConstrainedSystem, train: Dataset) -> FittedModel:
     if variant == "file":
-        return create("analytical", system)
+        return AnalyticalModel(system).nominal()
     model = create(MODEL, system)
     assert isinstance(model, StructuredGP)
     if variant == "sensor":
@@ -124,9 +126,9 @@ def _model(variant: str, system: ConstrainedSystem, train: Dataset) -> Predictor
 
 def force_of(stage: Stage, test: Dataset) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean and standard deviation of the normal force of a fitted model at states, `(n,)` each [N]."""
-    model = load_model(stage.folder / "model")
-    assert isinstance(model, StructuredGP)
-    fit, active = model.fitted, test.active(model.system.contact_names)
+    fit = load_model(stage.folder / "model")
+    assert isinstance(fit, StructuredFit)
+    active = test.active(fit.system.contact_names)
     if "multiplier" in fit.noise:
         return force_from_sensor(fit, test)
     states = test.q, test.qd, test.tau

@@ -56,13 +56,13 @@ def test_names_of_a_robot_file_are_text() -> None:
 
 
 def test_a_fit_says_how_it_went() -> None:
-    model = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1)
-    assert repr(model).endswith("not fitted>")
+    model = forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1)
+    assert repr(model) == "<StructuredGP of 'kuka_iiwa': 7 joints, contact table, ball>"
     fit = model.fit(logged(two_contacts(), 8), learn=[])
     assert repr(fit) == (
         "<StructuredFit of 'kuka_iiwa': 7 joints, contact table, ball; conditioned, nothing learned>"
     )
-    words = Tags(model._repr_html_()).words
+    words = Tags(fit._repr_html_()).words
     assert words[words.index("training samples") + 1] == "8"
     assert words[words.index("noise of qdd") + 1].startswith("0.1, 0.1")
     assert words[words.index("log marginal likelihood") + 1] == f"{fit.log_marginal_likelihood:.4g}"
@@ -86,7 +86,7 @@ def test_a_fit_shows_its_progress_in_a_notebook(monkeypatch: pytest.MonkeyPatch)
 
     shell = types.SimpleNamespace(get_ipython=object, display=types.SimpleNamespace(display=display))
     monkeypatch.setitem(sys.modules, "IPython", shell)
-    fit = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1).fit(
+    fit = forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1).fit(
         logged(two_contacts(), 8), progress=FitBar()
     )
     assert len(outputs) == 1

@@ -58,8 +58,9 @@ def test_other_threads_and_later_calls_keep_their_number() -> None:
 
 def test_threads_that_predict_get_the_same_numbers() -> None:
     system = table_system()
-    model = forcegp.StructuredGP(system, noise_std=0.1)
-    model.fit(random_data(system, 12), options=forcegp.LearningOptions(max_evaluations=2))
+    model = forcegp.StructuredGP(system, noise=0.1).fit(
+        random_data(system, 12), options=forcegp.LearningOptions(max_evaluations=2)
+    )
     test = random_data(system, 20, seed=1)
     alone = model.predict(test.q, test.qd, test.tau)
     found: list[forcegp.Prediction | BaseException] = []
@@ -95,11 +96,11 @@ def counts():
     return torch.get_num_threads(), torch.get_num_interop_threads(), torch.get_default_dtype(), pools
 data, before = random_data(system, 12), counts()
 few = forcegp.LearningOptions(max_evaluations=2)
-for model in (forcegp.StructuredGP(system, noise_std=0.1), forcegp.IndependentGP(system, noise_std=0.1)):
-    model.fit(data, options=few)
-    model.predict(data.q, data.qd, data.tau)
+for model in (forcegp.StructuredGP(system, noise=0.1), forcegp.IndependentGP(system, noise=0.1)):
+    fit = model.fit(data, options=few)
+    fit.predict(data.q, data.qd, data.tau)
     path = Path(tempfile.mkdtemp()) / "model"
-    model.save(path)
+    fit.save(path)
     loaded = forcegp.load_model(path)
     options = forcegp.RolloutOptions(dt=0.01, on_divergence="keep")
     loaded.rollout(data.q[0], 0.0 * data.qd[0], 0.0 * data.tau, duration=0.05, options=options)

@@ -24,7 +24,8 @@ tip = forcegp.SurfaceContact("tip", "tool", (0, 0, 0.1), plane, radius=0.01)
 other = forcegp.ConstrainedSystem(forcegp.load_robot("ur5"), [tip], forcegp.Baumgarte())
 theta = forcegp.AnalyticalParameters(system.robot, {"mass": ["joint"], "damping": "all"})
 priors = [forcegp.SlidingFrictionPrior("table", terms=("viscous", "dry")), forcegp.JointFrictionPrior()]
-model = forcegp.StructuredGP(system, "analytical", priors, torque_noise="learn", analytical_parameters=theta)
+noise = forcegp.Noise(torque="learn")
+model = forcegp.StructuredGP(system, "analytical", priors, noise, analytical_parameters=theta)
 fit = model.fit([forcegp.Observation(data), forcegp.Observation(data, "multiplier", noise_std=0.1)])
 force = fit.predict(data.q, data.qd, data.tau, quantity="multiplier")
 if force.std is not None:
@@ -32,6 +33,8 @@ if force.std is not None:
 path = fit.rollout(data.q[0], data.qd[0], data, samples=3, options=forcegp.RolloutOptions(dt=0.01))
 print(path.q.shape, path.multiplier)
 fit.save("model")
+second = model.fit(data, learn=["noise"], after=fit).update(data)
+print(second.condition(data).log_marginal_likelihood, second.forget(0.9).training.samples)
 loaded = forcegp.load_model("model")
 print(forcegp.evaluate(loaded, data).verdict, forcegp.check(system, data).verdict)
 eom = other.equations(data.q, data.qd)

@@ -17,6 +17,7 @@ from .data import SavitzkyGolay as SavitzkyGolay
 from .data import StreamedDataset as StreamedDataset
 from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
+from .forces.noise import Noise as Noise
 from .forces.observations import Observation as Observation
 from .forces.priors.contact import ContactForcePrior as ContactForcePrior
 from .forces.priors.contact import SlidingFrictionPrior as SlidingFrictionPrior

@@ -65,7 +65,7 @@ def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
     """Write a result; if that fails, write it to another place, which the error names.
 
     Args:
-        write: writes the result to a path, such as `model.save`.
+        write: writes the result to a path, such as `fit.save`.
         path: where it belongs.
 
     Raises:

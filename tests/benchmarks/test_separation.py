@@ -38,7 +38,7 @@ def test_the_correlation_does_not_depend_on_the_order_of_observations() -> None:
     found = []
     for observations in (parts, parts[::-1]):
         model = unfitted(system, NOISE_STD)
-        model.fit(observations, learn=[])
+        model = model.fit(observations, learn=[])
         found.append(judge("both", model, data[40:][closed[40:]], data[40:][~closed[40:]]))
     # The two posteriors differ by the rounding of a factorisation in another order.
     assert found[0].correlation == pytest.approx(found[1].correlation, abs=1e-8)

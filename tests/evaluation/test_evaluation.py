@@ -14,7 +14,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp import evaluate
-from forcegp.errors import DataError, ModelError
+from forcegp.errors import DataError
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import Prediction, Predictor
 from random_data import NOISE_STD, random_data, table_system
@@ -119,7 +119,7 @@ def test_the_residual_is_that_of_closed_contacts() -> None:
     assert found.residual == pytest.approx(float(expected.mean()), rel=1e-9)
     assert found.residual_max == pytest.approx(float(expected.max()), rel=1e-9)
     free = data.replace(contact={"table": torch.zeros(3000, dtype=torch.bool)})
-    plain = forcegp.AnalyticalModel(system)
+    plain = forcegp.AnalyticalModel(system).nominal()
     assert evaluate(plain, free[:10]).residual is None
 
 
@@ -136,7 +136,7 @@ def test_chunks_do_not_matter_and_progress_is_reported(monkeypatch: pytest.Monke
 
 
 def test_without_clean_accelerations() -> None:
-    found = evaluate(forcegp.AnalyticalModel(system), data[:20].replace(extras={}))
+    found = evaluate(forcegp.AnalyticalModel(system).nominal(), data[:20].replace(extras={}))
     assert found.clean is None and found.clean_mae is None and found.coverage_clean is None
     assert found.noise_std == pytest.approx((NOISE_STD,) * 7, rel=1e-12)  # a root of a mean of squares
 
@@ -149,23 +149,24 @@ def test_everything_fits_into_json() -> None:
 
 
 def test_a_structured_gp_with_learned_noise_is_held_against_that() -> None:
-    model = forcegp.StructuredGP(system, mean="analytical", learn_noise=True, noise_std=0.3)
-    model.fit(data[:30], options=LearningOptions(max_evaluations=12))
+    model = forcegp.StructuredGP(
+        system,
+        mean="analytical",
+        noise=forcegp.Noise(learn=True, acceleration=0.3),
+    ).fit(data[:30], options=LearningOptions(max_evaluations=12))
     found = evaluate(model, data[40:60])
     learned = model.hyperparameters["noise.0.log_noise_std"].exp()
     assert found.noise_std == pytest.approx(learned.tolist())
     assert max(found.noise_std or ()) < 0.29
-    # A fit is held against the same noise as the model that contains it.
-    assert evaluate(model.fitted, data[40:60]).uncertainty == found.uncertainty
 
 
 def test_wrong_use_is_refused() -> None:
     with pytest.raises(DataError, match="nothing to evaluate on"):
-        evaluate(forcegp.AnalyticalModel(system), data[:0])
-    with pytest.raises(ModelError, match="has not been fitted"):
-        evaluate(forcegp.IndependentGP(system), data[:5])
+        evaluate(forcegp.AnalyticalModel(system).nominal(), data[:0])
+    with pytest.raises(AttributeError, match=r"call fit = model\.fit\(data\)"):
+        evaluate(forcegp.IndependentGP(system), data[:5])  # type: ignore[arg-type]
     with pytest.raises(DataError, match="joint"):
-        evaluate(forcegp.AnalyticalModel(system), data.select(tuple(reversed(data.joint_names))))
+        evaluate(forcegp.AnalyticalModel(system).nominal(), data.select(tuple(reversed(data.joint_names))))
 
 
 def test_a_perfect_model_is_better_than_every_trivial_predictor() -> None:
@@ -182,7 +183,7 @@ def test_a_perfect_model_is_better_than_every_trivial_predictor() -> None:
 
 
 def test_the_robot_file_is_not_better_than_itself() -> None:
-    found = evaluate(forcegp.AnalyticalModel(system), data[:100], train=data[100:200])
+    found = evaluate(forcegp.AnalyticalModel(system).nominal(), data[:100], train=data[100:200])
     against = {v.against: v for v in found.verdicts}
     assert against["robot file"].torque == pytest.approx(1.0) and not against["robot file"].better
     assert "but is not better than" in found.verdict

@@ -125,8 +125,9 @@ def prepare(folder: Path) -> None:
     execute("simulate", folder, folder)
     run, system = Dataset.read(folder / "run.parquet"), forcegp.load_scene(folder / "scene.toml").system()
     run[::6].write(folder / "train.parquet")
-    model = forcegp.StructuredGP(system, mean="analytical", noise_std=0.1)
-    model.fit(run[::12], options=forcegp.LearningOptions(max_evaluations=2))
+    model = forcegp.StructuredGP(system, mean="analytical", noise=0.1).fit(
+        run[::12], options=forcegp.LearningOptions(max_evaluations=2)
+    )
     model.save(folder / "model")
     joints = enumerate(system.robot.joint_names)
     (folder / "mapping.toml").write_text(MAPPING + "".join(f'{name} = "{j}"\n' for j, name in joints))

@@ -72,7 +72,7 @@ def read_log(path: Path) -> int:
 def model(version: int) -> Predictor:
     """An analytical model, which needs no fit to be saved."""
     robot = SYSTEM.robot.replace(mass=SYSTEM.robot.mass * version)
-    return forcegp.AnalyticalModel(SYSTEM.with_robot(robot))
+    return forcegp.AnalyticalModel(SYSTEM.with_robot(robot)).nominal()
 
 
 def read_model(path: Path) -> int:

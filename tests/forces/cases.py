@@ -14,6 +14,7 @@ from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrio
 from forcegp.forces.priors.default import REMAINING
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.gp.kernels import Linear, SquaredExponential
+from forcegp.models.structured_fit import StructuredFit
 
 CONTACTS = ("table", "ball")
 NOISE = 0.1
@@ -84,15 +85,14 @@ def all_priors() -> list[ForcePrior]:
 
 def conditioned(
     observations: forcegp.Dataset | list[forcegp.Observation], seed: int = 0, **settings: object
-) -> forcegp.StructuredGP:
-    """A model with hyperparameters drawn at random around the start, conditioned, nothing learned."""
+) -> StructuredFit:
+    """A fit with hyperparameters drawn at random around the start, conditioned, nothing learned."""
     settings = {"mean": "analytical", "force_priors": all_priors(), **settings}
     model = forcegp.StructuredGP(two_contacts(), **settings)  # type: ignore[arg-type]
-    model.fit(observations, learn=["noise"], options=forcegp.LearningOptions(max_evaluations=1))
+    fit = model.fit(observations, learn=["noise"], options=forcegp.LearningOptions(max_evaluations=1))
     generator = torch.Generator().manual_seed(seed)
     values = {}
-    for key, value in model.hyperparameters.items():
+    for key, value in fit.hyperparameters.items():
         step = 0.4 * torch.randn(value.shape, generator=generator, dtype=torch.float64)
         values[key] = value.clamp(min=-3.0) + step if "noise" not in key else value
-    model.condition(observations, values)
-    return model
+    return fit.condition(observations, values)

@@ -74,7 +74,7 @@ def pendulum() -> forcegp.RobotModel:
 
 
 def fitted(robot: forcegp.RobotModel, drag: float) -> StructuredFit:
-    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", noise_std=0.01)
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", noise=0.01)
     return model.fit(swing(robot, 600, 0.5, drag, 0))
 
 
@@ -108,7 +108,7 @@ def test_growth_is_learned_from_regimes(
 
 
 def test_the_region_stays_where_noise_is_not_learned_again(pendulum: forcegp.RobotModel) -> None:
-    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(pendulum), "analytical", noise_std=0.01)
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(pendulum), "analytical", noise=0.01)
     data = swing(pendulum, 200, 0.5, 0.0, 0)
     first = model.fit(data)
     second = model.fit(data, learn=["joint_friction"])

@@ -57,8 +57,7 @@ def test_friction_is_found_from_few_points() -> None:
     true = -1.5 * (point.jacobian.mT @ slip[..., None])[..., 0]
 
     def relative_error(prior: ContactForcePrior | SlidingFrictionPrior) -> float:
-        model = forcegp.StructuredGP(table, "analytical", [prior], noise_std=NOISE_STD)
-        model.fit(data)
+        model = forcegp.StructuredGP(table, "analytical", [prior], noise=NOISE_STD).fit(data)
         found = model.predict(test.q, test.qd, test.tau, "contact_friction").mean
         return float((found - true).norm() / true.norm())
 

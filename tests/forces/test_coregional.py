@@ -14,30 +14,31 @@ import forcegp
 from forcegp.errors import ModelError
 from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.quantities import affine_map
+from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 
 N = 9
 EXACT = 1e-9
 
 
-def conditioned(**settings: Any) -> forcegp.StructuredGP:
+def conditioned(**settings: Any) -> StructuredFit:
     """With two causes, random W and κ."""
     model = forcegp.StructuredGP(
-        two_contacts(), "analytical", [forcegp.CoregionalPrior(causes=2)], noise_std=0.1, **settings
+        two_contacts(), "analytical", [forcegp.CoregionalPrior(causes=2)], noise=0.1, **settings
     )
-    model.fit(logged(two_contacts(), N), learn=[])
+    model = model.fit(logged(two_contacts(), N), learn=[])
     generator = torch.Generator().manual_seed(3)
     values = {
         key: x + 0.4 * torch.randn(x.shape, generator=generator, dtype=torch.float64)
         for key, x in model.hyperparameters.items()
     }
-    model.condition(logged(two_contacts(), N), values)
+    model = model.condition(logged(two_contacts(), N), values)
     return model
 
 
-def dense(model: forcegp.StructuredGP, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+def dense(model: StructuredFit, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
     """Negative log likelihood, and mean of q̈ at the training states, of K ⊗ (W Wᵀ + diag κ)."""
-    fit, m = model.fitted, model.training.measurements[0]
+    fit, m = model, model.training.measurements[0]
     at = m.at(fit.system)
     x = torch.cat([model.training.scales[0].apply({"q": m.q, "qd": m.qd})[k] for k in ("q", "qd")], -1)
     length = values["coregional.log_lengthscale"].exp()[0]
@@ -58,7 +59,7 @@ def dense(model: forcegp.StructuredGP, values: dict[str, Tensor]) -> tuple[Tenso
 def test_likelihood_and_mean_are_the_dense_ones() -> None:
     model = conditioned(inference="exact")
     nll, mean = dense(model, dict(model.hyperparameters))
-    assert model.log_marginal_likelihood() == pytest.approx(-float(nll), rel=EXACT)
+    assert model.log_marginal_likelihood == pytest.approx(-float(nll), rel=EXACT)
     m = model.training.measurements[0]
     found = model.predict(m.q, m.qd, m.tau, active=m.active).mean
     torch.testing.assert_close(found, mean, rtol=1e-8, atol=1e-8)
@@ -68,7 +69,7 @@ def test_likelihood_and_mean_are_the_dense_ones() -> None:
 def test_gradient(inference: str) -> None:
     """Exact against the dense formula's, sparse against central differences."""
     model = conditioned(inference=inference)
-    problem, values = model.fitted.problem, {k: x.clone() for k, x in model.hyperparameters.items()}
+    problem, values = model.problem, {k: x.clone() for k, x in model.hyperparameters.items()}
 
     def objective(tensors: dict[str, Tensor]) -> Tensor:
         return problem.negative_log_likelihood(kernel_parameters(tensors), problem.rows_for(tensors, {}))
@@ -119,8 +120,13 @@ def test_a_cause_of_two_joints_is_found_and_predicted_better() -> None:
     kernel = forcegp.CoregionalPrior().kernel
     errors = {}
     for prior in (forcegp.CoregionalPrior(), forcegp.JointForcePrior(kernel, inputs=("q", "qd"))):
-        model = forcegp.StructuredGP(system, "analytical", [prior], noise_std=(0.05, 10.0), torque_noise=None)
-        model.fit(data)
+        model = forcegp.StructuredGP(
+            system,
+            "analytical",
+            [prior],
+            noise=forcegp.Noise(acceleration=(0.05, 10.0), torque=None),
+        )
+        model = model.fit(data)
         new = torch.Generator().manual_seed(8)
         q, qd, tau = (torch.randn(200, 2, generator=new, dtype=torch.float64) for _ in range(3))
         found = model.predict(q, qd, tau, "joint_force").mean - system.equations(q, qd).Q_K - tau

@@ -129,7 +129,12 @@ def pressed(mu: float, n: int, seed: int = 0) -> forcegp.Dataset:
 def test_the_coefficient_is_learned_and_the_multiplier_found(tmp_path: Path) -> None:
     train, test = pressed(0.12, 30), pressed(0.12, 30, seed=7)
     prior = SlidingFrictionPrior("table", coupled=True)
-    model = forcegp.StructuredGP(table_system(), "analytical", [prior], noise_std=0.01, torque_noise=None)
+    model = forcegp.StructuredGP(
+        table_system(),
+        "analytical",
+        [prior],
+        noise=forcegp.Noise(acceleration=0.01, torque=None),
+    )
     fit = model.fit(train)
     assert fit.result.objective < -660.0, "not the optimum where a function of the state is the friction"
     mu, eps = (float(fit.hyperparameters[key].exp()) for key in coulomb_keys("table"))
@@ -144,7 +149,9 @@ def test_the_coefficient_is_learned_and_the_multiplier_found(tmp_path: Path) -> 
 def test_updates_and_samples_carry_the_error_of_learned_friction() -> None:
     train, test = pressed(0.12, 30), pressed(0.12, 10, seed=7)
     prior = SlidingFrictionPrior("table", Linear(), coupled=True)
-    model = forcegp.StructuredGP(table_system(), "analytical", [prior], noise_std=0.05, torque_noise=None)
+    model = forcegp.StructuredGP(
+        table_system(), "analytical", [prior], noise=forcegp.Noise(acceleration=0.05, torque=None)
+    )
     fit = model.fit(train[:20])
     updated = model.update(train[20:])
     model.adopt(fit)
@@ -172,7 +179,7 @@ def test_accelerations_follow_from_the_force_field() -> None:
 
 def test_gradient_for_the_friction() -> None:
     priors = [JointFrictionPrior(), SlidingFrictionPrior("table", coupled=True)]
-    model = forcegp.StructuredGP(two_contacts(), "analytical", priors, 0.1, torque_noise=0.3)
+    model = forcegp.StructuredGP(two_contacts(), "analytical", priors, forcegp.Noise(0.1, torque=0.3))
     fit = model.fit(logged(two_contacts(), 8), learn=[])
     problem = dataclasses.replace(fit.problem, inducing=None)
     keys = coulomb_keys("table")
@@ -233,7 +240,11 @@ def test_the_multiplier_is_as_uncertain_as_learned_friction_leaves_it() -> None:
     train, test = pressed(0.12, 30), pressed(0.12, 20, seed=7)
     prior = SlidingFrictionPrior("table", Linear(), coupled=True)
     model = forcegp.StructuredGP(
-        table_system(), "analytical", [prior], noise_std=0.05, torque_noise=None, inference="exact"
+        table_system(),
+        "analytical",
+        [prior],
+        noise=forcegp.Noise(acceleration=0.05, torque=None),
+        inference="exact",
     )
     fit, keys = model.fit(train), coulomb_keys("table")
     at = states(fit.system, test.q, test.qd, test.tau, torch.ones(20, 1, dtype=torch.bool))

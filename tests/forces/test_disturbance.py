@@ -17,6 +17,7 @@ from forcegp.forces.priors.disturbance import DisturbancePrior
 from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.forces.quantities import affine_map
 from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
 
@@ -34,19 +35,17 @@ def two_runs() -> forcegp.Dataset:
 
 def model(priors: list, **settings: Any) -> forcegp.StructuredGP:
     return forcegp.StructuredGP(
-        two_contacts(), "analytical", priors, noise_std=0.1, torque_noise=None, **settings
+        two_contacts(), "analytical", priors, noise=forcegp.Noise(acceleration=0.1, torque=None), **settings
     )
 
 
-def conditioned(others: list) -> forcegp.StructuredGP:
+def conditioned(others: list) -> StructuredFit:
     """With a disturbance of `STD` and `TIME` at every joint."""
-    found = model([*others, DisturbancePrior()])
-    found.fit(two_runs(), learn=[])
+    found = model([*others, DisturbancePrior()]).fit(two_runs(), learn=[])
     values = dict(found.hyperparameters)
     values["disturbance.log_std"] = torch.full((7,), math.log(STD), dtype=torch.float64)
     values["disturbance.log_time"] = torch.full((7,), math.log(TIME), dtype=torch.float64)
-    found.condition(two_runs(), values)
-    return found
+    return found.condition(two_runs(), values)
 
 
 def dense(B: Tensor) -> Tensor:
@@ -57,21 +56,21 @@ def dense(B: Tensor) -> Tensor:
 
 
 def test_likelihood_is_the_dense_one() -> None:
-    found, plain = conditioned([JointFrictionPrior()]), model([JointFrictionPrior()], inference="exact")
-    plain.fit(two_runs(), learn=[])
-    plain.condition(two_runs(), {k: v for k, v in found.hyperparameters.items() if "friction" in k})
+    found = conditioned([JointFrictionPrior()])
+    plain = model([JointFrictionPrior()], inference="exact").fit(two_runs(), learn=[])
+    plain = plain.condition(two_runs(), {k: v for k, v in found.hyperparameters.items() if "friction" in k})
     y, noise, maps = (book := Textbook(plain)).data()
     m = found.training.measurements[0]
     K = book.gram(maps) + torch.diag(noise) + dense(affine_map(found.system, m.at(found.system), "qdd").B_Q)
     L = torch.linalg.cholesky(K)
     alpha = torch.cholesky_solve(y[:, None], L)[:, 0]
     expected = -float(0.5 * y @ alpha + L.diagonal().log().sum() + 0.5 * len(y) * math.log(2 * math.pi))
-    assert found.log_marginal_likelihood() == pytest.approx(expected, rel=EXACT)
+    assert found.log_marginal_likelihood == pytest.approx(expected, rel=EXACT)
 
 
 def test_gradient() -> None:
     found = conditioned([JointFrictionPrior()])
-    problem, values = found.fitted.problem, dict(found.hyperparameters)
+    problem, values = found.problem, dict(found.hyperparameters)
 
     def objective(part: dict[str, Tensor]) -> Tensor:
         return problem.negative_log_likelihood(kernel_parameters({**values, **part}), problem.fixed_rows)
@@ -90,7 +89,7 @@ def test_a_new_motion_sees_it_as_variance(tmp_path: Path) -> None:
     q, qd, tau = draw(3, seed=5)
     at = found.system.equations(q, qd, mixed_contacts(3))
     predicted = found.predict(q, qd, tau, active=mixed_contacts(3))
-    friction = found.fitted.posterior
+    friction = found.posterior
     own = friction.rows(
         found.system,
         found.training.measurements[0][torch.arange(1)].at(found.system),
@@ -154,7 +153,7 @@ def test_disturbances_are_learned_and_keep_friction_honest() -> None:
     )  # fmt: skip
     system = forcegp.ConstrainedSystem(robot)
     priors = [JointFrictionPrior(load=False), DisturbancePrior(OrnsteinUhlenbeck(time=0.1))]
-    fit = forcegp.StructuredGP(system, "analytical", priors, noise_std=0.02).fit(data)
+    fit = forcegp.StructuredGP(system, "analytical", priors, noise=0.02).fit(data)
     std, time = (fit.hyperparameters[f"disturbance.log_{key}"].exp() for key in ("std", "time"))
     assert bool(((std / 0.5 - 1.0).abs() < 0.25).all()), std
     assert bool(((time / 0.5).log().abs() < 0.6).all()), time

@@ -9,6 +9,7 @@ import forcegp
 from forcegp.forces.observations import COLUMNS, Observation
 from forcegp.forces.quantities import QUANTITIES, affine_map, states
 from forcegp.gp.likelihood import negative_log_likelihood
+from forcegp.models.structured_fit import StructuredFit
 from forces.cases import conditioned, draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
 
@@ -48,7 +49,7 @@ mixtures = pytest.mark.parametrize("quantities", MIXTURES.values(), ids=MIXTURES
 def test_likelihood(quantities: tuple[str, ...]) -> None:
     model = conditioned(observed(*quantities))
     expected = -float(Textbook(model).negative_log_likelihood())
-    assert model.log_marginal_likelihood() == pytest.approx(expected, rel=LIKELIHOOD)
+    assert model.log_marginal_likelihood == pytest.approx(expected, rel=LIKELIHOOD)
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -56,19 +57,20 @@ def test_likelihood_all_closed_or_all_free(closed: bool) -> None:
     data = logged(two_contacts(), 7, active=torch.full((7, 2), closed))
     model = conditioned(data)
     expected = -float(Textbook(model).negative_log_likelihood())
-    assert model.log_marginal_likelihood() == pytest.approx(expected, rel=LIKELIHOOD)
+    assert model.log_marginal_likelihood == pytest.approx(expected, rel=LIKELIHOOD)
 
 
-def gradients(model: forcegp.StructuredGP, start: dict) -> tuple[dict, dict]:
+def gradients(model: StructuredFit, start: dict) -> tuple[dict, dict]:
     """Of the negative log likelihood, ours and by autograd through the dense formula."""
     results = []
     for dense in (False, True):
         leaves = {key: value.detach().clone().requires_grad_() for key, value in start.items()}
         if dense:
-            value = Textbook(model, leaves, model.fitted.problem.system_at(leaves)).negative_log_likelihood()
+            value = Textbook(model, leaves, model.problem.system_at(leaves)).negative_log_likelihood()
         else:
-            rows = model.fitted.problem.rows(leaves)
-            kernel = {k: v for k, v in leaves.items() if not k.startswith(("noise.", "analytical."))}
+            rows = model.problem.rows(leaves)
+            others = ("noise.", "analytical_parameters.")
+            kernel = {k: v for k, v in leaves.items() if not k.startswith(others)}
             value = negative_log_likelihood(model.force_priors, kernel, rows.blocks) + rows.constant
         found = torch.autograd.grad(value, list(leaves.values()), allow_unused=True)
         results.append(dict(zip(leaves, found, strict=True)))
@@ -77,7 +79,7 @@ def gradients(model: forcegp.StructuredGP, start: dict) -> tuple[dict, dict]:
 
 @mixtures
 def test_gradient_of_kernels_and_noise(quantities: tuple[str, ...]) -> None:
-    model = conditioned(observed(*quantities, n=6), learn_noise=True)
+    model = conditioned(observed(*quantities, n=6), noise=forcegp.Noise(learn=True))
     ours, dense = gradients(model, model.hyperparameters)
     assert any(key.startswith("noise.") for key in ours)
     for key in ours:
@@ -91,8 +93,9 @@ def test_gradient_of_analytical_parameters() -> None:
     theta = forcegp.AnalyticalParameters(
         robot, {"mass": joints[4:], "com": joints[5:], "damping": "all", "offset": joints[-1:]}
     )
-    model = conditioned(observed("qdd", "multiplier", n=6), learn_noise=True, analytical_parameters=theta)
-    start = {f"analytical.{key}": value.detach() for key, value in theta.named_parameters()}
+    noise = forcegp.Noise(learn=True)
+    model = conditioned(observed("qdd", "multiplier", n=6), noise=noise, analytical_parameters=theta)
+    start = {f"analytical_parameters.{key}": value.detach() for key, value in theta.named_parameters()}
     ours, dense = gradients(model, {**model.hyperparameters, **start})
     for key in start:
         assert float(dense[key].abs().max()) > 0.0
@@ -176,8 +179,8 @@ def test_affine_maps_are_the_equations_of_motion() -> None:
 def test_noise_of_the_dense_formula_matters() -> None:
     """The check above can fail: another noise gives another likelihood."""
     data = logged(two_contacts(), 6)
-    one, two = (conditioned(data, noise_std=std) for std in (0.1, 0.101))
-    assert abs(one.log_marginal_likelihood() - two.log_marginal_likelihood()) > 1e-3
+    one, two = (conditioned(data, noise=std) for std in (0.1, 0.101))
+    assert abs(one.log_marginal_likelihood - two.log_marginal_likelihood) > 1e-3
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-2])
@@ -188,8 +191,7 @@ def test_redundant_and_nearly_redundant_contacts(angle: float) -> None:
     again = forcegp.SurfaceContact("ball", first.frame, first.point, forcegp.Plane((angle, 0.2, 1), 0.055))
     system = forcegp.ConstrainedSystem(two_contacts().robot, [first, again], forcegp.Baumgarte())
     data = logged(system, 6)
-    model = forcegp.StructuredGP(system, "analytical", noise_std=0.1)
-    model.fit(data, learn=[])
+    model = forcegp.StructuredGP(system, "analytical", noise=0.1).fit(data, learn=[])
     expected = -float(Textbook(model).negative_log_likelihood())
     # Dropping a row leaves an error of the order of the angle.
-    assert model.log_marginal_likelihood() == pytest.approx(expected, rel=1e-5)
+    assert model.log_marginal_likelihood == pytest.approx(expected, rel=1e-5)

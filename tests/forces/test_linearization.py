@@ -42,13 +42,13 @@ def test_jacobians_are_central_differences(kind: str) -> None:
     system, active = two_contacts(), mixed_contacts(STATES)
     data = logged(system, 30)
     if kind == "analytical":
-        fit = forcegp.AnalyticalModel(system).fitted
+        fit = forcegp.AnalyticalModel(system).nominal()
     elif kind == "measured":
         priors = measured_priors(system)
         fit = forcegp.StructuredGP(system, "analytical", priors, 0.1).fit(data, learn=[])
     else:
         inference = "sparse" if kind == "sparse" else "exact"
-        fit = forcegp.StructuredGP(system, "zero", noise_std=0.1, inference=inference).fit(data, learn=[])
+        fit = forcegp.StructuredGP(system, "zero", noise=0.1, inference=inference).fit(data, learn=[])
     q, qd, tau = draw(STATES, 7)
     at = fit.linearize(q, qd, tau, active=active)
     assert torch.allclose(at.qdd, fit.predict(q, qd, tau, active=active, covariance=False).mean)
@@ -62,7 +62,7 @@ def test_jacobians_are_central_differences(kind: str) -> None:
 def test_batches_keep_their_shape_and_models_without_forces_are_refused() -> None:
     system = two_contacts()
     q, qd, tau = (x.reshape(2, 3, 7) for x in draw(6, 1))
-    at = forcegp.AnalyticalModel(system).linearize(q, qd, tau)
+    at = forcegp.AnalyticalModel(system).nominal().linearize(q, qd, tau)
     assert at.dq.shape == (2, 3, 7, 7)
     assert at.multiplier_dtau.shape == (2, 3, 2, 7)
     network = forcegp.NeuralNetwork(system, hidden=[4]).fit(logged(system, 20))

@@ -71,7 +71,7 @@ def test_a_joint_that_moved_one_way_has_friction_the_other_way_too(file: forcegp
     error = torque_error(fit, test)[:, 0]
     assert float(error.mean().abs()) < 0.25 * COULOMB, "an offset would leave twice the Coulomb friction"
     force = fit.predict(test.q, test.qd, test.tau, "total_force")
-    file_alone = forcegp.AnalyticalModel(forcegp.ConstrainedSystem(file))
+    file_alone = forcegp.AnalyticalModel(forcegp.ConstrainedSystem(file)).nominal()
     found = force.mean[:, 0] - file_alone.predict(test.q, test.qd, test.tau, "total_force").mean[:, 0]
     true = -(VISCOUS * test.qd[:, 0] + COULOMB * torch.tanh(test.qd[:, 0] / 0.02))
     assert float(((found - true).abs() <= 2.0 * force.std[:, 0]).double().mean()) > 0.9
@@ -79,9 +79,8 @@ def test_a_joint_that_moved_one_way_has_friction_the_other_way_too(file: forcegp
 
 def test_defaults_of_a_measured_log_learn_friction_and_noise(file: forcegp.RobotModel) -> None:
     train, test = log(file, 800, 0), log(file, 400, 7)
-    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical")
-    fit = model.fit(train)
-    assert [prior.name for prior in model.force_priors] == ["joint_friction"]
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(train)
+    assert [prior.name for prior in fit.force_priors] == ["joint_friction"]
     assert fit.torque_std is not None
     torch.testing.assert_close(fit.torque_std, NOISE, rtol=0.2, atol=0.0)
     error = torque_error(fit, test).square().mean(0).sqrt()
@@ -94,8 +93,7 @@ def test_defaults_of_a_measured_log_learn_friction_and_noise(file: forcegp.Robot
 def test_a_simulated_log_keeps_the_smooth_prior(file: forcegp.RobotModel) -> None:
     data = log(file, 40, 0)
     simulated = data.replace(header=data.header.model_copy(update={"seed": 3}))
-    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical")
-    model.fit(simulated, learn=[])
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(simulated, learn=[])
     assert [prior.name for prior in model.force_priors] == ["joint"]
 
 
@@ -181,7 +179,7 @@ def test_white_noise_of_accelerations_does_not_hide_correlated_torques(file: for
     friction = VISCOUS * data.qd + COULOMB * torch.tanh(data.qd / 0.02)
     tau = clean + friction + 0.1 * first_order(1000, 0.9, generator)
     qdd = data.qdd + 0.1 * torch.randn(1000, 2, generator=generator, dtype=torch.float64)
-    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical", noise_std=0.1)
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical", noise=0.1)
     fit = model.fit(data.replace(tau=tau, qdd=qdd))
     assert fit.problem.power == pytest.approx(1.0 / 19.0, rel=0.5)
 

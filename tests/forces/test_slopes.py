@@ -14,6 +14,7 @@ from forcegp.forces import slopes
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.quantities import States, states
 from forcegp.forces.state_noise import learned_slopes, state_jacobian
+from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, mixed_contacts, two_contacts
 
 Q_STD, QD_STD, SAMPLES = 0.02, 0.01, 100
@@ -79,14 +80,16 @@ def measured(seed: int, samples: int = SAMPLES, noisy: bool = True) -> tuple[for
     return forcegp.Dataset(t, q, qd, tau, truth + 0.1 * normal[5], system.robot.joint_names), truth
 
 
-def fitted(seed: int, mean: str = "analytical", **settings: object) -> forcegp.StructuredGP:
-    given = {"noise_std": 0.1, "torque_noise": None, "state_noise": (Q_STD, QD_STD), **settings}
-    model = forcegp.StructuredGP(pendulum(), mean, **given)  # type: ignore[arg-type]
-    model.fit(measured(seed)[0])
-    return model
+def model(mean: str = "analytical", inference: str = "auto") -> forcegp.StructuredGP:
+    noise = forcegp.Noise(0.1, torque=None, state=(Q_STD, QD_STD))
+    return forcegp.StructuredGP(pendulum(), mean, noise=noise, inference=inference)
 
 
-def error_of(model: forcegp.StructuredGP, seed: int) -> float:
+def fitted(seed: int, mean: str = "analytical", inference: str = "auto") -> StructuredFit:
+    return model(mean, inference).fit(measured(seed)[0])
+
+
+def error_of(model: StructuredFit, seed: int) -> float:
     test, truth = measured(50 + seed, 300, noisy=False)
     return float((model.predict(test.q, test.qd, test.tau).mean - truth).abs().mean())
 
@@ -120,7 +123,7 @@ def test_slopes_are_saved_and_go_on(tmp_path: Path) -> None:
     model, (test, _) = fitted(1), measured(7, 30)
     model.save(tmp_path / "model")
     again = forcegp.load_model(tmp_path / "model")
-    assert isinstance(again, forcegp.StructuredGP)
+    assert isinstance(again, StructuredFit)
     assert torch.equal(
         model.predict(test.q, test.qd, test.tau).mean, again.predict(test.q, test.qd, test.tau).mean
     )
@@ -139,11 +142,11 @@ def test_forces_without_slopes_are_told(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(slopes, "learned_slopes", no_tensors)
     model = fitted(1)
     assert model.training.slopes is None
-    assert any("slopes of the learned forces" in warning for warning in model.fitted.result.warnings)
+    assert any("slopes of the learned forces" in warning for warning in model.result.warnings)
 
 
 def test_a_fit_that_learns_nothing_conditions_as_it_was_learned() -> None:
-    model, more = fitted(1), measured(8, 20)[0]
-    value = model.condition(more).log_marginal_likelihood
-    again = fitted(1).fit(more, learn=[])
+    fit, more = fitted(1), measured(8, 20)[0]
+    value = fit.condition(more).log_marginal_likelihood
+    again = model().fit(more, learn=[], after=fit)
     assert again.training.slopes is not None and again.log_marginal_likelihood == value

@@ -51,16 +51,14 @@ def test_other_quantities_have_no_state_noise() -> None:
     assert state_jacobian(two_contacts(), m) is None
 
 
-def model(**settings: object) -> forcegp.StructuredGP:
-    return forcegp.StructuredGP(
-        two_contacts(), "analytical", [forcegp.JointForcePrior()], noise_std=0.1, **settings
-    )  # type: ignore[arg-type]
+def model(state: object = None) -> forcegp.StructuredGP:
+    noise = forcegp.Noise(0.1, state=state)  # type: ignore[arg-type]
+    return forcegp.StructuredGP(two_contacts(), "analytical", [forcegp.JointForcePrior()], noise)
 
 
 def test_likelihood_with_state_noise_is_the_dense_one() -> None:
-    noisy = model(state_noise=(Q_STD, QD_STD))
-    fit = noisy.fit(logged(two_contacts(), 8), learn=[])
-    y, noise, maps = (book := Textbook(noisy)).data()
+    fit = model((Q_STD, QD_STD)).fit(logged(two_contacts(), 8), learn=[])
+    y, noise, maps = (book := Textbook(fit)).data()
     std = torch.cat([torch.full((7,), Q_STD), torch.full((7,), QD_STD)]).double()
     G = jacobian(fit.system, fit.training.measurements[0]) * std
     K = book.gram(maps) + torch.diag(noise) + torch.block_diag(*(G @ G.mT))
@@ -72,7 +70,7 @@ def test_likelihood_with_state_noise_is_the_dense_one() -> None:
 
 def test_no_state_noise_is_the_projected_likelihood() -> None:
     data = logged(two_contacts(), 8)
-    without, zero = model().fit(data, learn=[]), model(state_noise=(0.0, 0.0)).fit(data, learn=[])
+    without, zero = model().fit(data, learn=[]), model((0.0, 0.0)).fit(data, learn=[])
     assert zero.log_marginal_likelihood == pytest.approx(without.log_marginal_likelihood, rel=1e-9)
 
 
@@ -84,7 +82,7 @@ def test_noisy_states_are_learned_from(tmp_path: Path) -> None:
     truth = system.equations(test.q, test.qd, mixed_contacts(40)).acceleration(test.Q + test.Q_z)
     errors = []
     for state_noise in (None, (Q_STD, QD_STD)):
-        fit = model(state_noise=state_noise).fit(noisy)
+        fit = model(state_noise).fit(noisy)
         read = fit.predict(test.q, test.qd, test.tau, active=mixed_contacts(40))
         errors.append(float((read.mean - truth).abs().mean()))
     assert errors[1] < 0.7 * errors[0]
@@ -100,4 +98,4 @@ def test_noisy_states_are_learned_from(tmp_path: Path) -> None:
 @pytest.mark.parametrize("given", [(0.1, -0.1), ((0.1, 0.2), 0.1), (math.nan, 0.0)])
 def test_state_noise_that_is_not_valid(given: object) -> None:
     with pytest.raises(ModelError, match="noise of the state"):
-        model(state_noise=given)
+        model(given)

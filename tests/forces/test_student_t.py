@@ -12,6 +12,7 @@ import torch
 import forcegp
 from forcegp.errors import ModelError
 from forcegp.forces.quantities import affine_map
+from forcegp.models.structured_fit import StructuredFit
 from forces.cases import logged, two_contacts
 from forces.textbook import Textbook
 
@@ -27,8 +28,7 @@ def test_likelihood_with_weights_is_the_dense_one() -> None:
         two_contacts(),
         "analytical",
         [forcegp.JointForcePrior()],
-        noise_std=0.1,
-        torque_noise=tuple(std.tolist()),
+        noise=forcegp.Noise(acceleration=0.1, torque=tuple(std.tolist())),
         inference="exact",
     )
     fit = model.fit(logged(two_contacts(), N), learn=[])
@@ -36,7 +36,7 @@ def test_likelihood_with_weights_is_the_dense_one() -> None:
     training = dataclasses.replace(fit.training, weights=(weight,))
     problem = dataclasses.replace(fit.problem, training=training)
     found = float(problem.negative_log_likelihood(dict(fit.hyperparameters), problem.rows({})))
-    y, noise, maps = (book := Textbook(model)).data()
+    y, noise, maps = (book := Textbook(fit)).data()
     m = fit.training.measurements[0]
     B = affine_map(fit.system, m.at(fit.system), "qdd").B_Q
     every = (torch.diag_embed(noise.reshape(N, 7)) + (B * std**2) @ B.mT) / weight[:, None, None]
@@ -60,17 +60,20 @@ def with_friction(impacts: bool) -> tuple[forcegp.ConstrainedSystem, forcegp.Dat
     return forcegp.ConstrainedSystem(robot), data
 
 
-def error(impacts: bool, degrees: float | None) -> tuple[float, forcegp.StructuredGP]:
+def error(impacts: bool, degrees: float | None) -> tuple[float, StructuredFit]:
     """Mean absolute error of the friction of a new motion [N m]."""
     system, data = with_friction(impacts)
     priors = [forcegp.JointFrictionPrior(load=False)]
     model = forcegp.StructuredGP(
-        system, "analytical", priors, noise_std=0.1, torque_noise=None, degrees_of_freedom=degrees
+        system,
+        "analytical",
+        priors,
+        noise=forcegp.Noise(acceleration=0.1, torque=None, degrees_of_freedom=degrees),
     )
-    model.fit(data)
+    fit = model.fit(data)
     q, qd, tau = torch.randn(3, 300, 2, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     truth = system.equations(q, qd).Q_K + tau - 0.8 * torch.tanh(qd / 0.02) - 0.3 * qd
-    return float((model.predict(q, qd, tau, "joint_force").mean - truth).abs().mean()), model
+    return float((fit.predict(q, qd, tau, "joint_force").mean - truth).abs().mean()), fit
 
 
 def test_planted_impacts_hardly_count(tmp_path: Path) -> None:
@@ -83,7 +86,7 @@ def test_planted_impacts_hardly_count(tmp_path: Path) -> None:
     weights = model.training.weights[0]
     assert float(weights[::EVERY].max()) < 0.1
     assert float(weights.median()) > 0.8
-    assert any("hardly count" in warning for warning in model.fitted.result.warnings)
+    assert any("hardly count" in warning for warning in model.result.warnings)
     model.save(tmp_path / "model")
     again = forcegp.load_model(tmp_path / "model")
     q, qd, tau = torch.randn(3, 5, 2, dtype=torch.float64)
@@ -102,4 +105,4 @@ def test_without_impacts_little_is_lost() -> None:
 @pytest.mark.parametrize("degrees", [2.0, -1.0, float("nan")])
 def test_degrees_that_are_not_valid(degrees: float) -> None:
     with pytest.raises(ModelError, match="degrees of freedom"):
-        forcegp.StructuredGP(two_contacts(), degrees_of_freedom=degrees)
+        forcegp.StructuredGP(two_contacts(), noise=forcegp.Noise(degrees_of_freedom=degrees))

@@ -30,7 +30,11 @@ FINITE = [JointFrictionPrior(), InertialPrior()]
 
 def fitted(priors: list, torque_noise: object = tuple(STD.tolist()), n: int = 8, **settings: object):
     model = forcegp.StructuredGP(
-        two_contacts(), "analytical", priors, noise_std=0.1, torque_noise=torque_noise, **settings
+        two_contacts(),
+        "analytical",
+        priors,
+        noise=forcegp.Noise(acceleration=0.1, torque=torque_noise),
+        **settings,
     )  # type: ignore[arg-type]
     return model.fit(logged(two_contacts(), n), learn=[])
 
@@ -41,12 +45,11 @@ def test_likelihood_with_torque_noise_is_the_dense_one(priors: list) -> None:
         two_contacts(),
         "analytical",
         priors,
-        noise_std=0.1,
-        torque_noise=tuple(STD.tolist()),
+        noise=forcegp.Noise(acceleration=0.1, torque=tuple(STD.tolist())),
         inference="exact",
     )
     fit = model.fit(logged(two_contacts(), 8), learn=[])
-    y, noise, maps = (book := Textbook(model)).data()
+    y, noise, maps = (book := Textbook(fit)).data()
     m = fit.training.measurements[0]
     B = affine_map(fit.system, m.at(fit.system), "qdd").B_Q
     K = book.gram(maps) + torch.diag(noise) + torch.block_diag(*((B * STD**2) @ B.mT))
@@ -88,7 +91,12 @@ def test_finite_priors_are_inferred_sparsely_and_exactly() -> None:
 def test_a_power_of_the_likelihood_is_that_many_samples() -> None:
     """Two copies of every sample at the power ½ are the samples once."""
     data = logged(two_contacts(), 6)
-    model = forcegp.StructuredGP(two_contacts(), "analytical", FINITE, noise_std=0.1, torque_noise=0.2)
+    model = forcegp.StructuredGP(
+        two_contacts(),
+        "analytical",
+        FINITE,
+        noise=forcegp.Noise(acceleration=0.1, torque=0.2),
+    )
     once = model.fit(data, learn=[])
     twice = model.fit(data[torch.arange(6).repeat(2)], learn=[])
     tempered = force_posterior(dataclasses.replace(twice.problem, power=0.5), twice.hyperparameters)
@@ -112,7 +120,7 @@ def test_noise_of_a_predicted_measurement() -> None:
 @pytest.mark.parametrize("given", ["loud", -0.1])
 def test_torque_noise_that_is_not_valid(given: object) -> None:
     with pytest.raises(ModelError, match="noise of the motor torque"):
-        forcegp.StructuredGP(two_contacts(), "analytical", FINITE, torque_noise=given)  # type: ignore[arg-type]
+        forcegp.StructuredGP(two_contacts(), "analytical", FINITE, noise=forcegp.Noise(torque=given))  # type: ignore[arg-type]
 
 
 def test_a_joint_that_sticks_has_a_spread_of_its_own() -> None:
@@ -129,7 +137,7 @@ def test_a_joint_that_sticks_has_a_spread_of_its_own() -> None:
     tau = forcegp.dynamics.inverse_dynamics(robot, q, qd, qdd) + friction
     t = torch.arange(n, dtype=torch.float64) * 0.01
     data = forcegp.Dataset(t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names)
-    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", noise_std=0.01).fit(data)
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", noise=0.01).fit(data)
     assert not bool(fit.system.robot.armature.any()), "what holds a joint is not inertia"
     assert float(fit.hyperparameters[STICK_NOISE].exp()[0]) == pytest.approx(2.0, rel=0.2)
     assert fit.torque_std is not None and float(fit.torque_std[0]) < 0.2

@@ -13,6 +13,7 @@ import forcegp
 from forcegp.constraints.surface import Surface
 from forcegp.data import farthest_points, standardized
 from forcegp.gp.features import FLOOR, Standardization
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.scene.load import load_scene
 from forcegp.simulate import simulate
 
@@ -42,7 +43,7 @@ def motion(surface: str, seed: int, duration: float) -> forcegp.Dataset:
 
 
 @cache
-def fitted(kind: str) -> forcegp.StructuredGP:
+def fitted(kind: str) -> StructuredFit:
     data = motion("learned", 0, 4.0)
     few = data[farthest_points(standardized(torch.cat([data.q, data.qd, data.tau], -1)), 60)]
     priors = {
@@ -50,9 +51,7 @@ def fitted(kind: str) -> forcegp.StructuredGP:
         "any force": [forcegp.ContactForcePrior("table")],
         "defaults": None,
     }
-    model = forcegp.StructuredGP(on("learned"), "analytical", priors[kind], noise_std=0.1)
-    model.fit(few, options=SHORT)
-    return model
+    return forcegp.StructuredGP(on("learned"), "analytical", priors[kind], noise=0.1).fit(few, options=SHORT)
 
 
 def score(kind: str, surface: str, quantity: str = "qdd") -> tuple[float, float]:

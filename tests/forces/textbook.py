@@ -14,7 +14,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.quantities import affine_map, states
 from forcegp.gp.kernels import Kernel, Linear, Product, SquaredExponential, Stationary, Sum, sub
-from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_fit import StructuredFit
 
 
 def covariance(kernel: Kernel, params: dict[str, Tensor], x1: dict, x2: dict) -> Tensor:
@@ -62,7 +62,7 @@ class Textbook:
 
     def __init__(
         self,
-        model: StructuredGP,
+        model: StructuredFit,
         params: dict[str, Tensor] | None = None,
         system: ConstrainedSystem | None = None,
     ) -> None:
@@ -77,7 +77,7 @@ class Textbook:
         system = self.system
         at = states(system, q, qd, tau, active)
         z = affine_map(system, at, quantity)
-        mean = z.o + torch.einsum("nab,nb->na", z.B_Q, self.model.mean(system, at))
+        mean = z.o + torch.einsum("nab,nb->na", z.B_Q, self.model.problem.mean(system, at))
         operators, inputs = [], []
         for p, prior in enumerate(self.model.force_priors):
             B = z.B_z if prior.target == "contact" else z.B_Q

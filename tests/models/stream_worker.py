@@ -22,8 +22,7 @@ def model(inference: str = "sparse") -> forcegp.StructuredGP:
         two_contacts(),
         "analytical",
         [JointFrictionPrior()],
-        noise_std=0.1,
-        torque_noise=0.2,
+        noise=forcegp.Noise(acceleration=0.1, torque=0.2),
         inference=inference,
     )
 
@@ -34,7 +33,8 @@ def run(rank: int, processes: int, folder: str) -> None:
     stream.PIECE_ROWS = PIECE
     store = Path(folder) / "store"
     dist.init_process_group("gloo", init_method=store.as_uri(), rank=rank, world_size=processes)
-    fit = model().fit(forcegp.StreamedDataset((Path(folder) / "log.parquet",)), learn=[], distributed=True)
+    log = forcegp.StreamedDataset((Path(folder) / "log.parquet",), distributed=True)
+    fit = model().fit(log, learn=[])
     latent = fit.posterior.latent
     likelihood = torch.tensor(fit.log_marginal_likelihood, dtype=torch.float64)
     save_file({"weights": latent.weights, "likelihood": likelihood}, Path(folder) / f"{rank}.safetensors")  # type: ignore[attr-defined]

@@ -29,7 +29,7 @@ def states() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def test_without_a_fit_it_is_the_robot_file() -> None:
-    model, active = AnalyticalModel(system), test.active(["table"])
+    model, active = AnalyticalModel(system).nominal(), test.active(["table"])
     eom = system.equations(test.q, test.qd, active)
     Q = eom.Q_K + test.tau
     expected = {
@@ -48,7 +48,7 @@ def test_without_a_fit_it_is_the_robot_file() -> None:
 
 
 def test_several_quantities_and_any_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = AnalyticalModel(system)
+    model = AnalyticalModel(system).nominal()
     whole = model.predict(*states(), ["qdd", "multiplier"])
     assert whole.parts == {"qdd": slice(0, 7), "multiplier": slice(7, 8)}
     monkeypatch.setattr("forcegp.models.analytical.CHUNK_STATES", 7)
@@ -61,10 +61,10 @@ def test_several_quantities_and_any_batch(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_mass_and_damping_are_found_again() -> None:
     names = ("lbr_iiwa_joint_6", "lbr_iiwa_joint_7")
-    model = AnalyticalModel(system, learn={"mass": names, "damping": names}, seed=3)
-    result = model.fit(frictionless, options=LBFGS)
-    assert result.converged and result.history[0] > 10.0 * result.objective
-    robot, true = model.system.robot, system.robot
+    model = AnalyticalModel(system, analytical_parameters={"mass": names, "damping": names}, seed=3)
+    fit = model.fit(frictionless, options=LBFGS)
+    assert fit.converged and fit.history[0] > 10.0 * fit.objective
+    robot, true = fit.system.robot, system.robot
     # Noise of 0.1 rad/s² on 840 accelerations leaves the masses uncertain by some parts in a thousand.
     torch.testing.assert_close(robot.mass[5:], true.mass[5:], rtol=0.02, atol=0.0)
     torch.testing.assert_close(robot.damping[5:], true.damping[5:], rtol=0.1, atol=0.0)
@@ -75,24 +75,23 @@ def test_mass_and_damping_are_found_again() -> None:
     "options", [LBFGS, BatchOptions(epochs=20, batch=12, learning_rate=0.05)], ids=["lbfgs", "adam"]
 )
 def test_every_link_is_learned_and_stays_physical(options: LearningOptions | BatchOptions) -> None:
-    model = AnalyticalModel(system)
-    result = model.fit(frictionless, options=options)
-    assert result.evaluations == len(result.history)
-    assert result.objective < 0.2 * result.history[0]
-    robot = model.system.robot
+    fit = AnalyticalModel(system).fit(frictionless, options=options)
+    assert fit.evaluations == len(fit.history)
+    assert fit.objective < 0.2 * fit.history[0]
+    robot = fit.system.robot
     assert float(torch.linalg.eigvalsh(pseudo_inertia(robot.mass, robot.com, robot.inertia)).min()) > 0.0
     assert bool((robot.damping > 0.0).all())
     active = test.active(["table"])
-    eom = model.system.equations(test.q, test.qd, active)
-    qdd = model.predict(*states(), active=active).mean
+    eom = fit.system.equations(test.q, test.qd, active)
+    qdd = fit.predict(*states(), active=active).mean
     assert float(((eom.A @ qdd[..., None])[..., 0] - eom.b).abs().max()) < CONSTRAINT
 
 
 def test_the_start_is_random_wide_and_repeatable() -> None:
     def start(seed: int, window: Window) -> torch.Tensor:
-        model = AnalyticalModel(system, learn={"mass": "all"}, seed=seed, window=window)
-        model.fit(frictionless, options=LearningOptions("lbfgs", max_evaluations=1))
-        return model.system.robot.mass / system.robot.mass
+        model = AnalyticalModel(system, analytical_parameters={"mass": "all"}, seed=seed, window=window)
+        fit = model.fit(frictionless, options=LearningOptions("lbfgs", max_evaluations=1))
+        return fit.system.robot.mass / system.robot.mass
 
     wide = start(0, Window(relative=1.0))
     assert torch.equal(wide, start(0, Window(relative=1.0)))
@@ -103,7 +102,7 @@ def test_the_start_is_random_wide_and_repeatable() -> None:
 
 def test_wrong_use_is_refused() -> None:
     with pytest.raises(UnknownNameError, match="'weight'"):
-        AnalyticalModel(system, learn={"weight": "all"})
+        AnalyticalModel(system, analytical_parameters={"weight": "all"})
     with pytest.raises(ModelError, match="no samples to learn from"):
         AnalyticalModel(system).fit(frictionless[:0])
     with pytest.raises(ModelError, match="epochs of training"):

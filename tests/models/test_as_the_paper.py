@@ -33,7 +33,7 @@ def test_inputs_enter_in_their_units() -> None:
     x = torch.cat([m.q, m.qd, m.tau], dim=-1)
     params = {k.removeprefix("joint."): v for k, v in fit.hyperparameters.items()}
     k = squared_exponential(params, x, x)
-    y, noise, maps = Textbook(own).data()
+    y, noise, maps = Textbook(fit).data()
     H = maps[0][1][0]
     K = torch.einsum("iab,bij,jcb->iajc", H, k, H).reshape(len(y), -1) + torch.diag(noise)
     L = torch.linalg.cholesky(K)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from forcegp import CoregionalPrior, DisturbancePrior, LearningOptions
+from forcegp import CoregionalPrior, DisturbancePrior, LearningOptions, Noise
 from forcegp.errors import SceneError, UnknownNameError
 from forcegp.forces import priors
 from forcegp.forces.priors.base import ForcePrior
@@ -30,7 +30,7 @@ from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
 from forcegp.scene import load_model_table, load_scene
-from forcegp.scene.model_section import LearningSection, ModelSection
+from forcegp.scene.model_section import LearningSection, ModelSection, NoiseSection
 from logs import random_log
 
 ROOT = Path(__file__).parents[2]
@@ -52,8 +52,8 @@ def test_a_table_without_keys_is_the_default_model(made) -> None:
     found = made("")
     assert found.name == "sgp-mean" and found.options is None
     ours, plain = found.model.specification, StructuredGP(SYSTEM, "analytical").specification
-    assert (ours.mean, ours.priors, ours.torque_noise, ours.automatic) == (
-        plain.mean, plain.priors, plain.torque_noise, plain.automatic,
+    assert (ours.mean, ours.priors, ours.noise, ours.automatic) == (
+        plain.mean, plain.priors, plain.noise, plain.automatic,
     )  # fmt: skip
 
 
@@ -61,10 +61,12 @@ def test_priors_and_kernels_are_those_of_the_classes(made) -> None:
     found = made("""
 name = "sgp-zero"
 mean = ["gravity", "actuation"]
-noise_std = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
-learn_noise = true
-torque_noise = 0.5
 inference = "exact"
+[model.noise]
+acceleration = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
+learn = true
+torque = 0.5
+state = [1e-3, 1e-2]
 [[model.priors]]
 type = "joint"
 inputs = ["q", "qd"]
@@ -77,26 +79,29 @@ contact = "table"
     kernel = Sum(Linear(("qd",)), Matern52())
     assert spec.priors == (JointForcePrior(kernel, ("q", "qd")), ContactForcePrior("table"))
     assert spec.mean == AnalyticalMean(("gravity", "actuation"))
-    assert spec.noise_std == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
-    assert spec.learn_noise and spec.torque_noise == 0.5 and spec.inference == "exact"
+    assert spec.noise == Noise((0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7), True, 0.5, (1e-3, 1e-2))
+    assert spec.inference == "exact"
 
 
 def test_robot_parameters_and_learning_of_a_structured_gp(made) -> None:
     found = made("""
-torque_noise = "none"
-analytical = { damping = "all", mass = ["lbr_iiwa_joint_7"] }
+noise = { torque = "none" }
+analytical_parameters = { damping = "all", mass = ["lbr_iiwa_joint_7"] }
 learning = { optimizer = "adam", restarts = 3, warm_start = false }
 """)
     spec = found.model.specification
-    assert spec.parameters.joints == {"damping": SYSTEM.robot.joint_names, "mass": ("lbr_iiwa_joint_7",)}
-    assert spec.torque_noise is None
+    assert spec.analytical_parameters.joints == {
+        "damping": SYSTEM.robot.joint_names,
+        "mass": ("lbr_iiwa_joint_7",),
+    }
+    assert spec.noise.torque is None
     expected = LearningOptions("adam", tolerance=WITH_PARAMETERS.tolerance, restarts=3, warm_start=None)
     assert found.options == expected
 
 
 def test_noise_with_tails_disturbances_and_causes(made) -> None:
     found = made("""
-degrees_of_freedom = 4.0
+noise = { degrees_of_freedom = 4.0 }
 standardize = false
 [[model.priors]]
 type = "disturbance"
@@ -108,7 +113,7 @@ causes = 2
 hyperpriors = false
 """)
     spec = found.model.specification
-    assert (spec.degrees_of_freedom, spec.standardize) == (4.0, False)
+    assert (spec.noise.degrees_of_freedom, spec.standardize) == (4.0, False)
     assert spec.priors == (DisturbancePrior(OrnsteinUhlenbeck(2.0)), CoregionalPrior(causes=2))
     assert found.options == LearningOptions(hyperpriors=False)
 
@@ -118,10 +123,10 @@ def test_the_other_models(made) -> None:
     assert isinstance(network.model, NeuralNetwork) and network.model.hidden == (30, 20)
     assert network.model.seed == 4
     assert network.options == BatchOptions(7, SHALLOW.batch, SHALLOW.learning_rate, patience=SHALLOW.patience)
-    independent = made('name = "gp"\nnoise_std = 0.3\n[model.learning]\nmax_evaluations = 5\n')
-    assert isinstance(independent.model, IndependentGP) and independent.model.noise_std == 0.3
+    independent = made('name = "gp"\nnoise = 0.3\n[model.learning]\nmax_evaluations = 5\n')
+    assert isinstance(independent.model, IndependentGP) and independent.model.noise == 0.3
     assert independent.options == LearningOptions(max_evaluations=5)
-    text = 'name = "analytical"\nanalytical = { friction = "all" }\nwindow = { relative = 0.2 }\n'
+    text = 'name = "analytical"\nanalytical_parameters = { friction = "all" }\nwindow = { relative = 0.2 }\n'
     analytical = made(text + "[model.learning]\nbatch = 64\n").model
     assert isinstance(analytical, AnalyticalModel)
     assert list(analytical.parameters.joints) == ["friction"] and analytical.window == Window(relative=0.2)
@@ -132,8 +137,8 @@ def test_the_other_models(made) -> None:
 
 
 def test_options_of_the_caller_override_the_table(made) -> None:
-    found = made('name = "nn"\nnoise_std = 0.1\nseed = 1\n', name="gp", noise_std=0.5, seed=2)
-    assert found.name == "gp" and found.model.noise_std == 0.5
+    found = made('name = "nn"\nnoise = 0.1\nseed = 1\n', name="gp", noise_std=0.5, seed=2)
+    assert found.name == "gp" and found.model.noise == 0.5
 
 
 @pytest.mark.parametrize(
@@ -152,7 +157,16 @@ def test_options_of_the_caller_override_the_table(made) -> None:
             r"toml:3: model\.learning\.restart: unknown(.|\n)*'restarts'",
         ),
         ("[model.learning]\nrestarts = -3", r"model\.toml:3: model\.learning\.restarts: (.|\n)*greater"),
-        ('[model.analytical]\nmas = "all"', r"model\.toml:2: model\.analytical: (.|\n)*'mas'(.|\n)*'mass'"),
+        (
+            '[model.analytical_parameters]\nmas = "all"',
+            r"model\.toml:2: model\.analytical_parameters: (.|\n)*'mas'(.|\n)*'mass'",
+        ),
+        ("[model.noise]\ntorqe = 0.1", r"model\.toml:3: model\.noise\.torqe: unknown key(.|\n)*'torque'"),
+        ("noise = { torque = -1.0 }", r"model\.toml:2: model\.noise\.torque"),
+        (
+            'name = "gp"\nnoise = { torque = 1.0 }',
+            r"model\.toml:1: model: (.|\n)*noise of accelerations alone",
+        ),
         ('mean = ["gravty"]', r"model\.toml:2: model\.mean: (.|\n)*did you mean 'gravity'"),
         (
             '[[model.priors]]\ntype = "join"',
@@ -195,11 +209,15 @@ def test_every_kind_of_model_has_its_keys() -> None:
 @pytest.mark.parametrize("made", [StructuredGP, AnalyticalModel, NeuralNetwork, IndependentGP])
 def test_every_argument_of_a_model_has_a_key(made: type) -> None:
     """What the constructor takes, a table can give; a new argument needs a key."""
-    named = {"force_priors": "priors", "analytical_parameters": "analytical", "learn": "analytical"}
+    named = {"force_priors": "priors"}
     arguments = [name for name in inspect.signature(made).parameters if name != "system"]
     keys = {*COMMON, *KEYS[made.kind]}
     assert {named.get(name, name) for name in arguments} <= keys
     assert keys <= set(ModelSection.model_fields)
+
+
+def test_every_field_of_the_noise_has_a_key() -> None:
+    assert {field.name for field in dataclasses.fields(Noise)} == set(NoiseSection.model_fields)
 
 
 @pytest.mark.parametrize("options", [LearningOptions, BatchOptions])
@@ -225,7 +243,7 @@ def test_every_prior_and_kernel_of_the_library_can_be_described() -> None:
 def test_the_template_is_valid_and_shows_every_key() -> None:
     path = ROOT / "examples" / "model.toml"
     text = path.read_text()
-    for name in (*ModelSection.model_fields, *LearningSection.model_fields):
+    for name in (*ModelSection.model_fields, *NoiseSection.model_fields, *LearningSection.model_fields):
         assert re.search(rf"\b{name}\b", text), name
     found = configured(load_model_table(path), load_scene(ROOT / "scenes" / "kuka_sphere.toml").system())
     assert isinstance(found.model, StructuredGP)

@@ -41,7 +41,7 @@ def _log(payload: float) -> forcegp.Dataset:
 def _model() -> forcegp.StructuredGP:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("kuka_iiwa"))
     priors = [JointFrictionPrior(), PayloadPrior()]
-    return forcegp.StructuredGP(system, "analytical", priors, noise_std=NOISE, inference="sparse")
+    return forcegp.StructuredGP(system, "analytical", priors, noise=NOISE, inference="sparse")
 
 
 def _error(fit: StructuredFit, data: forcegp.Dataset) -> float:
@@ -50,42 +50,42 @@ def _error(fit: StructuredFit, data: forcegp.Dataset) -> float:
 
 
 def test_a_payload_is_followed_within_a_second() -> None:
-    free, loaded, model = _log(0.0), _log(1.0), _model()
-    model.fit(free[:JUMP], learn=[])
+    free, loaded = _log(0.0), _log(1.0)
+    fit = _model().fit(free[:JUMP], learn=[])
     after = loaded[JUMP + RATE : JUMP + 2 * RATE]
-    stale = _error(model.fitted, after)
+    stale = _error(fit, after)
     changes = []
     for first in range(JUMP, JUMP + RATE, STEP):
-        found = follow(model, loaded[first : first + STEP], ["payload"])
+        found = follow(fit, loaded[first : first + STEP], ["payload"])
+        fit = found.fit
         changes += [first] if found.changed else []
     assert changes, "the payload is not noticed"
     assert changes[0] - JUMP < RATE // 4
-    reference = _model()
-    reference.fit(loaded[:JUMP], learn=[])
-    now = _error(model.fitted, after)
-    assert now < AS_GOOD * _error(reference.fitted, after) + 0.02
+    reference = _model().fit(loaded[:JUMP], learn=[])
+    now = _error(fit, after)
+    assert now < AS_GOOD * _error(reference, after) + 0.02
     assert now < FIRST_ORDER * stale
     one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
-    mass = model.posterior.latent.latent_mean(1, one)[0, 0]
+    mass = fit.posterior.latent.latent_mean(1, one)[0, 0]
     assert float(mass) == pytest.approx(1.0, abs=MASS)
 
 
 def test_nothing_changes_where_nothing_does() -> None:
-    free, model = _log(0.0), _model()
-    model.fit(free[:JUMP], learn=[])
-    found = [follow(model, free[i : i + STEP], ["payload"]) for i in range(JUMP, JUMP + 100, STEP)]
-    assert not any(one.changed for one in found)
-    reference = _model()
-    reference.fit(free[:JUMP], learn=[])
-    reference.update(free[JUMP : JUMP + 100])
+    free = _log(0.0)
+    first = fit = _model().fit(free[:JUMP], learn=[])
+    for i in range(JUMP, JUMP + 100, STEP):
+        found = follow(fit, free[i : i + STEP], ["payload"])
+        assert not found.changed
+        fit = found.fit
+    reference = first.update(free[JUMP : JUMP + 100])
     test = free[300:]
-    got, want = (m.predict(test.q, test.qd, test.tau) for m in (model, reference))
+    got, want = (m.predict(test.q, test.qd, test.tau) for m in (fit, reference))
     torch.testing.assert_close(got.mean, want.mean, rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(got.covariance, want.covariance, rtol=1e-8, atol=1e-8)
 
 
 def test_a_probability_is_a_probability() -> None:
-    model, free = _model(), _log(0.0)
-    model.fit(free[:50], learn=[])
+    free = _log(0.0)
+    fit = _model().fit(free[:50], learn=[])
     with pytest.raises(ModelError, match="invalid probability of a change"):
-        follow(model, free[50:52], ["payload"], change=1.0)
+        follow(fit, free[50:52], ["payload"], change=1.0)

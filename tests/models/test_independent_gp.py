@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from forcegp import IndependentGP
+from forcegp import IndependentGP, Noise
 from forcegp.errors import DataError, ModelError, ShapeError
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.independent_gp import joint_processes
+from forcegp.models.independent_gp import IndependentFit, joint_processes
 from random_data import NOISE_STD, random_data, table_system
 
 ROUNDING = 1e-9
@@ -27,10 +27,8 @@ test = random_data(system, 25, seed=1)
 
 
 @pytest.fixture(scope="module")
-def model() -> IndependentGP:
-    fitted = IndependentGP(system, noise_std=NOISE_STD)
-    fitted.fit(data, options=FEW)
-    return fitted
+def model() -> IndependentFit:
+    return IndependentGP(system, noise=NOISE_STD).fit(data, options=FEW)
 
 
 def standardized(x: Tensor) -> Tensor:
@@ -43,12 +41,12 @@ def textbook_kernel(x1: Tensor, x2: Tensor, log_lengthscale: Tensor, log_std: Te
     return torch.exp(2.0 * log_std) * torch.exp(-0.5 * (difference**2).sum(-1))
 
 
-def textbook(model: IndependentGP, joint: int) -> tuple[Tensor, Tensor, Tensor]:
+def textbook(model: IndependentFit, joint: int) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, variance and negative log likelihood by dense solves."""
     X = standardized(torch.cat([data.q, data.qd, data.tau], dim=-1))
     X_test = standardized(torch.cat([test.q, test.qd, test.tau], dim=-1))
-    lengthscale = model.fitted.hyperparameters[f"qdd_{joint}.log_lengthscale"][0]
-    std = model.fitted.hyperparameters[f"qdd_{joint}.log_std"][0]
+    lengthscale = model.hyperparameters[f"qdd_{joint}.log_lengthscale"][0]
+    std = model.hyperparameters[f"qdd_{joint}.log_std"][0]
     K = textbook_kernel(X, X, lengthscale, std) + NOISE_STD**2 * torch.eye(len(data), dtype=torch.float64)
     k = textbook_kernel(X_test, X, lengthscale, std)
     y = data.qdd[:, joint]
@@ -58,7 +56,7 @@ def textbook(model: IndependentGP, joint: int) -> tuple[Tensor, Tensor, Tensor]:
     return mean, variance, nll
 
 
-def test_posterior_is_the_textbook_one(model: IndependentGP) -> None:
+def test_posterior_is_the_textbook_one(model: IndependentFit) -> None:
     predicted = model.predict(test.q, test.qd, test.tau)
     assert predicted.covariance is not None and predicted.variance is not None
     for joint in range(7):
@@ -69,15 +67,15 @@ def test_posterior_is_the_textbook_one(model: IndependentGP) -> None:
     assert float(off_diagonal.abs().max()) == 0.0
 
 
-def test_likelihood_is_the_textbook_one(model: IndependentGP) -> None:
+def test_likelihood_is_the_textbook_one(model: IndependentFit) -> None:
     expected = -sum(float(textbook(model, joint)[2]) for joint in range(7))
-    assert model.log_marginal_likelihood() == pytest.approx(expected, rel=ROUNDING)
+    assert model.log_marginal_likelihood == pytest.approx(expected, rel=ROUNDING)
 
 
-def test_gradient_is_that_of_the_textbook_formula(model: IndependentGP) -> None:
+def test_gradient_is_that_of_the_textbook_formula(model: IndependentFit) -> None:
     X = standardized(torch.cat([data.q, data.qd, data.tau], dim=-1))
     names = ("log_lengthscale", "log_std")
-    leaves = {n: model.fitted.hyperparameters[f"qdd_2.{n}"].clone().requires_grad_() for n in names}
+    leaves = {n: model.hyperparameters[f"qdd_2.{n}"].clone().requires_grad_() for n in names}
     K = textbook_kernel(X, X, leaves["log_lengthscale"][0], leaves["log_std"][0])
     K = K + NOISE_STD**2 * torch.eye(len(data), dtype=torch.float64)
     y = data.qdd[:, 2]
@@ -85,16 +83,15 @@ def test_gradient_is_that_of_the_textbook_formula(model: IndependentGP) -> None:
     expected = torch.autograd.grad(dense, list(leaves.values()))
 
     own = {f"qdd_2.{n}": leaves[n] for n in names}
-    value = negative_log_likelihood(joint_processes(7)[2:3], own, [model.fitted.training.block(2)])
+    value = negative_log_likelihood(joint_processes(7)[2:3], own, [model.training.block(2)])
     for got, wanted in zip(torch.autograd.grad(value, list(leaves.values())), expected, strict=True):
         torch.testing.assert_close(got, wanted, rtol=GRADIENT, atol=GRADIENT * float(wanted.abs().max()))
 
 
-def test_it_has_154_hyperparameters_and_learning_raises_the_likelihood(model: IndependentGP) -> None:
-    assert sum(value.numel() for value in model.fitted.hyperparameters.values()) == 154
-    start = IndependentGP(system, noise_std=NOISE_STD)
-    start.fit(data, options=LearningOptions(max_evaluations=1))
-    assert model.log_marginal_likelihood() > start.log_marginal_likelihood() + 10.0
+def test_it_has_154_hyperparameters_and_learning_raises_the_likelihood(model: IndependentFit) -> None:
+    assert sum(value.numel() for value in model.hyperparameters.values()) == 154
+    start = IndependentGP(system, noise=NOISE_STD).fit(data, options=LearningOptions(max_evaluations=1))
+    assert model.log_marginal_likelihood > start.log_marginal_likelihood + 10.0
 
 
 def test_the_fit_reports_all_joints() -> None:
@@ -110,7 +107,9 @@ def test_the_fit_reports_all_joints() -> None:
     assert result.jitter == 0.0
 
 
-def test_batches_of_any_shape_and_chunks_agree(model: IndependentGP, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batches_of_any_shape_and_chunks_agree(
+    model: IndependentFit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = model.predict(test.q, test.qd, test.tau)
     shaped = model.predict(test.q.reshape(5, 5, 7), test.qd.reshape(5, 5, 7), test.tau.reshape(5, 5, 7))
     assert shaped.covariance is not None and whole.covariance is not None
@@ -124,16 +123,14 @@ def test_batches_of_any_shape_and_chunks_agree(model: IndependentGP, monkeypatch
     assert model.predict(test.q[:0], test.qd[:0], test.tau[:0]).mean.shape == (0, 7)
 
 
-def test_wrong_use_is_refused(model: IndependentGP) -> None:
-    with pytest.raises(ModelError, match="has not been fitted"):
-        IndependentGP(system).predict(test.q, test.qd, test.tau)
-    with pytest.raises(ModelError, match="has not been fitted"):
-        IndependentGP(system).log_marginal_likelihood()
+def test_wrong_use_is_refused(model: IndependentFit) -> None:
+    with pytest.raises(ModelError, match="white noise of accelerations alone"):
+        IndependentGP(system, noise=Noise(0.1, torque="learn"))
     with pytest.raises(ModelError, match="predicts accelerations only"):
         model.predict(test.q, test.qd, test.tau, "multiplier")
     with pytest.raises(ShapeError, match="qd does not fit"):
         model.predict(test.q, test.qd[:, :6], test.tau)
     with pytest.raises(ModelError, match="must be positive"):
-        IndependentGP(system, noise_std=0.0).fit(data)
+        IndependentGP(system, noise=0.0).fit(data)
     with pytest.raises(DataError, match="joint"):
-        model.fit(data.select(tuple(reversed(data.joint_names))))
+        IndependentGP(system).fit(data.select(tuple(reversed(data.joint_names))))

@@ -9,7 +9,7 @@ from torch import Tensor
 from forcegp import NeuralNetwork
 from forcegp.errors import ModelError, NumericalError
 from forcegp.models.minibatch import BatchOptions, train
-from forcegp.models.neural import PAPER_ARCHITECTURES
+from forcegp.models.neural import PAPER_ARCHITECTURES, NetworkFit
 from random_data import random_data, table_system
 
 ROUNDING = 1e-12
@@ -22,24 +22,22 @@ test = random_data(system, 20, seed=1)
 
 
 @pytest.fixture(scope="module")
-def model() -> NeuralNetwork:
-    fitted = NeuralNetwork(system, (30, 20))
-    fitted.fit(data, options=FEW)
-    return fitted
+def model() -> NetworkFit:
+    return NeuralNetwork(system, (30, 20)).fit(data, options=FEW)
 
 
-def by_hand(model: NeuralNetwork, x: Tensor) -> Tensor:
+def by_hand(model: NetworkFit, x: Tensor) -> Tensor:
     """Sigmoid layers and a linear one, on standardized inputs and outputs."""
     inputs = torch.cat([data.q, data.qd, data.tau], dim=-1)
     h = (x - inputs.mean(0)) / inputs.std(0, correction=0)
-    weights = list(model.fitted.network.parameters())
+    weights = list(model.network.parameters())
     for W, b in zip(weights[:-2:2], weights[1:-2:2], strict=True):
         h = 1.0 / (1.0 + torch.exp(-(h @ W.mT + b)))
     y = h @ weights[-2].mT + weights[-1]
     return y * data.qdd.std(0, correction=0) + data.qdd.mean(0)
 
 
-def test_prediction_is_the_formula(model: NeuralNetwork) -> None:
+def test_prediction_is_the_formula(model: NetworkFit) -> None:
     x = torch.cat([test.q, test.qd, test.tau], dim=-1)
     predicted = model.predict(test.q, test.qd, test.tau)
     torch.testing.assert_close(predicted.mean, by_hand(model, x), rtol=1e-10, atol=1e-10)
@@ -49,27 +47,26 @@ def test_prediction_is_the_formula(model: NeuralNetwork) -> None:
     assert model.predict(test.q[:0], test.qd[:0], test.tau[:0]).mean.shape == (0, 7)
 
 
-def test_derivatives_of_the_network_match_differences(model: NeuralNetwork) -> None:
+def test_derivatives_of_the_network_match_differences(model: NetworkFit) -> None:
     x = torch.randn(3, 21, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    assert torch.autograd.gradcheck(model.fitted.network, (x.requires_grad_(),))
+    assert torch.autograd.gradcheck(model.network, (x.requires_grad_(),))
 
 
 @pytest.mark.parametrize("hidden", PAPER_ARCHITECTURES, ids=str)
 def test_the_networks_of_the_paper_learn(hidden: tuple[int, ...]) -> None:
-    network = NeuralNetwork(system, hidden)
     # Four layers of 200 units move slowly in the few steps of a test.
-    result = network.fit(data, options=BatchOptions(epochs=25, batch=20, learning_rate=0.005))
-    assert result.evaluations == len(result.history) == 25
-    assert result.objective == min(result.history) < 0.9 * result.history[0]
-    widths = [layer.out_features for layer in network.fitted.network if isinstance(layer, torch.nn.Linear)]
+    options = BatchOptions(epochs=25, batch=20, learning_rate=0.005)
+    fit = NeuralNetwork(system, hidden).fit(data, options=options)
+    assert fit.evaluations == len(fit.history) == 25
+    assert fit.objective == min(fit.history) < 0.9 * fit.history[0]
+    widths = [layer.out_features for layer in fit.network if isinstance(layer, torch.nn.Linear)]
     assert widths == [*hidden, 7]
 
 
 def test_the_seed_decides_and_nothing_else() -> None:
     def weights(seed: int) -> Tensor:
-        network = NeuralNetwork(system, seed=seed)
-        network.fit(data, options=FEW)
-        return next(network.fitted.network.parameters()).detach()
+        fit = NeuralNetwork(system, seed=seed).fit(data, options=FEW)
+        return next(fit.network.parameters()).detach()
 
     first = weights(0)
     torch.rand(5)
@@ -109,15 +106,13 @@ def test_held_out_samples_are_not_trained_on() -> None:
     assert len(seen) == 40
 
 
-def test_wrong_use_is_refused(model: NeuralNetwork) -> None:
+def test_wrong_use_is_refused(model: NetworkFit) -> None:
     with pytest.raises(ModelError, match="at least one unit"):
         NeuralNetwork(system, (80, 0))
-    with pytest.raises(ModelError, match="has not been fitted"):
-        NeuralNetwork(system).predict(test.q, test.qd, test.tau)
     with pytest.raises(ModelError, match="predicts accelerations only"):
         model.predict(test.q, test.qd, test.tau, "joint_force")
     with pytest.raises(ModelError, match="too few samples"):
-        model.fit(data[:1])
+        NeuralNetwork(system).fit(data[:1])
     nan = {"x": torch.full((1,), float("inf"), dtype=torch.float64)}
     with pytest.raises(NumericalError, match="diverged in epoch 1"):
         train(quadratic, nan, 10, FEW, torch.Generator().manual_seed(0))

@@ -22,20 +22,16 @@ def model(inference: str = "sparse") -> forcegp.StructuredGP:
         two_contacts(),
         "analytical",
         [JointFrictionPrior()],
-        noise_std=0.1,
-        torque_noise=0.2,
+        noise=forcegp.Noise(acceleration=0.1, torque=0.2),
         inference=inference,
     )
 
 
 @pytest.mark.parametrize("inference", ["sparse", "exact"])
 def test_an_update_is_a_refit(inference: str, tmp_path: Path) -> None:
-    reference, grown = model(inference), model(inference)
-    for one in (reference, grown):
-        one.fit(data[:16], learn=[])
-    reference.condition(data)  # keeps the input scales of the first samples, as an update does
-    grown.update(data[16:20])
-    grown.update(data[20:])
+    first = model(inference).fit(data[:16], learn=[])
+    reference = first.condition(data)  # keeps the input scales of the first samples, as an update does
+    grown = first.update(data[16:20]).update(data[20:])
     grown.save(tmp_path / "grown")
     grown = forcegp.load_model(tmp_path / "grown")
     q, qd, tau = draw(5, seed=3)
@@ -46,9 +42,8 @@ def test_an_update_is_a_refit(inference: str, tmp_path: Path) -> None:
 
 
 def test_forgetting_returns_to_the_prior() -> None:
-    one = model()
-    before = one.fit(data, learn=[])
-    after = one.forget(1e-9)
+    before = model().fit(data, learn=[])
+    after = before.forget(1e-9)
     q, qd, tau = draw(5, seed=3)
     spread = [fit.predict(q, qd, tau, "joint_force").variance for fit in (before, after)]
     assert bool((spread[1] > spread[0]).all())
@@ -57,12 +52,10 @@ def test_forgetting_returns_to_the_prior() -> None:
 
 
 def test_what_cannot_be_updated() -> None:
-    exact = model("exact")
-    exact.fit(data, learn=[])
+    exact = model("exact").fit(data, learn=[])
     with pytest.raises(ModelError, match="exact inference cannot forget"):
         exact.forget(0.5)
-    sparse = model()
-    sparse.fit(data, learn=[])
+    sparse = model().fit(data, learn=[])
     with pytest.raises(ModelError, match="invalid forgetting factor"):
         sparse.forget(0.0)
     with pytest.raises(ModelError, match="measures other quantities"):

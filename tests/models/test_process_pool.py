@@ -13,6 +13,8 @@ import torch
 
 import forcegp
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.forces.quantities import States
+from forcegp.models.structured_fit import StructuredFit
 from random_data import random_data, table_system
 
 DATA = random_data(table_system(), 12)
@@ -28,14 +30,17 @@ def pool() -> Iterator[ProcessPoolExecutor]:
             yield workers
 
 
-def predicted(model: forcegp.StructuredGP, quantity: str) -> torch.Tensor:
+def identity(system: forcegp.ConstrainedSystem, at: States) -> torch.Tensor:
+    return torch.eye(7, dtype=torch.float64).expand(len(at.q), 7, 7)
+
+
+def predicted(model: StructuredFit, quantity: str) -> torch.Tensor:
     """What a worker predicts, as a tensor that is sent back by value."""
     return model.predict(DATA.q, DATA.qd, DATA.tau, quantity).mean.clone()
 
 
 def test_a_worker_predicts_the_same_bits_and_raises_the_same_error(pool: ProcessPoolExecutor) -> None:
-    model = forcegp.StructuredGP(table_system(), noise_std=0.1)
-    model.fit(DATA, options=FEW)
+    model = forcegp.StructuredGP(table_system(), noise=0.1).fit(DATA, options=FEW)
     here = predicted(model, "qdd")
     assert pool.submit(predicted, model, "qdd").result(timeout=120).tolist() == here.tolist()
     with pytest.raises(ForceGPError, match="unknown quantity") as there:
@@ -45,6 +50,18 @@ def test_a_worker_predicts_the_same_bits_and_raises_the_same_error(pool: Process
     assert str(there.value) == str(error.value) and type(there.value) is type(error.value)
 
 
-def test_a_model_without_a_fit_says_so_before_it_is_sent(pool: ProcessPoolExecutor) -> None:
-    with pytest.raises(ModelError, match="has not been fitted"):
-        pool.submit(predicted, forcegp.StructuredGP(table_system()), "qdd").result(timeout=120)
+def fitted(model: forcegp.StructuredGP) -> list[float]:
+    """What a worker fits and predicts."""
+    return predicted(model.fit(DATA, options=FEW), "qdd").flatten().tolist()
+
+
+def test_a_worker_fits_a_model_to_the_same_bits(pool: ProcessPoolExecutor) -> None:
+    model = forcegp.StructuredGP(table_system(), noise=0.1)
+    assert pool.submit(fitted, model).result(timeout=120) == fitted(model)
+
+
+def test_a_fit_of_python_code_says_so_before_it_is_sent(pool: ProcessPoolExecutor) -> None:
+    hill = forcegp.OperatorForcePrior("own", 7, identity)
+    fit = forcegp.StructuredGP(table_system(), force_priors=[hill], noise=0.1).fit(DATA, learn=[])
+    with pytest.raises(ModelError, match="holds Python code"):
+        pool.submit(predicted, fit, "qdd").result(timeout=120)

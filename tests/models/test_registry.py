@@ -47,11 +47,11 @@ def test_noise_seed_and_options_arrive() -> None:
     network = create("nn", system, seed=5, hidden=(30, 20))
     assert isinstance(network, forcegp.NeuralNetwork)
     assert (network.seed, network.hidden) == (5, (30, 20))
-    analytical = create("analytical", system, seed=6, learn={"mass": "all"})
+    analytical = create("analytical", system, seed=6, analytical_parameters={"mass": "all"})
     assert isinstance(analytical, forcegp.AnalyticalModel)
     assert analytical.seed == 6 and set(analytical.parameters.joints) == {"mass"}
     for name in ("gp", "sgp-zero", "sgp-mean", "sgp-contact"):
-        assert create(name, system, noise_std=0.3).noise_std == 0.3  # type: ignore[attr-defined]
+        assert create(name, system, noise=0.3).get_params()["noise"] == 0.3
 
 
 def test_an_unknown_name_lists_the_models() -> None:

@@ -26,11 +26,11 @@ CASES: dict[str, tuple[Callable[[], Any], Any]] = {
         forcegp.LearningOptions(max_evaluations=8, tolerance=0.0),
     ),
     "independent": (
-        lambda: forcegp.IndependentGP(table_system(), noise_std=0.1),
+        lambda: forcegp.IndependentGP(table_system(), noise=0.1),
         forcegp.LearningOptions(max_evaluations=4),
     ),
     "structured": (
-        lambda: forcegp.StructuredGP(table_system(), noise_std=0.1),
+        lambda: forcegp.StructuredGP(table_system(), noise=0.1),
         forcegp.LearningOptions(max_evaluations=8),
     ),
 }
@@ -68,14 +68,14 @@ def test_a_resumed_fit_ends_with_the_same_bits(
     with pytest.raises(KeyboardInterrupt):
         make().fit(DATA, options=options, checkpoint=file, progress=Interruption(at))
     assert file.is_file()
-    resumed = make().fit(DATA, options=options, checkpoint=file, keep_checkpoint=True)
+    resumed = make().fit(DATA, options=options, checkpoint=file)
     assert resumed.history == whole.history
     expected, found = tensors(whole), tensors(resumed)
     assert found.keys() == expected.keys()
     assert all(torch.equal(found[name], expected[name]) for name in expected)
-    assert file.is_file(), "kept on request"
+    assert file.is_file(), "kept until the caller has saved the fit"
     again = make().fit(DATA, options=options, checkpoint=file)
-    assert again.history == whole.history and not file.exists()
+    assert again.history == whole.history
 
 
 def test_a_training_by_epochs_does_not_repeat_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,20 +91,20 @@ def test_a_training_by_epochs_does_not_repeat_them(tmp_path: Path, monkeypatch: 
 def test_a_checkpoint_of_other_data_is_refused(case: tuple[Callable[[], Any], Any], tmp_path: Path) -> None:
     make, options = case
     file = tmp_path / "fit.ckpt"
-    make().fit(DATA, options=options, checkpoint=file, keep_checkpoint=True)
+    make().fit(DATA, options=options, checkpoint=file)
     with pytest.raises(ModelError, match="belongs to another fit"):
         make().fit(random_data(table_system(), 30, seed=9), options=options, checkpoint=file)
 
 
 @pytest.mark.parametrize(
-    "other", [{"standardize": False}, {"degrees_of_freedom": 4.0}, {"inducing_points": 7}]
+    "other",
+    [{"standardize": False}, {"noise": forcegp.Noise(0.1, degrees_of_freedom=4.0)}, {"inducing_points": 7}],
 )
 def test_a_checkpoint_of_another_objective_is_refused(other: dict[str, Any], tmp_path: Path) -> None:
     file, options = tmp_path / "fit.ckpt", forcegp.LearningOptions(max_evaluations=3)
-    model = forcegp.StructuredGP(table_system(), noise_std=0.1)
-    model.fit(DATA, options=options, checkpoint=file, keep_checkpoint=True)
+    forcegp.StructuredGP(table_system(), noise=0.1).fit(DATA, options=options, checkpoint=file)
     with pytest.raises(ModelError, match="belongs to another fit"):
-        forcegp.StructuredGP(table_system(), noise_std=0.1, **other).fit(
+        forcegp.StructuredGP(table_system(), **{"noise": 0.1, **other}).fit(
             DATA, options=options, checkpoint=file
         )
 
@@ -121,7 +121,7 @@ def test_a_checkpoint_of_another_objective_is_refused(other: dict[str, Any], tmp
 def test_a_damaged_state_is_refused(name: str, value: float | None, message: str, tmp_path: Path) -> None:
     make, options = CASES["network"]
     file = tmp_path / "fit.ckpt"
-    make().fit(DATA, options=options, checkpoint=file, keep_checkpoint=True)
+    make().fit(DATA, options=options, checkpoint=file)
     found, key = module.read_keyed(file)
     if value is None:
         del found[name]

@@ -86,13 +86,13 @@ def test_an_acceleration_of_1e8_is_refused(scene: str, mean: str) -> None:
 def test_a_noise_below_rounding_is_refused(noise: float) -> None:
     system, train, _ = drawn("kuka_plane", 30)
     with pytest.raises(NumericalError, match=r"noise at least [\d.e+]+ times as large"):
-        forcegp.StructuredGP(system, noise_std=noise).fit(train, options=FEW)
+        forcegp.StructuredGP(system, noise=noise).fit(train, options=FEW)
 
 
 def test_noise_learned_from_noise_free_accelerations_warns_and_is_right() -> None:
     system, data, test = drawn("pendulum_wire", 40)
     clean = dataclasses.replace(data, qdd=data.extras["qdd_clean"])
-    fit = forcegp.StructuredGP(system, "analytical", learn_noise=True).fit(clean)
+    fit = forcegp.StructuredGP(system, "analytical", noise=forcegp.Noise(learn=True)).fit(clean)
     assert any("ended at their lower bound" in doubt for doubt in fit.result.warnings)
     assert deviation_errors(fit, test) < WITHIN
 
@@ -103,7 +103,7 @@ def test_a_variance_that_is_rounding_and_a_negative_eigenvalue_are_refused() -> 
     fit = model.fit(train, options=FEW)
     strong = {k: v + 16.0 if k.endswith("_std") else v for k, v in fit.hyperparameters.items()}
     with pytest.raises(NumericalError, match="does not resolve"):
-        model.condition(train, strong)
+        model = model.condition(train, strong)
     covariance = torch.tensor([[1.0, 1.1], [1.1, 1.0]], dtype=torch.float64).expand(3, 2, 2)
     with pytest.raises(NumericalError, match=r"3 of 3 covariances .* not positive"):
         Prediction(torch.zeros(3, 2), covariance)

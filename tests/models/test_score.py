@@ -12,15 +12,21 @@ import torch
 import forcegp
 from forcegp.errors import DataError, UnknownNameError
 from forcegp.models.base import Model
+from forcegp.models.structured_fit import StructuredFit
 from forces.cases import logged, two_contacts
 
 
 def models() -> list[Model]:
     system = two_contacts()
     return [
-        forcegp.StructuredGP(system, "analytical", noise_std=0.2, inference="exact"),
-        forcegp.StructuredGP(system, "zero", [forcegp.JointForcePrior()], learn_noise=True, torque_noise=0.1),
-        forcegp.IndependentGP(system, noise_std=0.3),
+        forcegp.StructuredGP(system, "analytical", noise=0.2, inference="exact"),
+        forcegp.StructuredGP(
+            system,
+            "zero",
+            [forcegp.JointForcePrior()],
+            noise=forcegp.Noise(learn=True, torque=0.1),
+        ),
+        forcegp.IndependentGP(system, noise=0.3),
         forcegp.NeuralNetwork(system, hidden=(5, 4), seed=3),
         forcegp.AnalyticalModel(system, seed=2),
     ]
@@ -38,8 +44,9 @@ def test_parameters_make_a_copy(model: Model) -> None:
 
 
 def test_score_is_the_coefficient_of_determination() -> None:
-    model = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1)
-    model.fit(logged(two_contacts(), 12), learn=[])
+    model = forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1).fit(
+        logged(two_contacts(), 12), learn=[]
+    )
     data = logged(two_contacts(), 30, seed=5)
     with torch.no_grad():
         mean = model.predict(data.q, data.qd, data.tau, active=data.active(("table", "ball"))).mean.numpy()
@@ -56,8 +63,7 @@ def test_score_is_the_coefficient_of_determination() -> None:
 
 @pytest.mark.parametrize("inertia", ["file", "auto"])
 def test_a_saved_model_knows_where_its_inertia_is_from(inertia: str, tmp_path: Path) -> None:
-    model = forcegp.StructuredGP(two_contacts(), noise_std=0.1, inertia=inertia)
-    model.fit(logged(two_contacts(), 12), learn=[])
-    model.save(tmp_path / "model")
+    model = forcegp.StructuredGP(two_contacts(), noise=0.1, inertia=inertia)
+    model.fit(logged(two_contacts(), 12), learn=[]).save(tmp_path / "model")
     loaded = forcegp.load_model(tmp_path / "model")
-    assert isinstance(loaded, forcegp.StructuredGP) and loaded.get_params()["inertia"] == inertia
+    assert isinstance(loaded, StructuredFit) and loaded.specification.inertia == inertia

@@ -27,6 +27,7 @@ from forcegp.forces.start import negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
 from forcegp.gp.optimise import LearningOptions
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.storage.checkpoint import Checkpoint
 from forces.cases import all_priors, conditioned, draw, logged, mixed_contacts, two_contacts
@@ -44,21 +45,20 @@ both = (JointForcePrior(), ContactForcePrior("table"))
 
 def fitted(
     rows: forcegp.Dataset = data, options: LearningOptions = SHORT, **settings: object
-) -> StructuredGP:
+) -> StructuredFit:
     model = StructuredGP(table, **{"mean": "analytical", "force_priors": both, **settings})  # type: ignore[arg-type]
-    model.fit(rows, options=options)
-    return model
+    return model.fit(rows, options=options)
 
 
 @pytest.fixture(scope="module")
-def model() -> StructuredGP:
+def model() -> StructuredFit:
     return fitted()
 
 
 # -- edge cases -----------------------------------------------------------------------------------
 
 
-def is_right(model: StructuredGP) -> None:
+def is_right(model: StructuredFit) -> None:
     """Finite, PSD, on the constraint, and equal to the textbook's answer."""
     q, qd, tau = draw(3, seed=11)
     active = torch.tensor([[True], [True], [False]])
@@ -97,10 +97,9 @@ def test_a_joint_that_never_moves_is_reported_and_left_unscaled() -> None:
     active = data.active(["table"])
     qdd = table.equations(q, qd, active).acceleration(data.tau)
     still = dataclasses.replace(data, q=q, qd=qd, qdd=qdd, extras={})
-    model = StructuredGP(table, "analytical", both)
-    result = model.fit(still, options=SHORT)
-    assert result.constant_inputs == ("joint.q[2]", "joint.qd[2]")
-    is_right(model)
+    fit = StructuredGP(table, "analytical", both).fit(still, options=SHORT)
+    assert fit.constant_inputs == ("joint.q[2]", "joint.qd[2]")
+    is_right(fit)
 
 
 def test_badly_scaled_inputs_are_standardized() -> None:
@@ -118,17 +117,16 @@ def test_badly_scaled_inputs_are_standardized() -> None:
 def test_little_noise(std: float) -> None:
     """The mean passes through noise-free accelerations, or the jitter says how much noise was assumed."""
     clean = dataclasses.replace(data, qdd=data.qdd_clean)
-    model = StructuredGP(table, "analytical", both, noise_std=std)
-    result = model.fit(clean, options=SHORT)
-    found = model.predict(data.q, data.qd, data.tau, active=data.active(["table"]))
-    effective = std * math.sqrt(1.0 + result.jitter)
+    fit = StructuredGP(table, "analytical", both, noise=std).fit(clean, options=SHORT)
+    found = fit.predict(data.q, data.qd, data.tau, active=data.active(["table"]))
+    effective = std * math.sqrt(1.0 + fit.jitter)
     assert float((found.mean - clean.qdd).abs().max()) < 100.0 * effective
-    assert math.isfinite(result.log_marginal_likelihood or math.nan)
+    assert math.isfinite(fit.log_marginal_likelihood or math.nan)
 
 
 def test_contradicting_duplicates_without_noise_report_their_jitter() -> None:
     rows = data[torch.tensor([0] * 6 + [1] * 6)]
-    result = StructuredGP(table, "zero", both, noise_std=1e-7).fit(rows, options=SHORT)
+    result = StructuredGP(table, "zero", both, noise=1e-7).fit(rows, options=SHORT)
     assert result.jitter > 0.0
 
 
@@ -137,7 +135,7 @@ def test_contradicting_duplicates_without_noise_report_their_jitter() -> None:
 
 @pytest.mark.parametrize("batch", [(), (1,), (4,), (2, 3), (0,), (2, 0)])
 @pytest.mark.parametrize("quantity", list(QUANTITIES))
-def test_batch_shapes(model: StructuredGP, batch: tuple[int, ...], quantity: str) -> None:
+def test_batch_shapes(model: StructuredFit, batch: tuple[int, ...], quantity: str) -> None:
     d = {"multiplier": 1, "contact_force": 3}.get(quantity, 7)
     q, qd, tau = (x[: math.prod(batch)].reshape(*batch, 7) for x in (data.q, data.qd, data.tau))
     found = model.predict(q, qd, tau, quantity)
@@ -150,7 +148,7 @@ def test_batch_shapes(model: StructuredGP, batch: tuple[int, ...], quantity: str
     assert without.covariance is None and without.variance is None and without.std is None
 
 
-def test_states_broadcast_and_each_is_predicted_by_itself(model: StructuredGP) -> None:
+def test_states_broadcast_and_each_is_predicted_by_itself(model: StructuredFit) -> None:
     wide = model.predict(data.q[:2, None], data.qd[:3], data.tau[0])
     assert wide.mean.shape == (2, 3, 7)
     one = model.predict(data.q[1], data.qd[2], data.tau[0])
@@ -181,7 +179,7 @@ def test_transfer_to_another_surface_and_to_free_motion() -> None:
     assert none.mean.shape == (30, 0) and none.covariance is not None and none.covariance.shape == (30, 0, 0)
 
 
-def test_transfer_without_the_contact_of_a_prior_is_refused(model: StructuredGP) -> None:
+def test_transfer_without_the_contact_of_a_prior_is_refused(model: StructuredFit) -> None:
     other = dataclasses.replace(table.contacts[0], name="floor")  # type: ignore[type-var]
     with pytest.raises(UnknownNameError, match=r"unknown contact 'table'[\s\S]*floor"):
         model.predict(data.q, data.qd, data.tau, system=ConstrainedSystem(table.robot, [other]))
@@ -193,51 +191,56 @@ def test_transfer_without_the_contact_of_a_prior_is_refused(model: StructuredGP)
 def test_two_stages_hold_the_first_prior_and_its_scales() -> None:
     free, closed = data[~data.contact["table"]], data[data.contact["table"]]
     model = StructuredGP(table, "analytical", both)
-    model.fit(free, options=SHORT, learn=["joint"])
-    first, scale = dict(model.hyperparameters), model.training.scales[0]
-    assert bool((model.predict(data.q, data.qd, data.tau, "contact_friction").mean == 0.0).all())
-    model.fit(closed, options=SHORT, learn=["contact_table"])
+    one = model.fit(free, options=SHORT, learn=["joint"])
+    first, scale = dict(one.hyperparameters), one.training.scales[0]
+    assert bool((one.predict(data.q, data.qd, data.tau, "contact_friction").mean == 0.0).all())
+    two = model.fit(closed, options=SHORT, learn=["contact_table"], after=one)
     for key, value in first.items():
-        assert torch.equal(model.hyperparameters[key], value) == key.startswith("joint."), key
-    assert model.training.scales[0] is scale
-    position = model.training.scales[1].mean["position"]
+        assert torch.equal(two.hyperparameters[key], value) == key.startswith("joint."), key
+    assert two.training.scales[0] is scale
+    position = two.training.scales[1].mean["position"]
     point = table.equations(closed.q, closed.qd).contact_points["table"].position
     assert torch.allclose(position, point.mean(0)[:2])
-    both_again = model.hyperparameters
-    model.condition([Observation(free), Observation(closed)])
-    assert model.hyperparameters == both_again
-    assert float(model.predict(data.q, data.qd, data.tau, "contact_friction").mean.abs().max()) > 0.0
-    is_right(model)
+    whole = two.condition([Observation(free), Observation(closed)])
+    assert whole.hyperparameters == two.hyperparameters
+    assert float(whole.predict(data.q, data.qd, data.tau, "contact_friction").mean.abs().max()) > 0.0
+    is_right(whole)
 
 
-def test_conditioning_on_other_data_is_a_fit_that_learns_nothing(model: StructuredGP) -> None:
-    other, again = random_data(table, 6, seed=3), fitted()
-    again.condition(other)
+def test_conditioning_on_other_data_is_a_fit_that_learns_nothing(model: StructuredFit) -> None:
+    other = random_data(table, 6, seed=3)
+    again = fitted().condition(other)
     for key, value in model.hyperparameters.items():
         assert torch.equal(again.hyperparameters[key], value)
     assert again.training.scales[0].mean["q"].tolist() == model.training.scales[0].mean["q"].tolist()
     mean = again.predict(other.q, other.qd, other.tau).mean
-    result = again.fit(other, learn=[])
-    assert (result.converged, result.evaluations, result.message) == (True, 0, "conditioned, nothing learned")
-    assert torch.equal(again.predict(other.q, other.qd, other.tau).mean, mean)
-    assert result.log_marginal_likelihood == again.log_marginal_likelihood()
+    held = StructuredGP(table, "analytical", both).fit(other, learn=[], after=model)
+    assert (held.converged, held.evaluations, held.message) == (True, 0, "conditioned, nothing learned")
+    assert torch.equal(held.predict(other.q, other.qd, other.tau).mean, mean)
+    assert held.log_marginal_likelihood == again.log_marginal_likelihood
 
 
 def test_learned_noise_and_honest_flags() -> None:
     rows = random_data(table, 60, seed=2)
-    model = StructuredGP(table, "analytical", both, noise_std=0.3, learn_noise=True)
-    result = model.fit(rows, options=LearningOptions(max_evaluations=40))
-    noise = model.hyperparameters["noise.0.log_noise_std"].exp()
+    model = StructuredGP(
+        table,
+        "analytical",
+        both,
+        noise=forcegp.Noise(acceleration=0.3, learn=True),
+    )
+    fit = model.fit(rows, options=LearningOptions(max_evaluations=40))
+    noise = fit.hyperparameters["noise.0.log_noise_std"].exp()
     assert noise.shape == (7,)
     # Sixty samples leave room to take some noise of single joints for force.
     assert abs(float(noise.log().mean()) - math.log(0.1)) < 0.4, "the data have noise of 0.1"
-    assert result.evaluations == len(result.history) and result.seconds > 0.0
-    assert result.log_marginal_likelihood == pytest.approx(model.log_marginal_likelihood())
+    assert fit.evaluations == len(fit.history) and fit.seconds > 0.0
+    again = fit.condition(rows)
+    assert again.log_marginal_likelihood == pytest.approx(fit.log_marginal_likelihood)
     assert not StructuredGP(table).fit(rows, options=LearningOptions(max_evaluations=2)).converged
     with pytest.raises(
         ModelError, match=r"learned noise belongs to other measurements[\s\S]*expected: qdd\n"
     ):
-        model.condition([Observation(rows), Observation(rows)])
+        fit = fit.condition([Observation(rows), Observation(rows)])
 
 
 def test_progress_is_reported() -> None:
@@ -250,25 +253,26 @@ def test_progress_is_reported() -> None:
 # -- files ----------------------------------------------------------------------------------------
 
 
-def same(one: StructuredGP, two: object, seed: int = 1) -> None:
-    assert isinstance(two, StructuredGP)
+def same(one: StructuredFit, two: object, seed: int = 1) -> None:
+    assert isinstance(two, StructuredFit)
     (q, qd, tau), n = draw(5, seed), len(one.system.contacts)
     active = mixed_contacts(5)[:, :n]
     for quantity in ("qdd", "multiplier", "contact_friction"):
         a, b = (m.predict(q, qd, tau, quantity, active=active) for m in (one, two))
         assert torch.equal(a.mean, b.mean) and torch.equal(a.covariance, b.covariance)  # type: ignore[arg-type]
-    assert one.log_marginal_likelihood() == two.log_marginal_likelihood()
+    assert one.log_marginal_likelihood == two.log_marginal_likelihood
 
 
 def test_saved_models_are_exact_whatever_they_are_made_of(tmp_path: Path) -> None:
     kernel = SquaredExponential(("q",)) * Matern52(("qd",)) + Linear(("qd", "tau"))
     priors = [JointForcePrior(kernel, periodic=False, name="noisy"), *all_priors()[1:]]
-    noise = {"noise_std": [0.1, 0.2, 0.3, 0.1, 0.1, 0.1, 0.2], "learn_noise": True}
+    noise = forcegp.Noise([0.1, 0.2, 0.3, 0.1, 0.1, 0.1, 0.2], learn=True)
     observations = [
         Observation(logged(two_contacts(), 6)),
         Observation(logged(two_contacts(), 5, seed=4), "multiplier", [1.0, 2.0]),
     ]
-    model = conditioned(observations, force_priors=priors, mean=forcegp.AnalyticalMean(("gravity",)), **noise)
+    mean = forcegp.AnalyticalMean(("gravity",))
+    model = conditioned(observations, force_priors=priors, mean=mean, noise=noise)
     model.save(tmp_path / "model")
     same(model, forcegp.load_model(tmp_path / "model"))
 
@@ -324,7 +328,7 @@ HOSTILE: dict[str, Callable[[dict, dict], object]] = {
     "more measurements": lambda h, t: h["settings"].update(measured=["qdd"] * 3),
     "no measurement": lambda h, t: h["settings"].update(measured=[]),
     "no prior": lambda h, t: h["settings"].update(priors=[]),
-    "negative noise": lambda h, t: h["settings"].update(noise_std="much"),
+    "negative noise": lambda h, t: h["settings"]["noise"].update(acceleration="much"),
     "extra setting": lambda h, t: h["settings"].update(code="import os"),
     "deep kernel": deep,
     "kernel beyond recursion": lambda h, t: deep(h, t, 4000),
@@ -347,7 +351,7 @@ HOSTILE: dict[str, Callable[[dict, dict], object]] = {
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("change", HOSTILE.values(), ids=HOSTILE.keys())
 def test_hostile_files_are_refused_when_they_are_read(
-    model: StructuredGP, change: Callable, tmp_path: Path
+    model: StructuredFit, change: Callable, tmp_path: Path
 ) -> None:
     folder = tmp_path / "model"
     model.save(folder)
@@ -406,11 +410,11 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "did you mean 'joint'",
     ),
     "noise length": (
-        lambda: fitted(noise_std=[0.1, 0.2]),
+        lambda: fitted(noise=[0.1, 0.2]),
         ModelError,
         r"one number, 7, or \(20, 7\)[\s\S]*\(2,\)",
     ),
-    "noise zero": (lambda: fitted(noise_std=0.0), ModelError, "must be positive and finite"),
+    "noise zero": (lambda: fitted(noise=0.0), ModelError, "must be positive and finite"),
     "no rows": (lambda: fitted(data[:0]), ModelError, "no samples to learn from"),
     "no observation": (lambda: StructuredGP(table).fit([]), ModelError, "no samples to learn from"),
     "noise of a sensor": (
@@ -428,9 +432,11 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         UnknownNameError,
         "unknown contact with a logged multiplier 'table'",
     ),
-    "not fitted": (lambda: StructuredGP(table).predict(data.q, data.qd, data.tau), ModelError, "model.fit"),
-    "not fitted, save": (lambda: StructuredGP(table).save("nowhere"), ModelError, "has not been fitted"),
-    "not fitted, condition": (lambda: StructuredGP(table).condition(data), ModelError, "has not been fitted"),
+    "after another model": (
+        lambda: StructuredGP(table, "zero", [both[0]]).fit(data, after=fitted(force_priors=[both[1]])),
+        ModelError,
+        r"fit of another model[\s\S]*expected: priors joint[\s\S]*got: priors contact_table",
+    ),
 }
 
 
@@ -443,7 +449,7 @@ def test_what_does_not_fit_is_refused(
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_states_that_do_not_fit_are_refused(model: StructuredGP) -> None:
+def test_states_that_do_not_fit_are_refused(model: StructuredFit) -> None:
     q, qd, tau = data.q, data.qd, data.tau
     with pytest.raises(ShapeError, match=r"q does not fit robot 'kuka_iiwa'[\s\S]*got: \(20, 6\)"):
         model.predict(q[:, :6], qd, tau)
@@ -479,13 +485,13 @@ def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.M
 
     model = forcegp.StructuredGP(two_contacts())
     with pytest.raises(Interrupted):
-        model.fit(data, options=options, progress=stop, checkpoint=path)
+        model = model.fit(data, options=options, progress=stop, checkpoint=path)
     assert path.is_file()
     again: list[float] = []
     note = lambda done, most, value: again.append(value)  # noqa: E731
     resumed = model.fit(data, options=options, progress=note, checkpoint=path)
     assert again[: len(seen)] == seen
-    assert not path.exists()
+    assert path.is_file(), "kept until the caller has saved the fit"
     whole = forcegp.StructuredGP(two_contacts()).fit(data, options=options)
     assert resumed.history == whole.history
     assert all(torch.equal(x, resumed.hyperparameters[key]) for key, x in whole.hyperparameters.items())
@@ -515,45 +521,44 @@ def test_warm_start_ends_as_well_and_restarts_no_worse() -> None:
 
 def test_a_fit_begins_at_the_hyperparameters_of_another() -> None:
     data = logged(two_contacts(), 24)
-    small, large, again = (forcegp.StructuredGP(two_contacts(), "analytical") for _ in range(3))
-    small.fit(data[:12])
+    model = forcegp.StructuredGP(two_contacts(), "analytical")
+    small = model.fit(data[:12])
     seen: list[float] = []
-    large.fit(data, begin=small.hyperparameters, progress=lambda e, m, value: seen.append(value))
-    again.fit(data, learn=[])
-    prior = float(negative_log_prior(small.hyperparameters, again.hyperparameters))
-    again.condition(data, small.hyperparameters)
-    assert seen[0] == pytest.approx(prior - again.log_marginal_likelihood(), rel=1e-9)
+    model = model.fit(data, after=small, progress=lambda e, m, value: seen.append(value))
+    start = model.fit(data, learn=[])
+    prior = float(negative_log_prior(small.hyperparameters, start.hyperparameters))
+    again = start.condition(data, small.hyperparameters)
+    assert seen[0] == pytest.approx(prior - again.log_marginal_likelihood, rel=1e-9)
     assert min(seen) < seen[0]
     missing = {key: value for key, value in small.hyperparameters.items() if "bias" not in key}
     with pytest.raises(
         ModelError, match=r"incompatible initial hyperparameters: joint\.left\.left\.log_bias_std"
     ):
-        large.fit(data, begin=missing)
+        model = model.fit(data, after=dataclasses.replace(small, hyperparameters=missing))
 
 
 def test_a_part_of_the_data_has_distinct_states() -> None:
     data = logged(two_contacts(), 10)
-    model = forcegp.StructuredGP(two_contacts())
-    model.fit(data[torch.arange(10).repeat(3)], learn=[])
-    assert model.training is not None
-    (few,) = model.training.thinned(6).measurements
+    fit = forcegp.StructuredGP(two_contacts()).fit(data[torch.arange(10).repeat(3)], learn=[])
+    (few,) = fit.training.thinned(6).measurements
     assert len(few.q) == 6 and len(few.q.unique(dim=0)) == 6
-    (all_,) = model.training.thinned(30).measurements
+    (all_,) = fit.training.thinned(30).measurements
     assert len(all_.q) == 10
 
 
 def test_the_normal_force_prior_changes_multipliers_alone() -> None:
     data = logged(two_contacts(), 10)
     joint = forcegp.JointForcePrior()
-    plain = forcegp.StructuredGP(two_contacts(), force_priors=[joint])
-    open_ = forcegp.StructuredGP(two_contacts(), force_priors=[joint, forcegp.NormalForcePrior(joint)])
-    plain.fit(data, options=forcegp.LearningOptions(max_evaluations=5))
-    open_.fit(data, learn=[])
+    normal = forcegp.NormalForcePrior(joint)
+    plain = forcegp.StructuredGP(two_contacts(), force_priors=[joint]).fit(
+        data, options=forcegp.LearningOptions(max_evaluations=5)
+    )
+    open_ = forcegp.StructuredGP(two_contacts(), force_priors=[joint, normal]).fit(data, learn=[])
     start, learned = open_.hyperparameters, plain.hyperparameters
     for values in (start, learned):
         # The search itself amplifies rounding: data that differ by 10⁻¹⁵ are learned 10⁻⁵ apart.
-        plain.condition(data, values), open_.condition(data, values)
-        assert open_.log_marginal_likelihood() == pytest.approx(plain.log_marginal_likelihood(), rel=1e-12)
+        plain, open_ = plain.condition(data, values), open_.condition(data, values)
+        assert open_.log_marginal_likelihood == pytest.approx(plain.log_marginal_likelihood, rel=1e-12)
     assert learned.keys() == start.keys()
     state = (data.q, data.qd, data.tau)
     a, b = plain.predict(*state), open_.predict(*state)

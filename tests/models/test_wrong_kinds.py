@@ -37,6 +37,6 @@ def test_every_wrong_argument_is_a_typed_error(lines: list[str]) -> None:
     assert "call torch.tensor(q" in found["q=list"]
 
 
-def test_copies_of_a_model_predict_the_same_bits(lines: list[str]) -> None:
-    copies = ("pickle", "pickle of the fit", "deepcopy", "save and load")
+def test_copies_of_a_fit_predict_the_same_bits(lines: list[str]) -> None:
+    copies = ("pickle", "fit of a pickled model", "deepcopy", "save and load")
     assert lines[CALLS:] == [f"{name} same" for name in copies]

@@ -15,6 +15,7 @@ from matplotlib.collections import FillBetweenPolyCollection
 
 import forcegp
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.rollout.trajectory import FIELDS
 from forces.cases import logged, two_contacts
 from logs import JOINTS, random_log
@@ -31,10 +32,10 @@ def closed_figures() -> Iterator[None]:
 
 
 @cache
-def fitted() -> forcegp.StructuredGP:
-    model = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1)
-    model.fit(logged(two_contacts(), 12), learn=[])
-    return model
+def fitted() -> StructuredFit:
+    return forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1).fit(
+        logged(two_contacts(), 12), learn=[]
+    )
 
 
 def curve(axes: Axes, label: str) -> np.ndarray:
@@ -122,12 +123,10 @@ def test_a_prediction_by_itself() -> None:
 
 def test_a_rollout_with_the_spread_of_its_samples() -> None:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-    law = forcegp.AnalyticalModel(system)
+    law = forcegp.AnalyticalModel(system).nominal()
     q = torch.tensor([0.3, -0.2], dtype=torch.float64)
     tau = torch.zeros(11, 2, dtype=torch.float64)
-    path = forcegp.AnalyticalModel.rollout(
-        law, q, 0.0 * q, tau, duration=0.1, options=forcegp.RolloutOptions(0.01)
-    )
+    path = law.rollout(q, 0.0 * q, tau, duration=0.1, options=forcegp.RolloutOptions(0.01))
     spread = torch.stack([path.q + 0.1, path.q - 0.1, path.q])
     path = dataclasses.replace(path, samples=dataclasses.replace(path, q=spread))
     axes = path.plot(joints=[system.robot.joint_names[1]])

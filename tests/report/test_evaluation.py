@@ -15,7 +15,7 @@ from random_data import random_data, table_system
 
 system = table_system()
 data = random_data(system, 80)
-model = AnalyticalModel(system)
+model = AnalyticalModel(system).nominal()
 found = evaluate(model, data)
 window = predicted_window(model, opening(data, 0.2), model.kind)
 

@@ -103,24 +103,24 @@ def test_with_the_sensor_at_each_state_the_force_is_better_than_either(logs: dic
     model = create("sgp-real", SYSTEM)
     assert isinstance(model, StructuredGP)
     few = LearningOptions(max_evaluations=15)
-    model.fit(with_sensor(train[::8], SYSTEM, FORCE_NOISE), options=few)
+    model = model.fit(with_sensor(train[::8], SYSTEM, FORCE_NOISE), options=few)
     found = evaluate(model, test, compare=False)
     (own,), (sensed,) = found.multipliers, found.sensed
     assert sensed.spread < min(own.spread, FORCE_NOISE)
     # An independent formula: the mean of two independent measurements, weighted by their precisions.
     test = test[test.contact["ball"]]
-    mean, std = force_from_sensor(model.fitted, test)
+    mean, std = force_from_sensor(model, test)
     states = test.q, test.qd, test.tau
     active = test.active(SYSTEM.contact_names)
-    alone = model.fitted.predict(*states, "multiplier", active=active)
+    alone = model.predict(*states, "multiplier", active=active)
     assert alone.variance is not None
-    w2 = (alone.variance + model.fitted.noise_variance(*states, "multiplier", active, sensor=False))[:, 0]
+    w2 = (alone.variance + model.noise_variance(*states, "multiplier", active, sensor=False))[:, 0]
     precision = 1.0 / w2 + 1.0 / FORCE_NOISE**2
     expected = (alone.mean[:, 0] / w2 + sensed_force(test, SYSTEM) / FORCE_NOISE**2) / precision
     np.testing.assert_allclose(mean, expected, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(std, precision**-0.5, rtol=1e-9)
     with pytest.raises(ModelError, match="not fitted to a force sensor"):
-        force_from_sensor(model.fitted, truth)
+        force_from_sensor(model, truth)
 
 
 def test_a_sensor_needs_one_contact_and_its_columns(logs: dict[str, Dataset]) -> None:

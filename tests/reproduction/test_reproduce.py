@@ -11,7 +11,7 @@ import torch
 from forcegp.data import Dataset
 from forcegp.errors import DataError, UnknownNameError
 from forcegp.models.load import load_model
-from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.report.animation import animation_source
 from forcegp.report.rollout_data import RolloutData, together
 from forcegp.report.window import WindowData
@@ -96,7 +96,7 @@ def test_the_paper_s_own_models_make_a_page(tmp_path: Path) -> None:
     text = made.page.read_text(encoding="utf-8")
     assert "its kernel alone on inputs in their units" in text and "state where learning starts" in text
     model = load_model(next(tmp_path.glob("stages/fit/**/sgp-zero-20/model")))
-    assert isinstance(model, StructuredGP)
+    assert isinstance(model, StructuredFit)
     assert model.hyperparameters["joint.log_lengthscale"].numel() == 147
 
 

@@ -143,8 +143,8 @@ def test_lift_off_is_learned_from_sliding(name: str) -> None:
     """Learned with noise on another motion that never lifts off, the loss is where PyBullet has it."""
     data = pulled_off(viscous_friction=1.0)
     lost = int((~data.contact["table"]).nonzero()[0, 0])
-    model = create(name, arm(Baumgarte()), noise_std=0.1)
-    model.fit(sliding(), options=LearningOptions(max_evaluations=40))
+    model = create(name, arm(Baumgarte()), noise=0.1)
+    model = model.fit(sliding(), options=LearningOptions(max_evaluations=40))
     for before in (24, 60):
         start = lost - before
         found = model.rollout(

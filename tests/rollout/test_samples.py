@@ -13,9 +13,10 @@ from forcegp.errors import DataError, ModelError
 from forcegp.forces.quantities import states
 from forcegp.forces.samples import draw_samples
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.analytical import AnalyticalModel
-from forcegp.models.base import Model
+from forcegp.models.analytical import AnalyticalFit, AnalyticalModel
+from forcegp.models.base import FittedModel
 from forcegp.models.registry import create
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.rollout_data import RolloutData, rollout_data
 from forcegp.report.rollouts import PAGE, animation_source, write_rollouts
@@ -41,9 +42,9 @@ def log() -> Dataset:
 
 
 @cache
-def fitted(mean: str = "analytical") -> StructuredGP:
-    model = StructuredGP(arm(Baumgarte()), mean=mean, noise_std=0.1)
-    model.fit(log()[torch.arange(0, 288, 7)], options=LearningOptions(max_evaluations=15))
+def fitted(mean: str = "analytical") -> StructuredFit:
+    model = StructuredGP(arm(Baumgarte()), mean=mean, noise=0.1)
+    model = model.fit(log()[torch.arange(0, 288, 7)], options=LearningOptions(max_evaluations=15))
     return model
 
 
@@ -132,8 +133,8 @@ def test_a_contact_that_is_open_is_lost() -> None:
 
 @pytest.mark.parametrize("name", ["gp", "nn"])
 def test_a_model_of_accelerations_stays_on_its_own_system(name: str) -> None:
-    data, model = log(), create(name, arm(Baumgarte()), noise_std=0.1)
-    model.fit(data[torch.arange(0, 288, 24)])
+    data, model = log(), create(name, arm(Baumgarte()), noise=0.1)
+    model = model.fit(data[torch.arange(0, 288, 24)])
     free = ConstrainedSystem(model.system.robot)
     with pytest.raises(ModelError, match="predicts accelerations of the system that it was fitted on"):
         model.rollout(data.q[0], data.qd[0], data, 0.02, system=free)
@@ -152,7 +153,7 @@ def test_a_learned_model_loses_no_contact_while_it_slides() -> None:
 
 
 def test_models_without_a_posterior_say_so() -> None:
-    data, plain = log(), AnalyticalModel(arm(Baumgarte()))
+    data, plain = log(), AnalyticalModel(arm(Baumgarte())).nominal()
     with pytest.raises(ModelError, match="no uncertainty of the multiplier"):
         contact_loss_probability(plain, data.q[0], data.qd[0], data.tau[0])
     with pytest.raises(ModelError, match="no function samples"):
@@ -161,21 +162,22 @@ def test_models_without_a_posterior_say_so() -> None:
         plain.rollout(data.q[0], data.qd[0], data, 0.02).need_samples()
 
 
-class Freefloating(AnalyticalModel):
+class Freefloating(AnalyticalFit):
     """A model of accelerations alone, that knows of no surface."""
 
     def force_field(self) -> None:
         return None
 
-    def predict(self, q, qd, tau, quantity="qdd", *, active=None, covariance=True):
+    def predict(self, q, qd, tau, quantity="qdd", *, active=None, covariance=True, system=None):
         return super().predict(q, qd, tau, "qdd_free", active=active, covariance=covariance)
 
 
 def test_comparison_tells_models_apart_and_the_page_holds_them(tmp_path, monkeypatch) -> None:
     system = arm(Baumgarte())
-    models: dict[str, Model] = {
-        "analytical": AnalyticalModel(system),
-        "nn": Freefloating(system),
+    plain = AnalyticalModel(system).nominal()
+    models: dict[str, FittedModel] = {
+        "analytical": plain,
+        "nn": Freefloating(**vars(plain)),
         "sgp-mean": fitted(),
     }
     found = compare(models, log(), 0.3, starts=2, samples=3)
@@ -217,7 +219,7 @@ def test_a_rollout_beside_its_log() -> None:
 
 def test_a_selected_log_cannot_be_compared_with() -> None:
     data = log()
-    models: dict[str, Model] = {"analytical": AnalyticalModel(arm(Baumgarte()))}
+    models: dict[str, FittedModel] = {"analytical": AnalyticalModel(arm(Baumgarte())).nominal()}
     with pytest.raises(DataError, match="too short"):
         compare(models, data, 50.0)
     with pytest.raises(DataError, match="too short"):

@@ -59,7 +59,7 @@ def test_the_bundled_scene_is_the_papers_task() -> None:
     assert system.robot.gravity.tolist() == [0, 0, -9.8]
     assert system.robot.base_position.tolist() == [0, 0, 0.05]
     assert (scene.simulation.dt, scene.simulation.viscous_friction) == (1 / 240, 1.0)
-    assert scene.simulation.noise_std == 0.1 and scene.model.section.noise_std is None
+    assert scene.simulation.noise_std == 0.1 and scene.model.section.noise.acceleration is None
 
 
 @pytest.mark.parametrize("path", [*BUNDLED, *sorted(ROOT.glob("scenes/*.toml"))], ids=str)
@@ -77,14 +77,14 @@ def test_the_example_shows_every_key_of_the_simulation() -> None:
 
 def test_all_tables(tmp_path: Path) -> None:
     connection = '[[connection]]\nname = "hold"\nframe = "lbr_iiwa_link_7"\nother_point = [0.4, 0, 0.5]\n'
-    scene = load_scene(written(tmp_path, TEXT + connection + "[model]\nnoise_std = 0.2\n"))
+    scene = load_scene(written(tmp_path, TEXT + connection + "[model]\nnoise = 0.2\n"))
     system = scene.system(dtype=torch.float32)
     assert system.contact_names == ("table", "wall", "hold")
     assert system.contacts[1].surface == Cylinder((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.2)  # pyright: ignore
     held = PointConnection("hold", "lbr_iiwa_link_7", (0.0, 0.0, 0.0), None, (0.4, 0.0, 0.5))
     assert system.contacts[2] == held
     assert system.robot.dtype == torch.float32
-    assert scene.model.section.noise_std == 0.2
+    assert scene.model.section.noise.acceleration == 0.2
     assert scene.simulation.duration == 5.0 and scene.simulation.gains.position_stiffness == 64.0
     assert scene.simulation.gains.position_damping == SimulationConfig().gains.position_damping
 

@@ -185,12 +185,12 @@ def test_a_checkpoint_of_another_robot_or_surface_is_refused(fresh: Callable[[],
     data, path = random_data(system(), 6), fresh().path
     options = LearningOptions(max_evaluations=5, warm_start=None)
     with pytest.raises(KeyboardInterrupt):
-        forcegp.StructuredGP(system(), noise_std=0.1).fit(
+        forcegp.StructuredGP(system(), noise=0.1).fit(
             data, options=options, progress=interrupt(2), checkpoint=path
         )
     for other in (system(offset=0.06), system(mass=1.01)):
         with pytest.raises(ModelError, match="belongs to another fit"):
-            forcegp.StructuredGP(other, noise_std=0.1).fit(data, options=options, checkpoint=path)
+            forcegp.StructuredGP(other, noise=0.1).fit(data, options=options, checkpoint=path)
 
 
 def test_a_resumed_fit_with_restarts_keeps_the_best_and_its_file_until_it_is_saved(
@@ -198,7 +198,7 @@ def test_a_resumed_fit_with_restarts_keeps_the_best_and_its_file_until_it_is_sav
 ) -> None:
     data, path = random_data(system(), 12), fresh().path
     options = LearningOptions(max_evaluations=4, warm_start=4, restarts=1)
-    whole = forcegp.StructuredGP(system(), noise_std=0.1).fit(data, options=options)
+    whole = forcegp.StructuredGP(system(), noise=0.1).fit(data, options=options)
     seen: list[int] = []
 
     def stop(done: int, most: int, value: float) -> None:
@@ -206,12 +206,11 @@ def test_a_resumed_fit_with_restarts_keeps_the_best_and_its_file_until_it_is_sav
         if len(seen) == 6:
             raise KeyboardInterrupt
 
-    model = forcegp.StructuredGP(system(), noise_std=0.1)
+    model = forcegp.StructuredGP(system(), noise=0.1)
     with pytest.raises(KeyboardInterrupt):
         model.fit(data, options=options, progress=stop, checkpoint=path)
-    resumed = model.fit(data, options=options, checkpoint=path, keep_checkpoint=True)
+    resumed = model.fit(data, options=options, checkpoint=path)
     assert resumed.objective == whole.objective
     assert resumed.history == whole.history
     assert path.is_file()
     assert model.fit(data, options=options, checkpoint=path).objective == whole.objective
-    assert not path.exists()

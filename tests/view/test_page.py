@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 import forcegp
 from forcegp.cli import app
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.view.motion import Motion, at_rest, of_log, pictures, with_rollout
 from forcegp.view.page import Stage, force_text, write_view
 from forcegp.view.shapes import shapes_of
@@ -23,10 +24,10 @@ viser = pytest.importorskip("viser")
 
 
 @cache
-def fitted() -> forcegp.StructuredGP:
-    model = forcegp.StructuredGP(two_contacts(), "analytical", noise_std=0.1)
-    model.fit(logged(two_contacts(), 12), learn=[])
-    return model
+def fitted() -> StructuredFit:
+    return forcegp.StructuredGP(two_contacts(), "analytical", noise=0.1).fit(
+        logged(two_contacts(), 12), learn=[]
+    )
 
 
 def log() -> forcegp.Dataset:
@@ -97,9 +98,8 @@ def test_one_file_without_references(tmp_path: Path, capfd: pytest.CaptureFixtur
 def test_paths_of_a_rollout_are_added() -> None:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
     q = torch.tensor([0.3, -0.2], dtype=torch.float64)
-    path = forcegp.AnalyticalModel(system).rollout(
-        q, 0.0 * q, torch.zeros(1, 2, dtype=torch.float64), 0.1, options=forcegp.RolloutOptions(0.01)
-    )
+    tau, options = torch.zeros(1, 2, dtype=torch.float64), forcegp.RolloutOptions(0.01)
+    path = forcegp.AnalyticalModel(system).nominal().rollout(q, 0.0 * q, tau, 0.1, options=options)
     motion = with_rollout(Motion(system, np.zeros(1), q[None]), path)
     assert [p.kind for p in motion.paths] == ["predicted"]
     np.testing.assert_allclose(motion.paths[0].points, path.tip("tip").numpy())

@@ -182,10 +182,9 @@ def model_table(config: Path | None, scene: str | None) -> ModelTable:
 
 def warn_beyond(model: Predictor, data: Dataset) -> None:
     """Print a warning where a model is asked for states far from those that it was trained on."""
-    from forcegp.evaluation.predicted import structured_fit_of
     from forcegp.forces.torque_noise import warnings_beyond
+    from forcegp.models.structured_fit import StructuredFit
 
-    fit = structured_fit_of(model)
-    beyond = None if fit is None else fit.beyond(data.qd, data.tau)
+    beyond = model.beyond(data.qd, data.tau) if isinstance(model, StructuredFit) else None
     for doubt in () if beyond is None else warnings_beyond(beyond, data.joint_names):
         typer.secho(f"warning: {doubt}", fg="yellow", err=True)

@@ -97,7 +97,6 @@ def fit(
                 done, most, "" if math.isnan(value) else f"objective {value:.4g}"
             ),
             checkpoint=checkpoint,
-            keep_checkpoint=True,
         )
     write_or_keep(fitted.save, out)
     if checkpoint is not None:

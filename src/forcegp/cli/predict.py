@@ -112,13 +112,12 @@ def _predicted(
     if not (noise or sensor):
         found = model.predict(part.q, part.qd, part.tau, quantity, active=active)
         return found.mean, found.std
-    fit = getattr(model, "fitted", model)
-    if not isinstance(fit, StructuredFit):
+    if not isinstance(model, StructuredFit):
         raise ModelError("--noise and --sensor need a structured Gaussian process", got=model.kind)
     if sensor:
-        mean, std = force_from_sensor(fit, part)
+        mean, std = force_from_sensor(model, part)
         return mean[:, None], std[:, None]
-    found = fit.predict(part.q, part.qd, part.tau, quantity, active=active, noise=True)
+    found = model.predict(part.q, part.qd, part.tau, quantity, active=active, noise=True)
     return found.mean, found.std
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from forcegp.data import Dataset
-    from forcegp.models.base import Model
+    from forcegp.models.base import FittedModel
     from forcegp.rollout import Rollout, RolloutOptions
 
 
@@ -97,7 +97,7 @@ def rollout(
     show({**_figures(path, rolled, dt), **written}, as_json)
 
 
-def _roll(regression: Model, log: Dataset, options: RolloutOptions, samples: int, seed: int) -> Rollout:
+def _roll(regression: FittedModel, log: Dataset, options: RolloutOptions, samples: int, seed: int) -> Rollout:
     """From the first state of the log under its torques, to its end."""
     steps = len(log) - 1
     with progress_bar("rolling out", steps) as progress:

@@ -12,7 +12,7 @@ from forcegp.cli.common import AsJson, data_of_robot, progress_bar, read_data, s
 if TYPE_CHECKING:
     from forcegp.constraints import ConstrainedSystem
     from forcegp.data import Dataset
-    from forcegp.models.base import Model
+    from forcegp.models.base import FittedModel
     from forcegp.view.motion import Motion
     from forcegp.view.shapes import Shape
 
@@ -93,7 +93,7 @@ def view(
     show(figures, as_json)
 
 
-def _target(target: str) -> tuple[ConstrainedSystem, Model | None, list[Shape]]:
+def _target(target: str) -> tuple[ConstrainedSystem, FittedModel | None, list[Shape]]:
     """The system, the model if the target is one, and what the robot looks like."""
     from forcegp.robot.load import BUNDLED
     from forcegp.view.shapes import shapes_of
@@ -111,7 +111,7 @@ def _target(target: str) -> tuple[ConstrainedSystem, Model | None, list[Shape]]:
 
 
 def _motion(
-    system: ConstrainedSystem, model: Model | None, log: Path | None, start: int, seconds: float
+    system: ConstrainedSystem, model: FittedModel | None, log: Path | None, start: int, seconds: float
 ) -> Motion:
     from forcegp.view.motion import at_rest, of_log
 
@@ -141,7 +141,7 @@ def _stretch(log: Path, system: ConstrainedSystem, start: int, seconds: float) -
     return own[own.t <= own.t[0] + seconds]
 
 
-def _with_paths(motion: Motion, model: Model, data: Dataset, samples: int, horizon: float) -> Motion:
+def _with_paths(motion: Motion, model: FittedModel, data: Dataset, samples: int, horizon: float) -> Motion:
     """The motion with the paths that the model predicts from its first state."""
     from forcegp.view.motion import sampled_rollout, with_rollout
 

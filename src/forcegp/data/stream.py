@@ -199,6 +199,8 @@ class StreamedDataset:
         differentiate: how to compute the columns `qd` and `qdd` where the log has none.
         joints: the joints wanted, in this order; by default those of the files.
         dtype, device: of the tensors.
+        distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each of them
+            makes the same call and gets the same fit.
 
     Raises:
         DataError: there is not a file, one does not exist, or one is not Parquet.
@@ -220,6 +222,7 @@ class StreamedDataset:
     joints: tuple[str, ...] | None = None
     dtype: torch.dtype = torch.float64
     device: torch.device | str = "cpu"
+    distributed: bool = False
 
     def __post_init__(self) -> None:
         if not self.files:

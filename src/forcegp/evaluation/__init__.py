@@ -163,14 +163,13 @@ def evaluate(
         >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
         >>> t = torch.arange(20, dtype=torch.float64)
         >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = forcegp.StructuredGP(system, mean="analytical", noise_std=0.1).fit(data[:10])
+        >>> fit = forcegp.StructuredGP(system, mean="analytical", noise=0.1).fit(data[:10])
         >>> evaluation = evaluate(fit, data[10:])
         >>> evaluation.samples
         10
 
     Raises:
         DataError: the data are empty, or their joints are not the robot's.
-        ModelError: the model has not been fitted.
         UnknownNameError: a contact is not in the data.
     """
     if len(data) == 0:

@@ -19,7 +19,6 @@ from forcegp.evaluation.scores import share
 from forcegp.models.base import Predictor
 from forcegp.models.sensed import force_from_sensor, has_sensor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.models.structured_gp import StructuredGP
 
 CHUNK_STATES = 2000
 """States predicted at a time."""
@@ -71,12 +70,6 @@ def predict_all(
     return Predicted(torch.cat(means), variance, _noise_std(model, data), torch.cat(residuals), seconds)
 
 
-def structured_fit_of(model: Predictor) -> StructuredFit | None:
-    """The structured fit that a predictor is or contains; `None` for other models."""
-    found = model.fitted if isinstance(model, StructuredGP) else model
-    return found if isinstance(found, StructuredFit) else None
-
-
 @torch.no_grad()
 def _residual(system: ConstrainedSystem, data: Dataset, rows: slice, qdd: Tensor) -> Tensor:
     """|A q̈ − b| of the rows of closed contacts, `(k,)`."""
@@ -88,10 +81,9 @@ def _residual(system: ConstrainedSystem, data: Dataset, rows: slice, qdd: Tensor
 
 def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
     """The noise that the model assumes for measured accelerations, or the data's, `(n, nq)`."""
-    fit = structured_fit_of(model)
-    if fit is not None:
+    if isinstance(model, StructuredFit):
         active = data.active(model.system.contact_names)
-        return fit.noise_variance(data.q, data.qd, data.tau, active=active).sqrt()
+        return model.noise_variance(data.q, data.qd, data.tau, active=active).sqrt()
     noise = getattr(model, "noise_std", None)
     noise = data.header.noise_std if noise is None else noise
     if noise is None:
@@ -135,15 +127,15 @@ def multiplier_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[Mult
     names = model.system.contact_names
     if not _comparable(model, data):
         return ()
-    fit, active, means, stds = structured_fit_of(model), data.active(names), [], []
+    active, means, stds = data.active(names), [], []
     for i in range(0, len(data), chunk):
         part, closed = data[i : i + chunk], active[i : i + chunk]
         states = part.q, part.qd, part.tau
         predicted = model.predict(*states, "multiplier", active=closed)
         means.append(predicted.mean)
         variance = predicted.variance
-        if variance is not None and fit is not None:
-            variance = variance + fit.noise_variance(*states, "multiplier", closed, sensor=False)
+        if variance is not None and isinstance(model, StructuredFit):
+            variance = variance + model.noise_variance(*states, "multiplier", closed, sensor=False)
         stds += [] if variance is None else [variance.clamp(min=0.0).sqrt()]
     return _scores(data, names, torch.cat(means), torch.cat(stds) if stds else None)
 
@@ -158,12 +150,11 @@ def sensed_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[Multipli
     Returns:
         Nothing for a model that was not fitted to a sensor, or a log without one.
     """
-    fit = structured_fit_of(model)
-    if fit is None or "multiplier" not in fit.noise or not _comparable(model, data):
+    if not isinstance(model, StructuredFit) or "multiplier" not in model.noise:
         return ()
-    if not has_sensor(data, fit.system):
+    if not _comparable(model, data) or not has_sensor(data, model.system):
         return ()
-    parts = [force_from_sensor(fit, data[i : i + chunk]) for i in range(0, len(data), chunk)]
+    parts = [force_from_sensor(model, data[i : i + chunk]) for i in range(0, len(data), chunk)]
     mean, std = (torch.cat(part) for part in zip(*parts, strict=True))
     return _scores(data, model.system.contact_names, mean[:, None], std[:, None])
 

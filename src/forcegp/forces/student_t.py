@@ -19,7 +19,6 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from forcegp.errors import ModelError
 from forcegp.forces.coulomb import coupled
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem
@@ -32,21 +31,6 @@ CHUNK_STATES = 1024
 """Samples whose residuals are computed at a time."""
 IGNORED = 0.1
 """A sample of less weight is counted as left out."""
-
-
-def check_degrees(degrees: float | None) -> float | None:
-    """Degrees of freedom ν, or `None` for Gaussian noise.
-
-    Raises:
-        ModelError: ν is not above 2, where the noise has no variance.
-    """
-    if degrees is not None and not 2.0 < degrees < float("inf"):
-        raise ModelError(
-            "the degrees of freedom of the noise are not valid",
-            expected="a finite number above 2, or None for Gaussian noise",
-            got=degrees,
-        )
-    return degrees
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -59,7 +59,7 @@ class Window:
 class AnalyticalSettings(Settings):
     """What is kept of an analytical model besides its tensors; the robot is the learned one."""
 
-    learn: dict[str, tuple[str, ...]]
+    analytical_parameters: dict[str, tuple[str, ...]]
     relative: float
     length: float
     angle: float
@@ -69,12 +69,12 @@ class AnalyticalSettings(Settings):
 class AnalyticalModel(Model["AnalyticalFit"]):
     """The constrained equations of motion, with the robot parameters θ_A learned from accelerations.
 
-    Before `fit` it predicts with the parameters of the robot file. Learned parameters stay physically
-    consistent, since θ_A are coordinates of physical bodies only.
+    `nominal()` predicts with the parameters of the robot file. Learned parameters stay physically consistent,
+    since θ_A are coordinates of physical bodies only.
 
     Args:
         system: robot and contacts.
-        learn: joint names by quantity, as for `AnalyticalParameters`.
+        analytical_parameters: what is learned: joint names by quantity, as for `AnalyticalParameters`.
         window: how far from the parameters of the file learning starts.
         seed: of the start.
 
@@ -90,7 +90,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         torch.Size([20, 2])
 
     Raises:
-        UnknownNameError, ModelError, InertiaError: `learn` does not fit the robot.
+        UnknownNameError, ModelError, InertiaError: `analytical_parameters` do not fit the robot.
     """
 
     kind = KIND
@@ -98,23 +98,15 @@ class AnalyticalModel(Model["AnalyticalFit"]):
     def __init__(
         self,
         system: ConstrainedSystem,
-        learn: LearnedParameters = EVERY_LINK,
+        analytical_parameters: LearnedParameters = EVERY_LINK,
         window: Window | None = None,
         seed: int = 0,
     ) -> None:
-        self.specified = system
+        self._keep(locals())
+        self.system = system
         self.window = window or Window()
         self.seed = seed
-        self.parameters = AnalyticalParameters(system.robot, learn)
-        self._learn = learn
-
-    def get_params(self) -> dict[str, Any]:
-        return {
-            "system": self.specified,
-            "learn": self._learn,
-            "window": self.window,
-            "seed": self.seed,
-        }
+        self.parameters = AnalyticalParameters(system.robot, analytical_parameters)
 
     def fit(
         self,
@@ -123,7 +115,6 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         options: BatchOptions | LearningOptions | None = None,
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
-        keep_checkpoint: bool = False,
     ) -> AnalyticalFit:
         """Minimise the mean squared error of the accelerations, from a random start in the window.
 
@@ -132,15 +123,14 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             options: ADAM on batches with early stopping by default; `LearningOptions` minimise over all
                 samples at once, by L-BFGS or ADAM.
             progress: called after each epoch, or evaluation.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits, and
-                removes it at its end.
-            keep_checkpoint: leave the file, to be removed once the model is saved.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
+                Remove it once the fitted model is saved.
 
         Raises:
             ModelError, DataError: the data do not fit the model.
         """
         options = options or ADAM
-        measured, _ = measurement_of(Observation(data, noise_std=1.0), self.specified)
+        measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system)
         generator, width = torch.Generator().manual_seed(self.seed), self.window
         theta = AnalyticalParameters(self.parameters.start, self.parameters.joints)
         theta.reset(generator, relative=width.relative, length=width.length, angle=width.angle)
@@ -148,10 +138,10 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
             robot = torch.func.functional_call(theta, dict(tensors), ())
-            return _mean_squared_error(self.specified.with_robot(robot), measured, rows)
+            return _mean_squared_error(self.system.with_robot(robot), measured, rows)
 
         saved = None if checkpoint is None else Path(checkpoint)
-        key = "" if saved is None else _key(self.specified, measured, options, start, self.seed)
+        key = "" if saved is None else _key(self.system, measured, options, start, self.seed)
         if isinstance(options, BatchOptions):
             kept = None if saved is None else EpochCheckpoint(saved, key)
             learned = train(loss, start, len(measured.q), options, generator, progress, kept)
@@ -160,19 +150,13 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             learned = _minimise(loss, start, len(measured.q), options, progress, kept)
         theta.load_state_dict(learned.tensors)
         with torch.no_grad():
-            system = self.specified.with_robot(theta())
-        self._fitted = AnalyticalFit(system, theta, self.window, self.seed, FitResult.of(learned))
-        if kept is not None and not keep_checkpoint:
-            kept.remove()
-        return self._fitted
+            system = self.system.with_robot(theta())
+        return AnalyticalFit(system, theta, self.window, self.seed, FitResult.of(learned))
 
-    @property
-    def fitted(self) -> AnalyticalFit:
-        """The most recent fit, or the robot file as it is."""
-        if self._fitted is not None:
-            return self._fitted
+    def nominal(self) -> AnalyticalFit:
+        """The equations of motion with the parameters of the robot file; nothing is learned."""
         result = FitResult(True, 0, 0.0, 0.0, message="parameters of the robot file, nothing learned")
-        return AnalyticalFit(self.specified, self.parameters, self.window, self.seed, result)
+        return AnalyticalFit(self.system, self.parameters, self.window, self.seed, result)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -244,7 +228,7 @@ class AnalyticalFit(FittedModel):
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         theta, width = self.parameters, self.window
         settings = AnalyticalSettings(
-            learn=theta.joints,
+            analytical_parameters=theta.joints,
             relative=width.relative,
             length=width.length,
             angle=width.angle,
@@ -256,24 +240,23 @@ class AnalyticalFit(FittedModel):
 
 def load_analytical(
     header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> AnalyticalModel:
+) -> AnalyticalFit:
     """The model that `AnalyticalFit.save` wrote."""
     settings = settings_of(header, AnalyticalSettings, source)
     original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
     window = Window(settings.relative, settings.length, settings.angle)
     try:
-        model = AnalyticalModel(original, settings.learn, window, settings.seed)
+        model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
     except ForceGPError as cause:
-        raise ModelError.at(f"{source}: field 'settings.learn'", cause) from cause
+        raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
     state = {
         name: take(tensors, name, tuple(old.shape), old.dtype, source)
         for name, old in model.parameters.state_dict().items()
     }
-    theta = AnalyticalParameters(original.robot, settings.learn)
+    theta = AnalyticalParameters(original.robot, settings.analytical_parameters)
     theta.load_state_dict(state)
     result = FitResult(True, 0, 0.0, 0.0, message="loaded")
-    model._fitted = AnalyticalFit(system, theta, window, settings.seed, result)
-    return model
+    return AnalyticalFit(system, theta, window, settings.seed, result)
 
 
 def _minimise(

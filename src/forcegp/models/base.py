@@ -1,10 +1,9 @@
-"""What every model of the forward dynamics has in common: a specification that is fitted, and what
-predicts."""
+"""Models of the forward dynamics: a specification, and the fitted model that predicts."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -64,11 +63,6 @@ class Predictor(ABC):
             covariance: whether to compute the covariance.
             system: another system to predict on, for models of forces.
         """
-
-    @property
-    def _in_use(self) -> Predictor:
-        """What predicts: itself, or the most recent fit."""
-        return self
 
     def force_field(self) -> ForceField | None:
         """The mean impressed force Q̄ `(n, nq)` at states, or `None` for a model of accelerations alone."""
@@ -144,7 +138,7 @@ class Predictor(ABC):
             samples: number of function samples to integrate besides the mean.
             **settings: `options`, `seed`, `active`, `system` and `progress` of `rollout_model`.
         """
-        return rollout_model(self._in_use, q0, qd0, tau, duration, samples, **settings)
+        return rollout_model(self, q0, qd0, tau, duration, samples, **settings)
 
     def score(self, data: Dataset, quantity: str = "qdd") -> float:
         """Coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
@@ -199,7 +193,7 @@ class Predictor(ABC):
         """Write the model as a folder; `forcegp.load_model` reads it back exactly.
 
         Raises:
-            ModelError: the model has not been fitted, or a part of it is Python code.
+            ModelError: a part of the model is Python code.
             OSError: the place cannot be written.
         """
 
@@ -230,27 +224,39 @@ class FittedModel(HasResult, Predictor):
 F = TypeVar("F", bound=FittedModel)
 
 
-class Model(Predictor, Generic[F]):
-    """A specification that is fitted to data. It predicts with its most recent fit, for convenience."""
+class Model(ABC, Generic[F]):
+    """A specification, which never changes: `fit` learns from data and returns a fitted model."""
 
-    specified: ConstrainedSystem
-    """Robot and contacts as given."""
-    _fitted: F | None = None
+    kind: str
+    """Name of the class of models in saved files."""
+    system: ConstrainedSystem
+    """Robot and contacts."""
+
+    _params: dict[str, Any]
+
+    def _keep(self, arguments: Mapping[str, Any]) -> None:
+        """Keep the arguments of the constructor: its `locals()`."""
+        self._params = {name: x for name, x in arguments.items() if name not in ("self", "__class__")}
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> None:
+            """Raise `AttributeError`, which says how to get the fit that has the attribute."""
+            hint = "; call fit = model.fit(data), which has it" if hasattr(FittedModel, name) else ""
+            raise AttributeError(f"a {type(self).__name__} has no attribute {name!r}{hint}")
 
     def __repr__(self) -> str:
-        """One line: robot, contacts, and how the most recent fit went."""
-        result = None if self._fitted is None else self._fitted.result
-        return model_line(type(self).__name__, self.system, result)
+        """One line: robot and contacts."""
+        return model_line(type(self).__name__, self.system, None)
 
     def _repr_html_(self) -> str:
         """A table for notebooks."""
-        if self._fitted is not None:
-            return self._fitted._repr_html_()
         return fit_table(repr(self), None, list(self.get_params().items()))
 
-    @abstractmethod
     def get_params(self) -> dict[str, Any]:
-        """Arguments of the constructor: `type(model)(**model.get_params())` is an unfitted copy."""
+        """Arguments of the constructor as the caller passed them: `type(model)(**model.get_params())` is a
+        copy."""
+        return dict(self._params)
 
     @abstractmethod
     def fit(
@@ -259,69 +265,15 @@ class Model(Predictor, Generic[F]):
         *,
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
-        keep_checkpoint: bool = False,
     ) -> F:
         """Learn from a data set.
 
         Args:
             data: states and measurements.
             progress: called now and then.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits, and
-                removes it at its end.
-            keep_checkpoint: leave the file, to be removed once the model is saved.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
+                Remove it once the fitted model is saved.
 
         Returns:
-            The fitted model, which is also kept as `fitted`.
+            The fitted model. Fitting twice gives the same bits.
         """
-
-    @property
-    def fitted(self) -> F:
-        """The most recent fit.
-
-        Raises:
-            ModelError: the model has not been fitted.
-        """
-        if self._fitted is None:
-            raise ModelError(
-                f"this {self.kind!r} model has not been fitted", hint="call model.fit(data) first"
-            )
-        return self._fitted
-
-    @property
-    def system(self) -> ConstrainedSystem:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Robot and contacts that predictions refer to: the learned ones after a fit."""
-        return self.specified if self._fitted is None else self._fitted.system
-
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: Any = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-        system: ConstrainedSystem | None = None,
-        **settings: Any,
-    ) -> Prediction:
-        """Predict with the most recent fit; see the `predict` of the fitted model."""
-        return self.fitted.predict(
-            q, qd, tau, quantity, active=active, covariance=covariance, system=system, **settings
-        )
-
-    @property
-    def _in_use(self) -> Predictor:
-        return self.fitted
-
-    def force_field(self) -> ForceField | None:
-        return self.fitted.force_field()
-
-    @property
-    def torque_disturbance(self) -> Tensor | None:
-        return self.fitted.torque_disturbance
-
-    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
-        return self.fitted.force_samples(samples, generator)
-
-    def save(self, path: str | Path) -> None:
-        self.fitted.save(path)

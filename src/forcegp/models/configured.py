@@ -10,6 +10,7 @@ from typing import Any
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import SceneError, UnknownNameError, near_names
+from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.joint import AnalyticalMean
@@ -26,40 +27,34 @@ from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.scene import ModelTable
+from forcegp.scene.model_section import NoiseSection
 from forcegp.storage.descriptions import decode
 
 DEFAULT = "sgp-mean"
 """The model where none is named."""
-COMMON = ("name", "noise_std", "seed", "learning")
+COMMON = ("name", "noise", "seed", "learning")
 """Keys of `[model]` that every model takes; one without noise or a random start ignores these."""
 KEYS: dict[str, tuple[str, ...]] = {
-    AnalyticalModel.kind: ("analytical", "window"),
+    AnalyticalModel.kind: ("analytical_parameters", "window"),
     NeuralNetwork.kind: ("hidden",),
     IndependentGP.kind: ("standardize",),
     StructuredGP.kind: (
         "mean",
         "priors",
-        "learn_noise",
-        "torque_noise",
-        "state_noise",
         "sensor_noise_std",
         "inference",
         "inducing_points",
         "inertia",
         "standardize",
-        "degrees_of_freedom",
-        "analytical",
+        "analytical_parameters",
     ),
 }
 """Further keys by the kind of model."""
 PLAIN = (
-    "learn_noise",
-    "state_noise",
     "inference",
     "inducing_points",
     "inertia",
     "standardize",
-    "degrees_of_freedom",
     "hidden",
 )
 """Keys that are arguments of the model's class as they are."""
@@ -68,7 +63,7 @@ Options = LearningOptions | BatchOptions
 
 @dataclass(frozen=True, eq=False)
 class Configured:
-    """An unfitted model, and how it learns.
+    """A model, and how it learns.
 
     Attributes:
         name: of the model.
@@ -87,7 +82,7 @@ class Configured:
         if self.options is not None:
             settings["options"] = self.options
         if self.sensor_noise_std is not None and isinstance(self.model, StructuredGP):
-            both = with_sensor(data, self.model.specified, self.sensor_noise_std)
+            both = with_sensor(data, self.model.system, self.sensor_noise_std)
             return self.model.fit(both, progress=progress, **settings)
         return self.model.fit(data, progress=progress, **settings)
 
@@ -119,13 +114,13 @@ def configured(
     """
     section, at = table.section, table.document.at
     chosen = name or section.name or DEFAULT
-    noise = section.noise_std if noise_std is None else noise_std
+    noise = at(("model", "noise"), _noise, section.noise, noise_std)
     start = section.seed if seed is None else seed
     if chosen not in MODELS:
         unknown = UnknownNameError("model", chosen, MODELS)
         raise unknown if name else SceneError.at(table.document.place(("model", "name")), unknown)
     arguments = _arguments(table, system, chosen)
-    model = at(("model",), create, chosen, system, noise_std=noise, seed=start or 0, **arguments)
+    model = at(("model",), create, chosen, system, noise=noise, seed=start or 0, **arguments)
     return Configured(chosen, model, _learning(table, model), section.sensor_noise_std)
 
 
@@ -141,18 +136,25 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
         arguments["mean"] = mean
     elif mean is not None:
         arguments["mean"] = at(("model", "mean"), AnalyticalMean, mean)
-    if "torque_noise" in given:
-        noise = given["torque_noise"]
-        arguments["torque_noise"] = None if noise == "none" else noise
     if "priors" in given:
         arguments["force_priors"] = _priors(table)
     if "window" in given:
         arguments["window"] = Window(**given["window"].given())
-    if "analytical" in given:
-        theta = at(("model", "analytical"), AnalyticalParameters, system.robot, given["analytical"])
-        structured = kind == StructuredGP.kind
-        arguments |= {"analytical_parameters": theta} if structured else {"learn": given["analytical"]}
+    if "analytical_parameters" in given:
+        joints = given["analytical_parameters"]
+        theta = at(("model", "analytical_parameters"), AnalyticalParameters, system.robot, joints)
+        arguments["analytical_parameters"] = theta if kind == StructuredGP.kind else joints
     return arguments
+
+
+def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | Noise | None:
+    """The noise of `[model]`, a number or a table; `acceleration` replaces that of accelerations."""
+    given = section.given() | ({} if acceleration is None else {"acceleration": acceleration})
+    if set(given) <= {"acceleration"}:
+        return given.get("acceleration")
+    return Noise(
+        **{**given, "torque": None if given.get("torque") == "none" else given.get("torque", "auto")}
+    )
 
 
 def _priors(table: ModelTable) -> tuple[ForcePrior, ...]:
@@ -193,7 +195,7 @@ def _default(model: Model[Any], given: Mapping[str, Any]) -> Options:
         return DEEP if len(model.hidden) > 2 else SHALLOW
     if isinstance(model, AnalyticalModel) and not {"optimizer", "max_evaluations"} & set(given):
         return ADAM
-    if isinstance(model, StructuredGP) and model.specification.parameters is not None:
+    if isinstance(model, StructuredGP) and model.specification.analytical_parameters is not None:
         return WITH_PARAMETERS
     return LearningOptions()
 

@@ -132,15 +132,14 @@ class HasResult:
 
 
 def model_line(kind: str, system: ConstrainedSystem, result: FitResult | None) -> str:
-    """Robot, contacts, and how the fit went."""
+    """Robot, contacts, and how the fit went, of a model without one `None`."""
     robot = system.robot
     contacts = f", contact {', '.join(system.contact_names)}" if system.contacts else ""
-    return f"<{kind} of {robot.name!r}: {robot.nq} joints{contacts}; {_outcome(result)}>"
+    outcome = "" if result is None else f"; {_outcome(result)}"
+    return f"<{kind} of {robot.name!r}: {robot.nq} joints{contacts}{outcome}>"
 
 
-def _outcome(result: FitResult | None) -> str:
-    if result is None:
-        return "not fitted"
+def _outcome(result: FitResult) -> str:
     if not result.evaluations:
         return "conditioned, nothing learned"
     how = "converged" if result.converged else "NOT converged"

@@ -26,7 +26,6 @@ from forcegp.forces.priors.payload import PayloadPrior
 from forcegp.gp.bound import bound_of
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.models.structured_gp import StructuredGP
 
 CHANGE = 1e-3
 """Prior probability that a force changes between two calls."""
@@ -49,37 +48,35 @@ class Followed:
 
 @torch.no_grad()
 def follow(
-    model: StructuredGP, data: Dataset, priors: Sequence[str], *, factor: float = 1.0, change: float = CHANGE
+    fit: StructuredFit, data: Dataset, priors: Sequence[str], *, factor: float = 1.0, change: float = CHANGE
 ) -> Followed:
-    """Add samples to the most recent fit, and learn the forces of some priors anew where these contradict it.
+    """Add samples to a fit, and learn the forces of some priors anew where these contradict it.
 
     Args:
-        model: fitted with sparse inference.
+        fit: with sparse inference.
         data: a few new samples, such as those of 0.05 s.
         priors: names of the priors whose forces may change, such as `payload`.
         factor: correlation of these forces with what they were at the last call, for slow drift beside.
         change: prior probability of a change between two calls.
 
     Raises:
-        ModelError: the model has not been fitted, its inference is exact, or a number is out of range.
+        ModelError: inference is exact, or a number is out of range.
         UnknownNameError: no such prior.
     """
     if not 0.0 < change < 1.0:
         raise ModelError("invalid probability of a change", expected="between 0 and 1", got=change)
-    before = model.forget(factor, priors=priors)
-    kept = model.update(data)
-    model.adopt(before)
-    forgotten = model.forget(0.0, priors=priors)
-    anew = model.update(data)
+    before = fit.forget(factor, priors=priors)
+    kept = before.update(data)
+    forgotten = before.forget(0.0, priors=priors)
+    anew = forgotten.update(data)
     gain = _evidence(anew) - _evidence(forgotten) - (_evidence(kept) - _evidence(before))
     log_odds = gain + math.log(change) - math.log1p(-change)
     changed = log_odds > 0.0
     if changed:
         # The first estimate is that of accelerations without the new payload, so it is made once more.
-        model.adopt(_knowing(forgotten, anew, priors))
-        anew = model.update(data)
+        anew = _knowing(forgotten, anew, priors).update(data)
     found = anew if changed else kept
-    return Followed(model.adopt(_knowing(found, found, priors, begin=changed)), changed, log_odds)
+    return Followed(_knowing(found, found, priors, begin=changed), changed, log_odds)
 
 
 def _knowing(

@@ -9,7 +9,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from pydantic import PositiveFloat
@@ -17,7 +16,9 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.errors import ModelError
 from forcegp.forces.inference import require_double
+from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import FlatStates
@@ -82,12 +83,12 @@ class IndependentGP(Model["IndependentFit"]):
 
     Args:
         system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
-        noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
+        noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states, else 0.1.
         standardize: whether inputs are standardized; otherwise they enter in their units, as in the paper.
 
     Raises:
-        ModelError: the robot is not float64.
+        ModelError: the robot is not float64, or `noise` states more than that of accelerations.
 
     Example:
         >>> import forcegp, torch
@@ -96,7 +97,7 @@ class IndependentGP(Model["IndependentFit"]):
         >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
         >>> t = torch.arange(20, dtype=torch.float64)
         >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = IndependentGP(system, noise_std=0.1).fit(data)
+        >>> fit = IndependentGP(system, noise=0.1).fit(data)
         >>> fit.predict(q, qd, tau).std.shape
         torch.Size([20, 2])
     """
@@ -104,15 +105,20 @@ class IndependentGP(Model["IndependentFit"]):
     kind = KIND
 
     def __init__(
-        self, system: ConstrainedSystem, noise_std: NoiseStd | None = None, standardize: bool = True
+        self, system: ConstrainedSystem, noise: NoiseStd | Noise | None = None, standardize: bool = True
     ) -> None:
+        self._keep(locals())
         require_double(system)
-        self.specified = system
-        self.noise_std = noise_std
+        self.system = system
+        stated = Noise.of(noise)
+        if stated != Noise(stated.acceleration):
+            raise ModelError(
+                "independent Gaussian processes know white noise of accelerations alone",
+                expected="a number, one per joint, or Noise(acceleration)",
+                got=noise,
+            )
+        self.noise = stated.acceleration
         self.standardize = standardize
-
-    def get_params(self) -> dict[str, Any]:
-        return {"system": self.specified, "noise_std": self.noise_std, "standardize": self.standardize}
 
     def fit(
         self,
@@ -121,7 +127,6 @@ class IndependentGP(Model["IndependentFit"]):
         options: LearningOptions | None = None,
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
-        keep_checkpoint: bool = False,
     ) -> IndependentFit:
         """Learn the hyperparameters of each joint by maximum a posteriori, one joint after the other.
 
@@ -129,20 +134,19 @@ class IndependentGP(Model["IndependentFit"]):
             data: states and measured accelerations.
             options: optimiser and its limits, for each joint.
             progress: called after each evaluation, with those of all joints.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits, and
-                removes it at its end.
-            keep_checkpoint: leave the file, to be removed once the model is saved.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
+                Remove it once the fitted model is saved.
 
         Raises:
             ModelError, DataError: the data do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
         options = options or LearningOptions()
-        measured, noise_std = measurement_of(Observation(data), self.specified, self.noise_std)
+        measured, noise_std = measurement_of(Observation(data), self.system, self.noise)
         features = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
         scale = scale_of(features, self.standardize)
         training = IndependentTraining(features, measured.values, noise_std, scale)
-        priors = joint_processes(self.specified.robot.nq)
+        priors = joint_processes(self.system.robot.nq)
         announce(training, LEARNING)
         saved = None if checkpoint is None else _record(Path(checkpoint), training, priors, options)
         parts: list[Learned] = []
@@ -157,22 +161,7 @@ class IndependentGP(Model["IndependentFit"]):
         if saved is not None:
             saved.write()
         hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
-        self._fitted = fitted(
-            self.specified, self.noise_std, training, hyperparameters, parts, self.standardize
-        )
-        if saved is not None and not keep_checkpoint:
-            saved.remove()
-        return self._fitted
-
-    def log_marginal_likelihood(self) -> float:
-        """log p(y | X, θ) of the training data, summed over the joints.
-
-        Raises:
-            ModelError: the model has not been fitted.
-        """
-        value = self.fitted.log_marginal_likelihood
-        assert value is not None
-        return value
+        return fitted(self.system, self.noise, training, hyperparameters, parts, self.standardize)
 
 
 def scale_of(features: Mapping[str, Tensor], standardize: bool) -> Standardization:

@@ -10,7 +10,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError
 from forcegp.models.independent_gp import (
-    IndependentGP,
+    IndependentFit,
     IndependentSettings,
     IndependentTraining,
     announce,
@@ -24,11 +24,10 @@ from forcegp.storage.system import take
 
 def load_independent(
     header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> IndependentGP:
+) -> IndependentFit:
     """The model that `IndependentFit.save` wrote."""
     settings = settings_of(header, IndependentSettings, source)
     nq, dtype = system.robot.nq, system.robot.dtype
-    model = IndependentGP(system, settings.noise_std, settings.standardize)
     n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
     features = {
         name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
@@ -47,9 +46,6 @@ def load_independent(
     }
     announce(training, 0)
     try:
-        model._fitted = fitted(
-            system, settings.noise_std, training, hyperparameters, standardize=settings.standardize
-        )
+        return fitted(system, settings.noise_std, training, hyperparameters, standardize=settings.standardize)
     except ForceGPError as cause:
         raise ModelError.at(f"{source}: the training data", cause) from cause
-    return model

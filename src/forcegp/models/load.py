@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
 from forcegp.models.analytical import AnalyticalModel, load_analytical
-from forcegp.models.base import Model
+from forcegp.models.base import FittedModel
 from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.independent_load import load_independent
 from forcegp.models.neural import NeuralNetwork, load_network
@@ -20,7 +19,7 @@ from forcegp.models.structured_load import load_structured
 from forcegp.storage.folder import HEADER_FILE, ModelHeader, own_tensors, read_model
 from forcegp.storage.system import unpack_system
 
-Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], Model[Any]]
+Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], FittedModel]
 
 LOADERS: dict[str, Loader] = {
     AnalyticalModel.kind: load_analytical,
@@ -31,7 +30,7 @@ LOADERS: dict[str, Loader] = {
 """What reads each kind of models."""
 
 
-def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> Model[Any]:
+def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> FittedModel:
     """Read a model that `Model.save` wrote; it predicts the same, bit for bit.
 
     Args:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -70,14 +69,12 @@ class NeuralNetwork(Model["NetworkFit"]):
     kind = KIND
 
     def __init__(self, system: ConstrainedSystem, hidden: Sequence[int] = (80,), seed: int = 0) -> None:
+        self._keep(locals())
         if any(width < 1 for width in hidden):
             raise ModelError("a hidden layer needs at least one unit", got=tuple(hidden))
-        self.specified = system
+        self.system = system
         self.hidden = tuple(hidden)
         self.seed = seed
-
-    def get_params(self) -> dict[str, Any]:
-        return {"system": self.specified, "hidden": self.hidden, "seed": self.seed}
 
     def fit(
         self,
@@ -86,7 +83,6 @@ class NeuralNetwork(Model["NetworkFit"]):
         options: BatchOptions | None = None,
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
-        keep_checkpoint: bool = False,
     ) -> NetworkFit:
         """Train with ADAM on batches; the weights of the best epoch on held-out samples are kept.
 
@@ -94,9 +90,8 @@ class NeuralNetwork(Model["NetworkFit"]):
             data: states and measured accelerations.
             options: how to train; `SHALLOW` or `DEEP` by default.
             progress: called after each epoch.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits, and
-                removes it at its end.
-            keep_checkpoint: leave the file, to be removed once the model is saved.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
+                Remove it once the fitted model is saved.
 
         Returns:
             The epochs as `evaluations`, and the held-out error of standardized accelerations.
@@ -105,12 +100,12 @@ class NeuralNetwork(Model["NetworkFit"]):
             ModelError, DataError: the data do not fit the model.
             NumericalError: training diverges.
         """
-        measured, _ = measurement_of(Observation(data, noise_std=1.0), self.specified)
+        measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system)
         states = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
         inputs, outputs = Standardization.of(states), Standardization.of({"qdd": measured.values})
         x, y = _stacked(inputs, states), outputs.apply({"qdd": measured.values})["qdd"]
         generator = torch.Generator().manual_seed(self.seed)
-        network = _network(self.specified, self.hidden)
+        network = _network(self.system, self.hidden)
         _initialise(network, generator)
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
@@ -127,10 +122,7 @@ class NeuralNetwork(Model["NetworkFit"]):
         network.load_state_dict(learned.tensors)
         result = FitResult.of(learned, constant_inputs=inputs.constant)
         network.requires_grad_(False)
-        self._fitted = NetworkFit(self.specified, self.hidden, self.seed, network, inputs, outputs, result)
-        if saved is not None and not keep_checkpoint:
-            saved.remove()
-        return self._fitted
+        return NetworkFit(self.system, self.hidden, self.seed, network, inputs, outputs, result)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -170,10 +162,10 @@ class NetworkFit(AccelerationFit):
 
 def load_network(
     header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> NeuralNetwork:
+) -> NetworkFit:
     """The model that `NetworkFit.save` wrote."""
     settings = settings_of(header, NetworkSettings, source)
-    robot, model = system.robot, NeuralNetwork(system, settings.hidden, settings.seed)
+    robot = NeuralNetwork(system, settings.hidden, settings.seed).system.robot  # checks the widths
     widths = [3 * robot.nq, *settings.hidden, robot.nq]
     state = {}
     for layer, (before, after) in enumerate(pairwise(widths)):
@@ -191,11 +183,8 @@ def load_network(
         )
         scales.append(Standardization(mean, std, constant))
     result = FitResult(True, 0, 0.0, 0.0, constant_inputs=settings.constant, message="loaded")
-    fitted = NetworkFit(
-        system, settings.hidden, settings.seed, network.requires_grad_(False), scales[0], scales[1], result
-    )
-    model._fitted = fitted
-    return model
+    network = network.requires_grad_(False)
+    return NetworkFit(system, settings.hidden, settings.seed, network, scales[0], scales[1], result)
 
 
 def _network(system: ConstrainedSystem, hidden: tuple[int, ...]) -> nn.Sequential:

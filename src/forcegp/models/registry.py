@@ -8,6 +8,7 @@ from typing import Any
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
+from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd
 from forcegp.forces.priors.default import PAPER, contact_priors, default_priors, measured_priors
 from forcegp.gp.kernels import Kernel
@@ -18,6 +19,8 @@ from forcegp.models.neural import NeuralNetwork
 from forcegp.models.structured_gp import StructuredGP
 
 SGP = StructuredGP.kind
+Stated = NoiseStd | Noise | None
+"""The noise of a model, `None` for what the log states."""
 
 
 @dataclass(frozen=True)
@@ -35,37 +38,37 @@ class Entry:
     make: Callable[..., Model]
 
 
-def _analytical(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
+def _analytical(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
     return AnalyticalModel(system, seed=seed, **options)
 
 
-def _network(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
+def _network(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
     return NeuralNetwork(system, seed=seed, **options)
 
 
-def _independent(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
-    return IndependentGP(system, noise_std=noise_std, **options)
+def _independent(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
+    return IndependentGP(system, noise=noise, **options)
 
 
 def _structured(mean: str, kernel: Kernel | None = None) -> Callable[..., Model]:
-    def make(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
+    def make(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
         options = {"mean": mean} | options
         if kernel is not None:
             options.setdefault("force_priors", default_priors(system, options["mean"], kernel))
-        return StructuredGP(system, noise_std=noise_std, **options)
+        return StructuredGP(system, noise=noise, **options)
 
     return make
 
 
-def _measured(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
+def _measured(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
     options = {"mean": "analytical", "force_priors": measured_priors(system), "inertia": "auto"} | options
-    return StructuredGP(system, noise_std=noise_std, **options)
+    return StructuredGP(system, noise=noise, **options)
 
 
 def _contact(kernel: Kernel | None = None) -> Callable[..., Model]:
-    def make(system: ConstrainedSystem, noise_std: NoiseStd | None, seed: int, **options: Any) -> Model:
+    def make(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
         options = {"mean": "analytical", "force_priors": contact_priors(system, kernel)} | options
-        return StructuredGP(system, noise_std=noise_std, **options)
+        return StructuredGP(system, noise=noise, **options)
 
     return make
 
@@ -96,15 +99,19 @@ MODELS: dict[str, Entry] = {
 
 
 def create(
-    name: str, system: ConstrainedSystem, *, noise_std: NoiseStd | None = None, seed: int = 0, **options: Any
+    name: str,
+    system: ConstrainedSystem,
+    *,
+    noise: Stated = None,
+    seed: int = 0,
+    **options: Any,
 ) -> Model:
-    """An unfitted model by its short name.
+    """A model by its short name.
 
     Args:
         name: a key of `MODELS`.
         system: robot and contacts.
-        noise_std: of measured accelerations [rad/s², m/s²], for models that have one; default what the log
-            states.
+        noise: of measured accelerations, for models that have one; by default what the log states.
         seed: of random initial values, for models that have any.
         options: further arguments of the model's class.
 
@@ -113,4 +120,4 @@ def create(
     """
     if name not in MODELS:
         raise UnknownNameError("model", name, MODELS)
-    return MODELS[name].make(system, noise_std, seed, **options)
+    return MODELS[name].make(system, noise, seed, **options)

@@ -11,13 +11,16 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
+from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.coulomb import coupled
 from forcegp.forces.identifiability import doubts_of
-from forcegp.forces.inference import forces_and_constant, log_likelihood, lost_by_inducing
+from forcegp.forces.inference import forces_and_constant, is_sparse, log_likelihood, lost_by_inducing
 from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Training
+from forcegp.forces.observations import Observation
 from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
 from forcegp.forces.samples import draw_samples
@@ -27,6 +30,7 @@ from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel, ForceField, Prediction
 from forcegp.models.fit_result import FitResult
+from forcegp.models.structured_learning import prepared, training_for
 from forcegp.models.structured_spec import Specification, pack
 from forcegp.storage.folder import Settings
 
@@ -70,6 +74,11 @@ class StructuredFit(FittedModel):
     def training(self) -> Training:
         """What the posterior is conditioned on."""
         return self.problem.training
+
+    @property
+    def force_priors(self) -> tuple[ForcePrior, ...]:
+        """Priors on the unknown forces, those that were left to the data filled in."""
+        return self.posterior.priors
 
     @torch.no_grad()
     def predict(
@@ -143,13 +152,54 @@ class StructuredFit(FittedModel):
         """Force functions drawn from the posterior."""
         return draw_samples(self.posterior, samples, generator)
 
-    def updated(self, measurements: Training) -> StructuredFit:
-        """The fit with more samples.
+    def condition(
+        self, data: Dataset | Sequence[Observation], hyperparameters: Mapping[str, Tensor] | None = None
+    ) -> StructuredFit:
+        """Condition on other data instead, with the same hyperparameters and input scales.
 
-        The cost of a sparse fit does not depend on how many it has seen; that of an exact one grows with the
-        square of their number.
+        Args:
+            data: what to condition on.
+            hyperparameters: use these instead.
+
+        Raises:
+            ModelError: the data do not fit the model.
         """
-        measurements = self.with_slopes(measurements)
+        spec = self.specification
+        training, doubts = training_for(spec, self.problem, data, learned=())
+        if spec.noise.learn and training.quantities != self.training.quantities:
+            raise ModelError(
+                "the learned noise belongs to other measurements",
+                expected=", ".join(self.training.quantities),
+                got=", ".join(training.quantities),
+                hint='call model.fit(data, learn=["noise"], after=fit), which learns the noise alone',
+            )
+        values = self.hyperparameters if hyperparameters is None else hyperparameters
+        if not is_sparse(spec.inference, self.problem.priors, training.all_samples):
+            training = self._with_slopes(training)
+        problem = prepared(spec, dataclasses.replace(self.problem, training=training), values)
+        return conditioned(spec, problem, values, warnings=doubts)
+
+    def update(self, data: Dataset | Sequence[Observation]) -> StructuredFit:
+        """The fit with more samples, as in a control loop.
+
+        With sparse inference the cost does not depend on the number of samples seen before; with exact
+        inference it grows with their square. Hyperparameters, input scales and inducing points stay as they
+        are.
+
+        Args:
+            data: further measurements of the same quantities.
+
+        Raises:
+            ModelError: the data measure something else.
+        """
+        measurements, _ = training_for(self.specification, self.problem, data, learned=())
+        if measurements.quantities != tuple(self.noise):
+            raise ModelError(
+                "an update measures other quantities than the fit",
+                expected=", ".join(self.noise),
+                got=", ".join(measurements.quantities),
+            )
+        measurements = self._with_slopes(measurements)
         problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
         latent, central = self.posterior.latent, self.posterior.central
@@ -163,7 +213,7 @@ class StructuredFit(FittedModel):
         whole = dataclasses.replace(self.problem, training=self.training.joined(measurements, noise))
         return dataclasses.replace(self, problem=whole, posterior=posterior)
 
-    def with_slopes(self, measurements: Training) -> Training:
+    def _with_slopes(self, measurements: Training) -> Training:
         """Other measurements, with the slopes of the learned forces where the fit has them."""
         if self.training.slopes is None:
             return measurements
@@ -175,33 +225,25 @@ class StructuredFit(FittedModel):
         problem = dataclasses.replace(self.problem, training=measurements, system=system, parameters=None)
         return problem.with_coulomb_errors(self.hyperparameters)[0]
 
-    def without(self, measurements: Training) -> StructuredFit:
-        """The fit without samples that it was conditioned on.
-
-        Raises:
-            ModelError: inference is exact, or there are more samples than it was conditioned on.
-            NumericalError: the samples were not among them.
-        """
-        problem = self._problem_of(measurements)
-        latent, central = _sparse(self.posterior), self.posterior.central
-        if isinstance(central, SparsePosterior):
-            known = problem.of_means().rows(self.hyperparameters).blocks
-            central = central.without(problem.silenced(known))
-        latent = latent.without(problem.rows(self.hyperparameters).blocks)
-        posterior = dataclasses.replace(self.posterior, latent=latent, central=central)
-        return dataclasses.replace(self, posterior=posterior)
-
-    def forgetting(self, factor: float, priors: Sequence[str] | None = None) -> StructuredFit:
-        """The fit with all samples so far, or what they say about some priors, partly forgotten.
+    def forget(
+        self, what: float | Dataset | Sequence[Observation], priors: Sequence[str] | None = None
+    ) -> StructuredFit:
+        """The fit without some samples, or with all of them partly forgotten so that later ones count more.
 
         Args:
-            factor: weight of all samples; for given priors, correlation of their forces with what they were.
-            priors: names of the priors that forget; all samples by default.
+            what: a factor between 0 and 1, such as exp(−Δt/T) for a memory of T seconds, which the weight of
+                all samples so far is multiplied by; or samples of the fit, which are removed.
+            priors: forget only what the samples say about the forces of these priors, such as a payload: they
+                drift towards their prior, and the factor is the correlation with what they were.
 
         Raises:
             ModelError: inference is exact, or the factor is out of range.
             UnknownNameError: no such prior.
+            NumericalError: the samples to remove were not among those of the fit.
         """
+        if not isinstance(what, int | float):
+            return self._without(training_for(self.specification, self.problem, what, learned=())[0])
+        factor = float(what)
         if priors is not None:
             return self._drifting(factor, priors)
         if not 0.0 < factor <= 1.0:
@@ -210,6 +252,17 @@ class StructuredFit(FittedModel):
         if isinstance(central, SparsePosterior):
             central = central.forgetting(factor)
         posterior = dataclasses.replace(self.posterior, latent=latent.forgetting(factor), central=central)
+        return dataclasses.replace(self, posterior=posterior)
+
+    def _without(self, measurements: Training) -> StructuredFit:
+        """The fit without samples that it was conditioned on."""
+        problem = self._problem_of(measurements)
+        latent, central = _sparse(self.posterior), self.posterior.central
+        if isinstance(central, SparsePosterior):
+            known = problem.of_means().rows(self.hyperparameters).blocks
+            central = central.without(problem.silenced(known))
+        latent = latent.without(problem.rows(self.hyperparameters).blocks)
+        posterior = dataclasses.replace(self.posterior, latent=latent, central=central)
         return dataclasses.replace(self, posterior=posterior)
 
     def _drifting(self, factor: float, priors: Sequence[str]) -> StructuredFit:

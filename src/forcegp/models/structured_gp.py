@@ -6,24 +6,21 @@ q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and likewise for every other quantit
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
-from torch import Tensor, nn
+from torch import nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError
-from forcegp.forces.inference import check_method, is_sparse, require_double
-from forcegp.forces.measurements import Training
+from forcegp.forces.inference import check_method, require_double
+from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd, Observation
-from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
 from forcegp.forces.priors.joint import AnalyticalMean, mean_of
 from forcegp.forces.state_noise import state_std_of
-from forcegp.forces.student_t import check_degrees
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
@@ -32,11 +29,9 @@ from forcegp.models.structured_learning import (
     chosen_of,
     given_to,
     learned,
-    prepared,
     search_of,
-    training_for,
 )
-from forcegp.models.structured_spec import Specification, check_inertia, torque_noise_of
+from forcegp.models.structured_spec import Specification, check_inertia
 from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
 
 FIT_COPIES = 3.0
@@ -54,25 +49,18 @@ class StructuredGP(Model[StructuredFit]):
             noise of the torque); else `default_priors`: a `JointForcePrior`, in contact its
             `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest,
             and around the analytical forces a `SlidingFrictionPrior` for each surface.
-        noise_std: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
-            default what the log states (`qdd_std` by sample, else its header), else 0.1.
-        learn_noise: whether the noise is a hyperparameter too, starting from `noise_std`.
+        noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint, or a `Noise`
+            that also states that of torques and states; by default what the log states, else 0.1.
         analytical_parameters: a module whose `forward()` gives the robot with its analytical parameters θ_A
             as learned tensors; `None` keeps the robot as it is.
-        torque_noise: standard deviation of the motor torque's white noise [N m, N], `"learn"`, `None` for
-            none, or `"auto"`: learned with priors for measured robots.
         inference: `"exact"`, `"sparse"` or `"auto"`.
         inducing_points: maximum number of inducing points of one prior; fewer are taken where they suffice,
             and the result of the fit says where more would help.
-        state_noise: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number
-            or one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
         inertia: `"file"` keeps that of the robot; `"auto"` identifies links and drives where held-out
             stretches of the log ask for it (`forces/inertia.py`), as the defaults of a measured robot do. It
             needs a `JointFrictionPrior` and a mean with the motor torque.
         standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
             in the paper.
-        degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
-            impacts and other outliers; `None` for Gaussian noise (`forces/student_t.py`).
 
     Example:
         >>> import forcegp, torch
@@ -81,7 +69,7 @@ class StructuredGP(Model[StructuredFit]):
         >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
         >>> t = torch.arange(20, dtype=torch.float64)
         >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = StructuredGP(system, mean="analytical", noise_std=0.1).fit(data)
+        >>> fit = StructuredGP(system, mean="analytical", noise=0.1).fit(data)
         >>> fit.predict(q, qd, tau).std.shape
         torch.Size([20, 2])
 
@@ -90,53 +78,38 @@ class StructuredGP(Model[StructuredFit]):
     """
 
     kind = KIND
-    has_function_samples = True
 
     def __init__(
         self,
         system: ConstrainedSystem,
         mean: str | AnalyticalMean = "zero",
         force_priors: Sequence[ForcePrior] | None = None,
-        noise_std: NoiseStd | None = None,
-        learn_noise: bool = False,
+        noise: NoiseStd | Noise | None = None,
         analytical_parameters: nn.Module | None = None,
-        torque_noise: NoiseStd | str | None = "auto",
         inference: str = "auto",
         inducing_points: int = LIMIT,
-        state_noise: tuple[NoiseStd, NoiseStd] | None = None,
         inertia: str | None = None,
         standardize: bool = True,
-        degrees_of_freedom: float | None = None,
     ) -> None:
+        self._keep(locals())
         require_double(system)
-        form = mean_of(mean)
+        form, stated = mean_of(mean), Noise.of(noise)
         priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
         check_priors(priors, system)
-        state_std_of(state_noise, system.robot)
-        self.specified = system
+        state_std_of(stated.state, system.robot)
+        self.system = system
         self.specification = Specification(
             system,
             form,
             priors,
-            noise_std,
-            learn_noise,
+            stated.for_priors(priors),
             analytical_parameters,
-            torque_noise_of(torque_noise, priors),
             check_method(inference),
             check_limit(inducing_points),
-            force_priors is None and torque_noise == "auto" and "actuation" in form.terms,
-            state_noise,
+            force_priors is None and stated.torque == "auto" and "actuation" in form.terms,
             check_inertia(inertia),
             standardize,
-            check_degrees(degrees_of_freedom),
         )
-
-    @classmethod
-    def of(cls, specification: Specification) -> StructuredGP:
-        """A model with a given specification."""
-        model = cls.__new__(cls)
-        model.specified, model.specification = specification.system, specification
-        return model
 
     @property
     def mean(self) -> AnalyticalMean:
@@ -148,207 +121,84 @@ class StructuredGP(Model[StructuredFit]):
         """Priors on the unknown forces."""
         return self.specification.priors
 
-    @property
-    def noise_std(self) -> NoiseStd | None:
-        """Noise of measured accelerations as given, `None` for what the log states."""
-        return self.specification.noise_std
-
-    def get_params(self) -> dict[str, Any]:
-        spec = self.specification
-        return {
-            "system": spec.system,
-            "mean": spec.mean,
-            "force_priors": None if spec.automatic else spec.priors,
-            "noise_std": spec.noise_std,
-            "learn_noise": spec.learn_noise,
-            "analytical_parameters": spec.parameters,
-            "torque_noise": "auto" if spec.automatic else spec.torque_noise,
-            "inference": spec.inference,
-            "inducing_points": spec.inducing_points,
-            "state_noise": spec.state_noise,
-            "inertia": spec.inertia,
-            "standardize": spec.standardize,
-            "degrees_of_freedom": spec.degrees_of_freedom,
-        }
-
     def fit(
         self,
         data: Dataset | Sequence[Observation] | StreamedDataset,
         *,
-        options: LearningOptions | None = None,
         learn: Iterable[str] | None = None,
-        begin: Mapping[str, Tensor] | None = None,
+        after: StructuredFit | None = None,
+        options: LearningOptions | None = None,
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
-        keep_checkpoint: bool = False,
-        distributed: bool = False,
     ) -> StructuredFit:
         """Learn hyperparameters (and analytical parameters) by maximum a posteriori, then condition.
 
         Args:
             data: measured accelerations, any mixture of measurements, or a log that is read piece by piece,
                 in memory that does not grow with its length.
+            learn: what is learned: names of priors, `"noise"`, `"analytical_parameters"`. Everything else
+                keeps the values (and input scales) of the fit `after`, or else the initial ones. Default all;
+                an empty list conditions only.
+            after: an earlier fit of this model, such as one to other or less data. What `learn` does not name
+                keeps its values; without `learn` learning begins there, by default on fewer samples
+                (`options.warm_start`).
             options: optimiser and its limits; L-BFGS by default, to a tolerance of 1e-9 where θ_A is learned.
-            learn: what is learned: names of priors, `"noise"`, `"analytical"`. Everything else keeps the
-                values (and input scales) of the previous fit, or else the initial ones. Default all; an
-                empty list conditions only.
-            begin: `hyperparameters` of a fit of the same kind of model, such as one to less data, where
-                learning begins; by default it begins on fewer samples (`options.warm_start`).
             progress: called after each evaluation; for a streamed log also after each piece, with the samples
                 so far, the number of all, and NaN.
-            checkpoint: file that records the evaluations of a long fit; a fit that finds it resumes
-                there, to the same bits as one without a break, and removes it at its end.
-            keep_checkpoint: leave the file, to be removed once the model is saved.
-            distributed: for a streamed log, share its pieces among the processes of `torch.distributed`, each
-                of which makes this call and gets the same fit.
+            checkpoint: file that records the evaluations of a long fit, and beside it the sums over a
+                streamed log; a fit that finds it resumes there, to the same bits as one without a break.
+                Remove it once the fitted model is saved.
 
         Returns:
-            The fitted model, which is also kept as `fitted`.
+            The fitted model. Fitting twice gives the same bits.
 
         Raises:
-            ModelError, DataError, UnknownNameError: the data, or the checkpoint, do not fit the model.
+            ModelError, DataError, UnknownNameError: the data, the earlier fit, or the checkpoint do not fit
+                the model.
             NumericalError: the likelihood cannot be computed.
         """
-        if isinstance(data, StreamedDataset):
-            sample = sample_of(self.specification, data)
-            known = sample.data
-        else:
-            sample, known = None, data
-        if self._fitted is None:
-            self.specification = self.specification.for_data(known)
-        chosen = None if learn is None else chosen_of(self.specification, learn)
-        if chosen == () and self._fitted is not None and not isinstance(data, StreamedDataset):
-            return self.condition(data)
-        given = given_to(self.specification, self._fitted, known, chosen)
-        self.specification, training = given.specification, given.training
-        spec, file = self.specification, None if checkpoint is None else Path(checkpoint)
+        spec = self.specification if after is None else self._continued(after)
+        sample = sample_of(spec, data) if isinstance(data, StreamedDataset) else None
+        known = data if sample is None else sample.data
+        assert not isinstance(known, StreamedDataset)
+        spec = spec.for_data(known)
+        chosen = None if learn is None else chosen_of(spec, learn)
+        if chosen == () and after is not None and sample is None:
+            return after.condition(known)
+        given = given_to(spec, None if after is None else after.problem, known, chosen)
+        spec, training = given.specification, given.training
+        file = None if checkpoint is None else Path(checkpoint)
         spec.system.announce_states(training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
-        log, neighbours, forces = None, None, None
+        neighbours, forces = None, None
         if sample is not None:
             training = dataclasses.replace(training, part_of=sample.count)
-            log = Pass(spec, sample, file, progress, distributed)
             neighbours = neighbours_of(spec, sample, training)
         problem = spec.problem(training)
         if given.robot is not spec.system.robot:
             system = spec.system.with_robot(given.robot)
             problem = dataclasses.replace(problem, system=system, pinned=given.pinned)
-        search = search_of(spec, problem, self._fitted, chosen, options)
-        lesson, saved = learned(spec, problem, search, file, progress, begin, neighbours)
+        before = {} if after is None else after.hyperparameters
+        search = search_of(spec, problem, before, chosen, options)
+        begin = {key: before[key] for key in search.start if key in before} if chosen is None else None
+        lesson = learned(spec, problem, search, file, progress, begin, neighbours)
         values, doubts = lesson.hyperparameters, (*given.doubts, *lesson.warnings)
-        if log is not None and lesson.problem.inducing is not None:
-            forces = log.forces(*lesson.problem.with_coulomb_errors(values))
-        fitted = self.adopt(
-            conditioned(spec, lesson.problem, values, lesson.learned, doubts, lesson.learned_on, forces)
-        )
-        for kept in () if keep_checkpoint else (saved, log):
-            if kept is not None:
-                kept.remove()
-        return fitted
+        if sample is not None and lesson.problem.inducing is not None:
+            forces = Pass(spec, sample, file, progress).forces(*lesson.problem.with_coulomb_errors(values))
+        return conditioned(spec, lesson.problem, values, lesson.learned, doubts, lesson.learned_on, forces)
 
-    def condition(
-        self,
-        data: Dataset | Sequence[Observation],
-        hyperparameters: Mapping[str, Tensor] | None = None,
-    ) -> StructuredFit:
-        """Condition on other data, with the hyperparameters and input scales of the previous fit.
-
-        Args:
-            data: what to condition on.
-            hyperparameters: use these instead.
+    def _continued(self, after: StructuredFit) -> Specification:
+        """What an earlier fit of this model was fitted with: priors that were left to its data are filled in.
 
         Raises:
-            ModelError: the model has not been fitted, or the data do not fit it.
+            ModelError: the fit is of a model with other priors or contacts.
         """
-        fitted = self.fitted
-        training, doubts = training_for(self.specification, fitted, data, learned=())
-        if self.specification.learn_noise and training.quantities != fitted.training.quantities:
+        spec = after.specification
+        own = () if self.specification.automatic else tuple(prior.name for prior in self.force_priors)
+        names = tuple(prior.name for prior in spec.priors)
+        if names[: len(own)] != own or spec.system.contact_names != self.system.contact_names:
             raise ModelError(
-                "the learned noise belongs to other measurements",
-                expected=", ".join(fitted.training.quantities),
-                got=", ".join(training.quantities),
-                hint='call fit(data, learn=["noise"]), which learns the noise alone',
+                "`after` is a fit of another model",
+                expected=f"priors {', '.join(own)} and contacts {', '.join(self.system.contact_names)}",
+                got=f"priors {', '.join(names)} and contacts {', '.join(spec.system.contact_names)}",
             )
-        values = fitted.hyperparameters if hyperparameters is None else hyperparameters
-        spec, priors = self.specification, fitted.problem.priors
-        if not is_sparse(spec.inference, priors, training.all_samples):
-            training = fitted.with_slopes(training)
-        problem = prepared(spec, dataclasses.replace(fitted.problem, training=training), values)
-        return self.adopt(conditioned(spec, problem, values, warnings=doubts))
-
-    def update(self, data: Dataset | Sequence[Observation]) -> StructuredFit:
-        """Add samples to the most recent fit, as in a control loop.
-
-        With sparse inference the cost does not depend on the number of samples seen before; with exact
-        inference it grows with their square. Hyperparameters, input scales and inducing points stay as they
-        are.
-
-        Args:
-            data: further measurements of the same quantities.
-
-        Raises:
-            ModelError: the model has not been fitted, or the data measure something else.
-        """
-        fitted = self.fitted
-        training, _ = training_for(self.specification, fitted, data, learned=())
-        if training.quantities != tuple(fitted.noise):
-            raise ModelError(
-                "an update measures other quantities than the fit",
-                expected=", ".join(fitted.noise),
-                got=", ".join(training.quantities),
-            )
-        return self.adopt(fitted.updated(training))
-
-    def forget(
-        self, what: float | Dataset | Sequence[Observation], priors: Sequence[str] | None = None
-    ) -> StructuredFit:
-        """Forget samples, so that later ones count for more.
-
-        Args:
-            what: a factor between 0 and 1, such as exp(−Δt/T) for a memory of T seconds, which the weight of
-                all samples so far is multiplied by; or samples of the fit, which are removed.
-            priors: forget only what the samples say about the forces of these priors, such as a payload: they
-                drift towards their prior, and the factor is the correlation with what they were.
-
-        Raises:
-            ModelError: the model has not been fitted, its inference is exact, or the factor is out of range.
-            UnknownNameError: no such prior.
-            NumericalError: the samples to remove were not among those of the fit.
-        """
-        if isinstance(what, int | float):
-            return self.adopt(self.fitted.forgetting(float(what), priors))
-        training, _ = training_for(self.specification, self.fitted, what, learned=())
-        return self.adopt(self.fitted.without(training))
-
-    def adopt(self, fitted: StructuredFit) -> StructuredFit:
-        """Predict with this fit from now on."""
-        self._fitted = fitted
-        return fitted
-
-    def log_marginal_likelihood(self) -> float:
-        """log p(y | X, θ) of the training data.
-
-        Raises:
-            ModelError: the model has not been fitted.
-        """
-        value = self.fitted.log_marginal_likelihood
-        assert value is not None
-        return value
-
-    @property
-    def hyperparameters(self) -> Mapping[str, Tensor]:
-        """All learned tensors of the most recent fit, by name."""
-        return self.fitted.hyperparameters
-
-    @property
-    def posterior(self) -> ForcePosterior:
-        """The posterior over latent forces.
-
-        Raises:
-            ModelError: the model has not been fitted.
-        """
-        return self.fitted.posterior
-
-    @property
-    def training(self) -> Training:
-        """What the posterior is conditioned on."""
-        return self.fitted.training
+        return spec

@@ -44,7 +44,6 @@ from forcegp.forces.torque_noise import REGION, TORQUE_NOISE
 from forcegp.gp.likelihood import require_exact_fits
 from forcegp.gp.optimise import Learned, LearningOptions, Progress
 from forcegp.models.base import FitProgress
-from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_spec import Specification
 from forcegp.robot.model import RobotModel
 from forcegp.storage.checkpoint import Checkpoint
@@ -106,14 +105,14 @@ class Given:
 
 def given_to(
     spec: Specification,
-    before: StructuredFit | None,
+    before: Problem | None,
     data: Dataset | Sequence[Observation],
     chosen: Sequence[str] | None,
 ) -> Given:
-    """What a fit to data learns from, after an earlier fit of the model or as its first."""
+    """What a fit to data learns from, after the problem of an earlier fit or as the first."""
     training, doubts = training_for(spec, before, data, chosen)
-    if before is not None and not before.problem.offsets:
-        return Given(spec, training, before.system.robot, before.problem.pinned, doubts)
+    if before is not None and not before.offsets:
+        return Given(spec, training, before.system.robot, before.pinned, doubts)
     if before is not None or chosen is not None:
         return Given(spec, training, spec.system.robot, (), doubts)
     found = spec.inertia_of(training)
@@ -128,7 +127,7 @@ def given_to(
 
 def training_for(
     spec: Specification,
-    before: StructuredFit | None,
+    before: Problem | None,
     data: Dataset | Sequence[Observation],
     learned: Sequence[str] | None,
 ) -> tuple[Training, tuple[str, ...]]:
@@ -140,8 +139,8 @@ def training_for(
     if before is not None and learned is not None:
         scales = zip(spec.priors, before.training.scales, strict=True)
         kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
-    training = training_of(data, spec.system, spec.priors, spec.noise_std, kept, spec.standardize)
-    return in_motion(spec.system, training) if spec.learns_torque_noise else (training, ())
+    training = training_of(data, spec.system, spec.priors, spec.noise.acceleration, kept, spec.standardize)
+    return in_motion(spec.system, training) if spec.noise.learns_torque else (training, ())
 
 
 def chosen_of(spec: Specification, learn: Iterable[str]) -> tuple[str, ...]:
@@ -161,17 +160,17 @@ def chosen_of(spec: Specification, learn: Iterable[str]) -> tuple[str, ...]:
 def search_of(
     spec: Specification,
     problem: Problem,
-    before: StructuredFit | None,
+    known: Mapping[str, Tensor],
     chosen: Sequence[str] | None,
     options: LearningOptions | None,
 ) -> Search:
-    """What is learned of a problem, from where, and what keeps its values.
+    """What is learned of a problem, from where, and what keeps its known value.
 
     The scale of a force that the robot contains is not learned.
     """
-    options = options or (OPTIONS if spec.parameters is None else WITH_PARAMETERS)
-    start = initial(problem, spec.learn_noise, spec.learns_torque_noise)
-    known = {} if before is None or chosen is None else before.hyperparameters
+    options = options or (OPTIONS if spec.analytical_parameters is None else WITH_PARAMETERS)
+    start = initial(problem, spec.noise.learn, spec.noise.learns_torque)
+    known = {} if chosen is None else known
     current = {key: known.get(key, value) for key, value in start.items()}
     if chosen is not None and NOISE not in chosen:
         current |= {key: value for key, value in known.items() if key.startswith(REGION)}
@@ -208,7 +207,7 @@ def subset(spec: Specification, problem: Problem) -> Problem:
     most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
     if training.samples > most:
         # Neighbours in time show how long residuals are correlated; elsewhere samples far apart say most.
-        training = training.evenly(most) if spec.learns_torque_noise else training.thinned(most)
+        training = training.evenly(most) if spec.noise.learns_torque else training.thinned(most)
     problem = dataclasses.replace(problem, training=training)
     return without_inducing(problem) if finite else problem
 
@@ -221,7 +220,7 @@ def learned(
     progress: FitProgress | None,
     begin: Mapping[str, Tensor] | None,
     neighbours: Training | None,
-) -> tuple[Lesson, Checkpoint | None]:
+) -> Lesson:
     """Learn what is free in a search, and record it; where nothing is free, prepare the problem alone.
 
     Args:
@@ -233,14 +232,11 @@ def learned(
         begin: where to begin.
         neighbours: see `solve`.
 
-    Returns:
-        What was learned, and its record.
-
     Raises:
         ModelError: the file belongs to other learning.
     """
     if not search.start:
-        return Lesson(prepared(spec, problem, search.held), search.held), None
+        return Lesson(prepared(spec, problem, search.held), search.held)
     saved = None
     if file is not None:
         saved = Checkpoint(file, _key(spec, problem, search, begin))
@@ -254,7 +250,7 @@ def learned(
     lesson = solve(spec, problem, search, report if progress else None, begin, neighbours)
     if saved is not None:
         saved.write()
-    return lesson, saved
+    return lesson
 
 
 def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:
@@ -269,7 +265,7 @@ def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[s
     options = (
         spec.inference,
         spec.inducing_points,
-        spec.degrees_of_freedom,
+        spec.noise.degrees_of_freedom,
         spec.standardize,
         search.options,
     )
@@ -301,7 +297,7 @@ def solve(
     part = subset(spec, problem)
     if part.inducing is None:
         require_exact_fits(part.fixed_rows.blocks)
-    calibrated = spec.learns_torque_noise and TORQUE_NOISE in search.start
+    calibrated = spec.noise.learns_torque and TORQUE_NOISE in search.start
     correlated = calibrated and not any(prior.in_time for prior in part.priors)
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)
@@ -314,9 +310,9 @@ def solve(
         part, learned, doubts = with_learned_slopes(part, search, learned, progress)
         warnings += doubts
         values = {**search.held, **learned.tensors}
-    if spec.degrees_of_freedom is not None:
+    if spec.noise.degrees_of_freedom is not None:
         for _ in range(ROUNDS):
-            part = weighted(part, values, spec.degrees_of_freedom)
+            part = weighted(part, values, spec.noise.degrees_of_freedom)
             learned = search.solve(part, progress, learned.tensors)
             values = {**search.held, **learned.tensors}
     if correlated:
@@ -331,7 +327,7 @@ def solve(
     training = dataclasses.replace(problem.training, slopes=part.training.slopes)
     whole = dataclasses.replace(part, training=training, inducing=None)
     whole = prepared(spec, whole, values)
-    if spec.degrees_of_freedom is not None and (count := left_out(whole)):
+    if spec.noise.degrees_of_freedom is not None and (count := left_out(whole)):
         samples = whole.training.samples
         warnings.append(f"{count} of {samples} samples lie far outside the noise and hardly count")
     return Lesson(whole, values, learned, learned_on, tuple(warnings))
@@ -358,6 +354,6 @@ def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]
             problem = without_inducing(problem)
         else:
             problem = with_inducing(problem, values, spec.inducing_points)
-    if spec.degrees_of_freedom is None:
+    if spec.noise.degrees_of_freedom is None:
         return problem
-    return weighted(problem, values, spec.degrees_of_freedom)
+    return weighted(problem, values, spec.noise.degrees_of_freedom)

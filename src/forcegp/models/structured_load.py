@@ -13,6 +13,7 @@ from forcegp.errors import ForceGPError, ModelError
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.noise import Noise
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import states
@@ -21,7 +22,6 @@ from forcegp.gp.features import Standardization
 from forcegp.gp.sparse_tensors import posterior_of_tensors
 from forcegp.models.fit_result import FitResult
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_spec import CLASSES, COLUMNS, IN_TIME, Specification, StructuredSettings
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode
@@ -35,7 +35,7 @@ def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 def load_structured(
     header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> StructuredGP:
+) -> StructuredFit:
     """The model that `StructuredFit.save` wrote.
 
     Raises:
@@ -43,16 +43,14 @@ def load_structured(
     """
     settings = settings_of(header, StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)
-    model = StructuredGP.of(spec)
     try:
         _check_types(tensors)
         training = _training(settings, spec, tensors)
         hyper = _below(tensors, "hyper.")
         _check_hyperparameters(spec, training, hyper)
-        model.adopt(_restored(spec, training, hyper, tensors, settings, system))
+        return _restored(spec, training, hyper, tensors, settings, system)
     except (KeyError, RuntimeError, ValueError, IndexError) as cause:
         raise ModelError(f"{source}: the model's tensors do not fit its settings", got=str(cause)) from cause
-    return model
 
 
 def _specification(
@@ -64,25 +62,21 @@ def _specification(
     )
     original, parameters = take_robot(tensors, "start.", system.robot, source), None
     system = system.with_robot(original)
-    if settings.analytical is not None:
+    if settings.analytical_parameters is not None:
         try:
-            parameters = AnalyticalParameters(original, settings.analytical)
+            parameters = AnalyticalParameters(original, settings.analytical_parameters)
         except ForceGPError as cause:
-            raise ModelError.at(f"{source}: field 'settings.analytical'", cause) from cause
+            raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
     return Specification(
         system,
         AnalyticalMean(settings.mean),
         priors,
-        settings.noise_std,
-        settings.learn_noise,
+        Noise(**settings.noise.model_dump()),
         parameters,
-        settings.torque_noise,
         settings.inference,
         settings.inducing_points,
-        state_noise=settings.state_noise,
         inertia=settings.inertia,
         standardize=settings.standardize,
-        degrees_of_freedom=settings.degrees_of_freedom,
     )
 
 
@@ -160,7 +154,7 @@ def _restored(
     """The fit with its weights as they were; the factorisation waits until a covariance is asked for."""
     problem = dataclasses.replace(
         spec.problem(training),
-        system=spec.system if spec.parameters is not None else system,
+        system=spec.system if spec.analytical_parameters is not None else system,
         power=settings.power,
         correlation=_correlation(tensors, settings, system),
         offsets=_below(tensors, "offset."),

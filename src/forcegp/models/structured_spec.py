@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import UnknownNameError
 from forcegp.forces.inertia import Inertia, inertia_of
 from forcegp.forces.learn import Problem, analytical_parameters
 from forcegp.forces.measurements import Training
+from forcegp.forces.noise import Noise
 from forcegp.forces.observations import (
-    NoiseStd,
     Observation,
     is_simulated,
     observations_of,
@@ -26,7 +26,7 @@ from forcegp.forces.observations import (
     states_noise,
 )
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.coregional import CoregionalPrior
 from forcegp.forces.priors.default import measured_priors
@@ -87,34 +87,26 @@ class Specification:
         system: robot and contacts.
         mean: prior mean of Q.
         priors: on the unknown forces.
-        noise_std: of measured accelerations, or `None` for what the log states.
-        learn_noise: whether the noise is learned.
-        parameters: module whose `forward()` gives the robot at θ_A, or `None`.
-        torque_noise: standard deviation of the motor torque's white noise, `"learn"`, or `None` for none.
+        noise: of measured accelerations, torques and states.
+        analytical_parameters: module whose `forward()` gives the robot at θ_A, or `None`.
         inference: `"auto"`, `"exact"` or `"sparse"`.
         inducing_points: maximum number of inducing points of one prior.
         automatic: whether the priors depend on whether the data are simulated or measured.
-        state_noise: standard deviations of the noise of q and of q̇, or `None` for none.
         inertia: `"file"`, or `"auto"` where the log may show another one; `None` for `"auto"` with the
             defaults of a measured robot and `"file"` elsewhere.
         standardize: whether the inputs of kernels are standardized.
-        degrees_of_freedom: ν of noise with heavy tails, or `None` for Gaussian noise.
     """
 
     system: ConstrainedSystem
     mean: AnalyticalMean
     priors: tuple[ForcePrior, ...]
-    noise_std: NoiseStd | None = None
-    learn_noise: bool = False
-    parameters: nn.Module | None = None
-    torque_noise: NoiseStd | str | None = None
+    noise: Noise
+    analytical_parameters: nn.Module | None = None
     inference: str = "auto"
     inducing_points: int = LIMIT
     automatic: bool = False
-    state_noise: tuple[NoiseStd, NoiseStd] | None = None
     inertia: str | None = None
     standardize: bool = True
-    degrees_of_freedom: float | None = None
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
         """The specification with what was left to the data filled in.
@@ -125,56 +117,30 @@ class Specification:
         spec, observations = self, observations_of(data)
         if spec.automatic and not is_simulated(observations):
             priors = measured_priors(spec.system)
-            spec = dataclasses.replace(
-                spec, priors=priors, torque_noise="learn", inertia=spec.inertia or "auto"
-            )
-        if spec.learns_torque_noise and spec.noise_std is None and not states_noise(observations):
-            spec = dataclasses.replace(spec, learn_noise=True)
+            noise = dataclasses.replace(spec.noise, torque="learn")
+            spec = dataclasses.replace(spec, priors=priors, noise=noise, inertia=spec.inertia or "auto")
+        if spec.noise.learns_torque and spec.noise.acceleration is None and not states_noise(observations):
+            spec = dataclasses.replace(spec, noise=dataclasses.replace(spec.noise, learn=True))
         return dataclasses.replace(spec, automatic=False)
-
-    @property
-    def learns_torque_noise(self) -> bool:
-        """Whether the noise of the motor torque is learned."""
-        return isinstance(self.torque_noise, str)
 
     def inertia_of(self, training: Training) -> Inertia:
         """The robot that the training samples ask for, where the model is to find it."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
-        asks = self.inertia == "auto" and "actuation" in self.mean.terms and self.parameters is None
+        asks = (
+            self.inertia == "auto" and "actuation" in self.mean.terms and self.analytical_parameters is None
+        )
         if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
             return Inertia(self.system.robot)
         return inertia_of(self.system, friction, self.mean, training)
 
     def problem(self, training: Training) -> Problem:
         """The learning problem of training data."""
-        robot, noise = self.system.robot, self.torque_noise
+        robot, noise = self.system.robot, self.noise
         std = None
-        if noise is not None and not isinstance(noise, str):
-            std = torch.as_tensor(noise, dtype=robot.dtype, device=robot.device).expand(robot.nq)
-        state_std = None if self.state_noise is None else state_std_of(self.state_noise, robot)
-        return Problem(
-            self.system, self.priors, self.mean, training, self.parameters, std, state_std=state_std
-        )
-
-
-def torque_noise_of(given: NoiseStd | str | None, priors: Sequence[ForcePrior]) -> NoiseStd | str | None:
-    """What is known of the noise of the motor torque.
-
-    Raises:
-        ModelError: a name other than "auto" and "learn", or a value that is not positive.
-    """
-    if given == "auto":
-        measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
-        return "learn" if measured else None
-    if given is None or given == "learn":
-        return given
-    if isinstance(given, str) or not bool((torch.as_tensor(given) > 0.0).all()):
-        raise ModelError(
-            "the noise of the motor torque is not valid",
-            expected="'auto', 'learn', None, or positive standard deviations [N m, N]",
-            got=given,
-        )
-    return given
+        if noise.torque is not None and not isinstance(noise.torque, str):
+            std = torch.as_tensor(noise.torque, dtype=robot.dtype, device=robot.device).expand(robot.nq)
+        state_std, theta = state_std_of(noise.state, robot), self.analytical_parameters
+        return Problem(self.system, self.priors, self.mean, training, theta, std, state_std=state_std)
 
 
 def check_inertia(inertia: str | None) -> str | None:
@@ -209,18 +175,24 @@ class ResultSettings(Settings):
     more_points_would_help: bool | None = None
 
 
+class NoiseSettings(Settings):
+    """Fields of `Noise`."""
+
+    acceleration: PositiveFloat | tuple[PositiveFloat, ...] | None
+    learn: bool
+    torque: PositiveFloat | tuple[PositiveFloat, ...] | Literal["learn"] | None
+    state: tuple[Stated, Stated] | None
+    degrees_of_freedom: float | None = Field(gt=2.0)
+
+
 class StructuredSettings(Settings):
     """What is kept of a structured Gaussian process besides its tensors."""
 
     mean: tuple[str, ...]
-    noise_std: PositiveFloat | tuple[PositiveFloat, ...] | None
-    learn_noise: bool
-    torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["learn"] | None
-    state_noise: tuple[Stated, Stated] | None
+    noise: NoiseSettings
     inference: Literal["auto", "exact", "sparse"]
     inducing_points: PositiveInt = LIMIT
     standardize: bool = True
-    degrees_of_freedom: float | None = Field(default=None, gt=2.0)
     inertia: Literal["file", "auto"] | None = None
     power: float = Field(gt=0.0, le=1.0)
     correlation_time: float = Field(default=0.0, ge=0.0)
@@ -228,7 +200,7 @@ class StructuredSettings(Settings):
     pinned: tuple[str, ...]
     measured: tuple[str, ...]
     constant: tuple[tuple[str, ...], ...]
-    analytical: dict[str, tuple[str, ...]] | None
+    analytical_parameters: dict[str, tuple[str, ...]] | None
     result: ResultSettings
 
 
@@ -251,7 +223,7 @@ def pack(
     Raises:
         ModelError: a prior or kernel is Python code.
     """
-    own = spec.parameters if isinstance(spec.parameters, AnalyticalParameters) else None
+    own = spec.analytical_parameters if isinstance(spec.analytical_parameters, AnalyticalParameters) else None
     tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
     tensors |= {f"offset.{name}": value for name, value in problem.offsets.items()}
     if problem.torque_std is not None:
@@ -271,23 +243,26 @@ def _settings_of(
     spec: Specification, problem: Problem, exact: bool, own: AnalyticalParameters | None, result: FitResult
 ) -> StructuredSettings:
     """What is kept of a fit besides tensors."""
+    noise = spec.noise
     return StructuredSettings(
         mean=spec.mean.terms,
-        noise_std=plain(spec.noise_std),
-        learn_noise=spec.learn_noise,
-        torque_noise=plain(spec.torque_noise),
-        state_noise=None if spec.state_noise is None else tuple(map(plain, spec.state_noise)),  # pyright: ignore[reportArgumentType]
+        noise=NoiseSettings(
+            acceleration=plain(noise.acceleration),
+            learn=noise.learn,
+            torque=plain(noise.torque),
+            state=None if noise.state is None else tuple(map(plain, noise.state)),  # pyright: ignore[reportArgumentType]
+            degrees_of_freedom=noise.degrees_of_freedom,
+        ),
         inference=spec.inference,  # pyright: ignore[reportArgumentType]
         inducing_points=spec.inducing_points,
         standardize=spec.standardize,
-        degrees_of_freedom=spec.degrees_of_freedom,
         inertia=spec.inertia,  # pyright: ignore[reportArgumentType]
         power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
         pinned=problem.pinned,
         measured=problem.training.quantities if exact else (),
         constant=tuple(scale.constant for scale in problem.training.scales),
-        analytical=None if own is None else own.joints,
+        analytical_parameters=None if own is None else own.joints,
         result=ResultSettings(**{name: getattr(result, name) for name in ResultSettings.model_fields}),
     )
 
@@ -319,4 +294,4 @@ def _tensors_of(training: Training, in_time: bool) -> dict[str, Tensor]:
 def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:
     """The hyperparameters without θ_A of a module that cannot be saved, which the robot contains."""
     left_out = analytical_parameters(hyper) if own is None else {}
-    return {k: v for k, v in hyper.items() if k.removeprefix("analytical.") not in left_out}
+    return {k: v for k, v in hyper.items() if k.removeprefix(f"{ANALYTICAL}.") not in left_out}

@@ -68,7 +68,7 @@ def sample_of(spec: Specification, stream: StreamedDataset) -> Sample:
         ModelError: exact inference is asked for on more samples than are read at once.
     """
     first = next(stream.pieces(), None)
-    if first is not None and spec.for_data(first).learns_torque_noise:
+    if first is not None and spec.for_data(first).noise.learns_torque:
         data, count = spaced_sample(stream.pieces(), SAMPLE_ROWS, moving_rows)
         if count >= FEWEST_MOVING:
             _check_inference(spec, count, len(data))
@@ -80,7 +80,7 @@ def sample_of(spec: Specification, stream: StreamedDataset) -> Sample:
 
 def _check_inference(spec: Specification, count: int, held: int) -> None:
     """Raise `ModelError` where exact inference is needed on more samples than are held at once."""
-    if spec.degrees_of_freedom is not None and count > held:
+    if spec.noise.degrees_of_freedom is not None and count > held:
         raise ModelError(
             "noise with heavy tails weighs every sample, also of a log that is read piece by piece",
             expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",
@@ -107,7 +107,7 @@ def neighbours_of(spec: Specification, sample: Sample, training: Training) -> Tr
     Returns:
         `None` where the sample is the whole log, or the model does not ask for it.
     """
-    if not spec.learns_torque_noise or len(sample.data) == sample.count:
+    if not spec.noise.learns_torque or len(sample.data) == sample.count:
         return None
     last, length = sample.log.piece_count - 1, MOST_RESIDUALS // STRETCHES
     wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
@@ -115,7 +115,9 @@ def neighbours_of(spec: Specification, sample: Sample, training: Training) -> Tr
     if sample.moving:
         parts = [piece[moving_rows(piece)] for piece in parts]
     data = Dataset.concatenate([piece[:length] for piece in parts])
-    return training_of(data, spec.system, spec.priors, spec.noise_std, kept_scales(spec.priors, training))
+    return training_of(
+        data, spec.system, spec.priors, spec.noise.acceleration, kept_scales(spec.priors, training)
+    )
 
 
 def kept_scales(priors: Sequence[ForcePrior], training: Training) -> dict[str, Standardization]:
@@ -137,14 +139,12 @@ class Pass:
         sample: the log, and what the model learned from.
         checkpoint: file that records the sums, or `None`.
         progress: called with the samples so far, the number of all, and NaN.
-        distributed: whether the processes of `torch.distributed` share the pieces.
     """
 
     spec: Specification
     sample: Sample
     checkpoint: Path | None = None
     progress: FitProgress | None = None
-    distributed: bool = False
 
     @torch.no_grad()
     def forces(
@@ -165,9 +165,9 @@ class Pass:
         kept = {} if saved is None else saved.read()
         if kept:
             basis, begin = _restored(problem, basis, kept)
-        elif self.distributed:
+        elif self.sample.log.distributed:
             basis = share_basis(basis)
-        processes = dist.get_world_size() if self.distributed else 1
+        processes = dist.get_world_size() if self.sample.log.distributed else 1
 
         def after(total: Totals) -> None:
             if saved is not None:
@@ -178,13 +178,13 @@ class Pass:
 
         pieces = self._pieces(problem, 0 if begin is None else begin.pieces)
         total = total_over(problem, hyperparameters, basis, pieces, begin, after)
-        if self.distributed:
+        if self.sample.log.distributed:
             total = total.over_processes()
         return posterior_of(problem, hyperparameters, basis, total), total.constant
 
     def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
         """The samples of this process, a piece at a time; a piece of another process has none."""
-        rank, processes = (dist.get_rank(), dist.get_world_size()) if self.distributed else (0, 1)
+        rank, processes = (dist.get_rank(), dist.get_world_size()) if self.sample.log.distributed else (0, 1)
         kept = kept_scales(problem.priors, problem.training)
         for piece in self.sample.log.pieces(start, (rank, processes)):
             if self.sample.moving:
@@ -192,17 +192,12 @@ class Pass:
             if len(piece) == 0:
                 yield problem.training.of_rows([torch.arange(0)] * len(problem.training.measurements))
             else:
-                yield training_of(piece, self.spec.system, problem.priors, self.spec.noise_std, kept)
+                yield training_of(piece, self.spec.system, problem.priors, self.spec.noise.acceleration, kept)
 
     def _own_file(self) -> Path:
         assert self.checkpoint is not None
         path = beside(self.checkpoint)
-        return path.with_name(f"{path.name}.{dist.get_rank()}") if self.distributed else path
-
-    def remove(self) -> None:
-        """Remove the checkpoint; call it once the model is saved."""
-        if self.checkpoint is not None:
-            self._own_file().unlink(missing_ok=True)
+        return path.with_name(f"{path.name}.{dist.get_rank()}") if self.sample.log.distributed else path
 
     def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
         """Identifies the sums over a log, with a basis, a system and a noise."""

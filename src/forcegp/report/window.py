@@ -13,7 +13,6 @@ from forcegp.data import Dataset
 from forcegp.files import Header
 from forcegp.models.base import Predictor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.style import INK, Picture, colour, draw, label
 from forcegp.report.values import Series, as_tensor, columns, series
 
@@ -77,11 +76,10 @@ def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
     """
     predicted = model.predict(data.q, data.qd, data.tau, active=data.active(model.system.contact_names))
     clean, variance = data.extras.get("qdd_clean"), predicted.variance
-    fitted = model.fitted if isinstance(model, StructuredGP) else model
-    if variance is not None and isinstance(fitted, StructuredFit) and fitted.torque_std is not None:
+    if variance is not None and isinstance(model, StructuredFit) and model.torque_std is not None:
         # Where the noise of the torque is known, a measurement scatters by it around what is predicted.
-        active = data.active(fitted.system.contact_names)
-        variance = variance + fitted.noise_variance(data.q, data.qd, data.tau, active=active)
+        active = data.active(model.system.contact_names)
+        variance = variance + model.noise_variance(data.q, data.qd, data.tau, active=active)
     return WindowData(
         model=name,
         noise_std=data.header.noise_std,

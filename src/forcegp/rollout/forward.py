@@ -175,7 +175,7 @@ def rollout_model(
 
     Raises:
         DivergedError: a trajectory diverged; the error holds what was computed.
-        ModelError: the model is not fitted, has no function samples, or cannot leave its own system.
+        ModelError: the model has no function samples, or cannot leave its own system.
     """
     options = options or DEFAULT
     batch = torch.broadcast_shapes(q0.shape[:-1], qd0.shape[:-1])

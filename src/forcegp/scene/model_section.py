@@ -8,7 +8,15 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    field_validator,
+)
 
 
 class Section(BaseModel):
@@ -54,27 +62,46 @@ class WindowSection(Section):
     angle: NonNegativeFloat = 0.0
 
 
+class NoiseSection(Section):
+    """`[model.noise]`: fields of `Noise`; `torque = "none"` for none."""
+
+    acceleration: NonNegativeFloat | tuple[NonNegativeFloat, ...] | None = None
+    learn: bool = False
+    torque: PositiveFloat | tuple[PositiveFloat, ...] | Literal["auto", "learn", "none"] = "auto"
+    state: tuple[State, State] | None = None
+    degrees_of_freedom: PositiveFloat | None = None
+
+
 class ModelSection(Section):
     """`[model]`: see `forcegp.models.configured`."""
 
     name: str | None = None
-    noise_std: NonNegativeFloat | tuple[NonNegativeFloat, ...] | None = None
-    learn_noise: bool = False
-    torque_noise: PositiveFloat | tuple[PositiveFloat, ...] | Literal["auto", "learn", "none"] = "auto"
-    state_noise: tuple[State, State] | None = None
+    noise: NoiseSection = NoiseSection()
     sensor_noise_std: PositiveFloat | None = None
     inference: Literal["auto", "exact", "sparse"] = "auto"
     inertia: Literal["file", "auto"] | None = None
     inducing_points: PositiveInt = 100
     standardize: bool = True
-    degrees_of_freedom: PositiveFloat | None = None
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: tuple[dict[str, Any], ...] = ()
-    analytical: dict[str, Literal["all"] | tuple[str, ...]] = {}
+    analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = {}
     hidden: tuple[PositiveInt, ...] = ()
     window: WindowSection = WindowSection()
     seed: NonNegativeInt | None = None
     learning: LearningSection = LearningSection()
+
+    @field_validator("noise", mode="before")
+    @classmethod
+    def _of_accelerations(cls, value: object) -> object:
+        """A number, or a list of them, is the noise of accelerations."""
+        return _tuples({"acceleration": value} if isinstance(value, int | float | list) else value)
+
+
+def _tuples(value: Any) -> Any:
+    """Lists as tuples, which strict validation asks for after a validator in Python."""
+    if isinstance(value, dict):
+        return {key: _tuples(part) for key, part in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 class ModelFile(Section):

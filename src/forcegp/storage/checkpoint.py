@@ -127,10 +127,6 @@ class Checkpoint:
             write_record(self.path, dict(zip(NAMES, parts, strict=True)), self.key)
         self._written = time.monotonic()
 
-    def remove(self) -> None:
-        """Remove the file of a fit that has ended; call it once the model is saved."""
-        self.path.unlink(missing_ok=True)
-
 
 def write_record(path: Path, tensors: Mapping[str, Tensor], key: str) -> None:
     """Write a checkpoint, whole or not at all.

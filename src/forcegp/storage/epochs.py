@@ -70,7 +70,3 @@ class EpochCheckpoint:
         """
         checkpoint.write_record(self.path, state, self.key)
         self._written = time.monotonic()
-
-    def remove(self) -> None:
-        """Remove the file of a training that has ended; call it once the model is saved."""
-        self.path.unlink(missing_ok=True)

@@ -40,7 +40,7 @@ class ModelHeader(Header):
     """
 
     FORMAT: ClassVar[str] = "forcegp-model"
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     kind: str
     settings: dict[str, Any]

@@ -65,7 +65,3 @@ class SumsCheckpoint:
             with atomic_file(self.path) as temporary:
                 temporary.write_bytes(safetensors.torch.save(own, {"key": self.key}))
             self._written = time.monotonic()
-
-    def remove(self) -> None:
-        """Remove the file; call it once the model is saved."""
-        self.path.unlink(missing_ok=True)

@@ -22,7 +22,7 @@ from forcegp.robot.model import RobotModel
 JOINT, CONTACT, CONSTRAINT = "joint", "contact", "constraint"
 """Targets of priors: the joint force Q, the contact's dissipative force Q_z, or the part of Q that acts
 against the constraint (the range of Aᵀ), which no acceleration in contact shows."""
-NOISE, ANALYTICAL, COULOMB = "noise", "analytical", "coulomb"
+NOISE, ANALYTICAL, COULOMB = "noise", "analytical_parameters", "coulomb"
 RESERVED = (NOISE, ANALYTICAL, COULOMB)
 """Prefixes of what is learned beside the hyperparameters of the priors."""
 
