@@ -18,7 +18,7 @@ import torch
 from forcegp.data import split_by_stretches
 from forcegp.data.split import complement
 from forcegp.evaluation import evaluate
-from forcegp.files import atomic_directory, write_json
+from forcegp.files import write_json, written_folder
 from forcegp.models.configured import configured
 from forcegp.optional import optional_module
 from forcegp.scene import load_scene
@@ -93,7 +93,7 @@ def run_fit(fit: Fit, out: str) -> dict[str, Any]:
         "seconds": fitted.seconds,
         "converged": fitted.converged,
     }
-    with atomic_directory(folder) as temporary:
+    with written_folder(folder) as temporary:
         fitted.save(temporary / MODEL)
         write_json(temporary / SCORE, score)
     return score

@@ -17,7 +17,7 @@ import torch
 import forcegp
 from forcegp.errors import DestinationError, ForceGPError, ModelError
 from forcegp.storage import folder as module
-from forcegp.storage.folder import HEADER_FILE, TENSOR_FILE, check_model_destination
+from forcegp.storage.model_file import HEADER_FILE, TENSOR_FILE, check_model_destination
 from forcegp.temporary import ASIDE
 from random_data import random_data, table_system
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, DataFile, ModelFolder, data_of_robot, progress_bar, read_data, show
+from forcegp.cli.common import AsJson, DataFile, ModelFile, data_of_robot, progress_bar, read_data, show
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,7 +33,7 @@ Seed = Annotated[int, typer.Option(help="Seed of the samples.")]
 
 
 def rollout(
-    model: ModelFolder,
+    model: ModelFile,
     data: DataFile,
     out: Out,
     start: Start = 0,
@@ -53,12 +53,12 @@ def rollout(
 
     [bold]Examples[/bold]
 
-    forcegp rollout --model model/ --data test.parquet --out rollout/ --duration 2
+    forcegp rollout --model model --data test.parquet --out rollout/ --duration 2
 
-    forcegp rollout -m model/ -d run.parquet --start 2400 --samples 50 -o rollout/
+    forcegp rollout -m model -d run.parquet --start 2400 --samples 50 -o rollout/
     """
     from forcegp.destination import check_destination, write_or_keep
-    from forcegp.files import atomic_directory
+    from forcegp.files import written_folder
     from forcegp.models.load import load_model
     from forcegp.rollout import RolloutOptions
     from forcegp.rollout.inputs import sampling_period
@@ -77,7 +77,7 @@ def rollout(
     )
 
     def write(folder: Path) -> None:
-        with atomic_directory(folder) as temporary:
+        with written_folder(folder) as temporary:
             rolled.with_step(step).write(temporary / "rollout.parquet")
             _write_page(temporary, title, regression.kind, path, log, dt)
 

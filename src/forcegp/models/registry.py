@@ -38,9 +38,7 @@ class Entry:
     make: Callable[..., Model]
 
 
-def _analytical(
-    system: ConstrainedSystem, noise: Stated, seed: int, **options: Any
-) -> Model:
+def _analytical(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
     return AnalyticalModel(system, seed=seed, **options)
 
 
@@ -48,9 +46,7 @@ def _network(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any
     return NeuralNetwork(system, seed=seed, **options)
 
 
-def _independent(
-    system: ConstrainedSystem, noise: Stated, seed: int, **options: Any
-) -> Model:
+def _independent(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
     return IndependentGP(system, noise=noise, **options)
 
 
