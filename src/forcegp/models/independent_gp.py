@@ -32,7 +32,7 @@ from forcegp.models.acceleration import AccelerationFit
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
-from forcegp.storage.checkpoint import Checkpoint
+from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from forcegp.storage.model_file import Settings
 
 KIND = "independent_gp"
