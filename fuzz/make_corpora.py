@@ -9,6 +9,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import safetensors
+import safetensors.torch
 import torch
 from targets import CORPORA, START
 
@@ -17,8 +19,8 @@ from forcegp.gp.optimise import LearningOptions
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.registry import create
 from forcegp.robot.load import BUNDLED
-from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.folder import HEADER_FILE, TENSOR_FILE
+from forcegp.storage.checkpoint import Checkpoint, Evaluations
+from forcegp.storage.model_file import HEADER, model_path
 from logs import random_log
 from random_data import random_data, table_system
 
@@ -64,21 +66,23 @@ def models() -> None:
         options = BatchOptions(epochs=1) if name == "nn" else LearningOptions(max_evaluations=1)
         fit = model.fit(data, options=options)  # type: ignore[call-arg]
         with tempfile.TemporaryDirectory() as parent:
-            folder = Path(parent) / "model"
-            fit.save(folder)
-            header, tensors = (folder / HEADER_FILE).read_bytes(), (folder / TENSOR_FILE).read_bytes()
+            file = model_path(Path(parent) / "model")
+            fit.save(file)
+            with safetensors.safe_open(file, "pt") as opened:
+                header = opened.metadata()[HEADER].encode()
+            tensors = safetensors.torch.save(safetensors.torch.load_file(file))
         keep("model", name, len(header).to_bytes(4, "little") + header + tensors)
 
 
 def checkpoints() -> None:
     """Two evaluations."""
     with tempfile.TemporaryDirectory() as folder:
-        checkpoint = Checkpoint(Path(folder) / "fit.ckpt", "key")
+        checkpoint = Evaluations(Checkpoint(Path(folder) / "fit.ckpt", "key"))
         objective = checkpoint.recorded(lambda tensors: tensors["a"].square().sum())
         for number in range(2):
             objective({"a": START["a"] + number})
         checkpoint.write()
-        keep("checkpoint", "two", checkpoint.path.read_bytes())
+        keep("checkpoint", "two", checkpoint.checkpoint.path.read_bytes())
 
 
 def logs() -> None:

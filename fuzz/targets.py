@@ -14,8 +14,8 @@ import torch
 import forcegp
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
-from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.folder import HEADER_FILE, TENSOR_FILE
+from forcegp.storage.checkpoint import Checkpoint, Evaluations
+from forcegp.storage.model_file import HASH, HEADER, NO_HASH, SUFFIX
 
 CORPORA = Path(__file__).parent / "corpora"
 
@@ -59,26 +59,29 @@ def _log(path: Path) -> None:
 
 
 def model_of(data: bytes, folder: Path) -> None:
-    """A model folder whose hash is repaired: a length (4 bytes), `model.json`, `model.safetensors`."""
+    """A model under a hash that fits: a length (4 bytes), the header of the model, a safetensors file."""
     length = int.from_bytes(data[:4], "little")
     header, tensors = data[4 : 4 + length], data[4 + length :]
+    start = int.from_bytes(tensors[:8], "little")
     try:
-        fields = json.loads(header)
-        if isinstance(fields, dict):
-            fields["sha256"] = hashlib.sha256(tensors).hexdigest()
-            header = json.dumps(fields).encode()
-    except (ValueError, RecursionError):
-        pass
-    (folder / HEADER_FILE).write_bytes(header)
-    (folder / TENSOR_FILE).write_bytes(tensors)
-    model = forcegp.load_model(folder)
+        table = json.loads(tensors[8 : 8 + start])
+        table["__metadata__"] = {HEADER: header.decode("utf-8", "replace"), HASH: NO_HASH}
+        text = json.dumps(table, separators=(",", ":")).encode()
+        content = len(text).to_bytes(8, "little") + text + tensors[8 + start :]
+        digest = hashlib.sha256(content).hexdigest()
+        content = content.replace(f'"{HASH}":"{NO_HASH}"'.encode(), f'"{HASH}":"{digest}"'.encode(), 1)
+    except (ValueError, TypeError, RecursionError):
+        content = tensors
+    file = folder / f"model{SUFFIX}"
+    file.write_bytes(content)
+    model = forcegp.load_model(file)
     states = torch.full((3, 2, model.system.robot.nq), 0.1, dtype=model.system.robot.dtype)
     prediction = model.predict(*states)
     assert bool(torch.isfinite(prediction.mean).all())
 
 
 def _checkpoint(path: Path) -> None:
-    Checkpoint(path, "key").read(START)
+    Evaluations(Checkpoint(path, "key")).read(START)
 
 
 TARGETS: dict[str, Callable[[bytes, Path], None]] = {

@@ -14,7 +14,7 @@ import pytest
 from forcegp import destination
 from forcegp.destination import check_destination, write_or_keep
 from forcegp.errors import DestinationError, ModelError
-from forcegp.files import atomic_directory, write_text
+from forcegp.files import write_text, written_folder
 
 
 def test_a_place_that_can_be_written_is_left_as_it_was(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_a_name_that_is_too_long_is_refused_and_the_longest_written(folder: bool
     check_destination(longest, folder=folder)
     for text in ("one", "two"):
         if folder:
-            with atomic_directory(longest) as temporary:
+            with written_folder(longest) as temporary:
                 (temporary / "a").write_text(text)
         else:
             write_text(longest, text)

@@ -52,6 +52,16 @@ def test_every_example_is_a_tutorial() -> None:
         assert text.count("# %%") >= 1, "it opens as a notebook"
 
 
+def test_minimal_sgp() -> None:
+    done = run("examples/minimal_sgp.py")
+    assert done.returncode == 0, done.stderr
+    assert numbers(r"\(10\) .* beside the library's: (\S+)", done.stdout)[0] < 1e-9
+    for name in ("qdd", "multiplier"):
+        assert numbers(rf"\(25\) {name}: .* differ by (\S+)", done.stdout)[0] < 1e-9
+    learned, prior = numbers(r"wire's force: ([\d.]+) N; of the prior ([\d.]+) N", done.stdout)
+    assert learned < 0.3 * prior
+
+
 def test_double_pendulum_on_a_wire(tmp_path: Path) -> None:
     text = example("double_pendulum_on_a_wire", tmp_path)
     model, file = numbers(r"force: ([\d.]+) N, of the robot file alone ([\d.]+) N", text)

@@ -9,7 +9,7 @@ from typing import ClassVar
 import pytest
 
 from forcegp.errors import DataError, DestinationError
-from forcegp.files import Header, atomic_directory, atomic_file, write_json, write_text
+from forcegp.files import Header, atomic_file, write_json, write_text, written_folder
 from forcegp.limits import HEADER_BYTES
 
 
@@ -30,7 +30,7 @@ def write_half_a_file(target: Path) -> None:
 
 
 def write_half_a_folder(target: Path) -> None:
-    with atomic_directory(target) as temporary:
+    with written_folder(target) as temporary:
         (temporary / "half").write_text("half")
         raise Crash
 
@@ -52,12 +52,12 @@ def test_a_file_takes_its_place_and_missing_folders_are_made(tmp_path: Path) -> 
 
 def test_a_crash_leaves_the_old_folder_and_success_replaces_it_whole(tmp_path: Path) -> None:
     target = tmp_path / "model"
-    with atomic_directory(target) as temporary:
+    with written_folder(target) as temporary:
         (temporary / "old").write_text("old")
     with pytest.raises(Crash):
         write_half_a_folder(target)
     assert os.listdir(target) == ["old"]
-    with atomic_directory(target) as temporary:
+    with written_folder(target) as temporary:
         (temporary / "new").write_text("new")
     assert os.listdir(target) == ["new"]
     assert os.listdir(tmp_path) == ["model"]
@@ -65,7 +65,7 @@ def test_a_crash_leaves_the_old_folder_and_success_replaces_it_whole(tmp_path: P
 
 def test_a_folder_does_not_replace_a_file(tmp_path: Path) -> None:
     (tmp_path / "model").write_text("precious")
-    with pytest.raises(DestinationError, match="is a file"), atomic_directory(tmp_path / "model"):
+    with pytest.raises(DestinationError, match="is a file"), written_folder(tmp_path / "model"):
         pass
     assert (tmp_path / "model").read_text() == "precious"
 

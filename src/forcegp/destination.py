@@ -11,7 +11,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from forcegp.errors import DestinationError, ForceGPError
-from forcegp.exchange import is_other_than_file, is_other_than_folder, kind_of
+from forcegp.files import is_other_than_file, is_other_than_folder, kind_of
 
 PROBE_BYTES = 1 << 16
 """Written and removed again to see whether there is room, and whether a quota allows it."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,9 +14,8 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from forcegp.errors import DestinationError, ForceGPError
-from forcegp.exchange import is_other_than_file, is_other_than_folder, kind_of, place, recover
 from forcegp.limits import HEADER_BYTES, HEADER_DEPTH
-from forcegp.temporary import Temporary, sweep
+from forcegp.temporary import Temporary, discard, sweep
 
 H = TypeVar("H", bound="Header")
 
@@ -100,18 +100,17 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_directory(path: str | Path) -> Iterator[Path]:
-    """A temporary folder beside `path` that takes its place when the block ends without an error.
+def written_folder(path: str | Path) -> Iterator[Path]:
+    """A temporary folder whose files take their places in a folder when the block ends without an error.
 
-    The two folders are exchanged in one step; where the system has none, a crash may leave the old
-    folder under a hidden name, and `recover` (which every reader of ours calls) moves it back. Of two
-    writers the last one's folder stays. What a killed writer left is removed.
+    Each file replaces its namesake in one step, in the order in which they were written, so that the last one
+    is there only with the others; then what else was in the folder is removed.
 
     Args:
         path: the folder to write; missing parents are made. A symbolic link is written through.
 
     Yields:
-        The folder to write the files to, piece by piece.
+        The folder to write the files to.
 
     Raises:
         DestinationError: the place cannot be written, or `path` is a file.
@@ -119,31 +118,56 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
     Example:
         >>> import os, tempfile
         >>> with tempfile.TemporaryDirectory() as parent:
-        ...     with atomic_directory(f"{parent}/run") as temporary:
+        ...     with written_folder(f"{parent}/run") as temporary:
         ...         _ = (temporary / "a.txt").write_text("one")
         ...         _ = (temporary / "b.txt").write_text("two")
         ...     sorted(os.listdir(f"{parent}/run"))
         ['a.txt', 'b.txt']
     """
-    target = Path(path)
-    if target.is_symlink():
-        target = target.resolve()
+    target = Path(path).resolve() if Path(path).is_symlink() else Path(path)
     try:
         taken = is_other_than_folder(target)
     except OSError as cause:
         raise _refused(target, cause) from cause
     if taken:
         raise DestinationError(f"{target} is a file, and a folder is to be written there")
-    recover(target)
     with _temporary(target, folder=True, mode=0o777) as temporary:
         yield temporary
         try:
-            for inner in (*temporary.rglob("*"), temporary):
-                _sync(inner) if inner.is_file() else _sync_names(inner)
-            place(temporary, target)
+            written = sorted(temporary.iterdir(), key=lambda file: file.stat().st_mtime_ns)
+            target.mkdir(exist_ok=True)
+            for file in written:
+                _sync(file)
+                os.replace(file, target / file.name)
+            for old in set(target.iterdir()) - {target / file.name for file in written}:
+                discard(old)
         except OSError as cause:
             raise _refused(target, cause) from cause
-        _sync_names(target.parent)
+        _sync_names(target)
+
+
+def is_other_than_folder(path: Path) -> bool:
+    """Whether a path is taken by something that is not a folder.
+
+    The path is looked at once: between `exists` and `is_dir` another writer can change it.
+    """
+    try:
+        return not stat.S_ISDIR(os.stat(path).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+
+
+def is_other_than_file(path: Path) -> bool:
+    """Whether a path is taken by something that is not a regular file: a folder, a pipe, a device."""
+    try:
+        return not stat.S_ISREG(os.stat(path).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+
+
+def kind_of(path: Path) -> str:
+    """What is at a path, in words."""
+    return "a folder" if path.is_dir() else "not a regular file"
 
 
 def write_text(path: str | Path, text: str) -> None:

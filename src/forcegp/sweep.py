@@ -19,7 +19,7 @@ from forcegp.data import split_by_stretches
 from forcegp.data.selection import complement
 from forcegp.errors import optional_module
 from forcegp.evaluation import evaluate
-from forcegp.files import atomic_directory, write_json
+from forcegp.files import write_json, written_folder
 from forcegp.models.configured import configured
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
@@ -93,7 +93,7 @@ def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
         "seconds": fitted.seconds,
         "converged": fitted.converged,
     }
-    with atomic_directory(folder) as temporary:
+    with written_folder(folder) as temporary:
         fitted.save(temporary / MODEL)
         write_json(temporary / SCORE, score)
     return score

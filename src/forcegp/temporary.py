@@ -22,13 +22,13 @@ except ImportError:  # Windows
 
 LONGEST = 200
 """Bytes of a target's name that its hidden names repeat; file systems allow 255 in all."""
-NEW, ASIDE = ".forcegp-new-", ".forcegp-aside-"
-"""Prefixes of what is under construction, and of a folder that is moved aside to make room for another."""
+NEW = ".forcegp-new-"
+"""Prefix of what is under construction."""
 
 
-def hidden_name(target: Path, prefix: str) -> Path:
+def hidden_name(target: Path) -> Path:
     """A hidden, unused path beside a target with the same ending, as some writers go by the ending."""
-    return target.with_name(f"{prefix}{secrets.token_hex(6)}-{_short(target)}")
+    return target.with_name(f"{NEW}{secrets.token_hex(6)}-{_short(target)}")
 
 
 def _short(target: Path) -> str:
@@ -40,9 +40,9 @@ def _short(target: Path) -> str:
     return hashlib.sha256(name).hexdigest() + ending
 
 
-def left_beside(target: Path, prefix: str) -> list[Path]:
+def left_beside(target: Path) -> list[Path]:
     """Everything beside a target that has a hidden name of it, the latest first."""
-    form = re.compile(re.escape(prefix) + "[0-9a-f]{12}-" + re.escape(_short(target)))
+    form = re.compile(re.escape(NEW) + "[0-9a-f]{12}-" + re.escape(_short(target)))
     try:
         with os.scandir(target.parent) as entries:
             found = [entry for entry in entries if form.fullmatch(entry.name)]
@@ -66,7 +66,7 @@ class Temporary:
 
     def __init__(self, target: Path, *, folder: bool, mode: int) -> None:
         while True:
-            self.path = hidden_name(target, NEW)
+            self.path = hidden_name(target)
             if folder:
                 self.path.mkdir(mode=mode)
             else:
@@ -86,7 +86,7 @@ class Temporary:
 
 def sweep(target: Path) -> None:
     """Remove what killed writers of a target left beside it."""
-    for path in left_beside(target, NEW) if fcntl is not None else []:
+    for path in left_beside(target) if fcntl is not None else []:
         locked, descriptor = _lock(path)
         if descriptor is not None:
             if locked:

@@ -209,4 +209,4 @@ def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
     assert "did you mean 'sgp-mean'?" in fail(
         "fit", "-s", "kuka_plane", "-d", train, "-m", "sgp-men", "-o", model
     )
-    assert "model.json" in fail("evaluate", "-m", tmp_path, "-d", test)
+    assert "is not a saved model" in fail("evaluate", "-m", tmp_path, "-d", test)

@@ -103,6 +103,48 @@ def test_a_folder_below_one_that_others_write_is_refused(tmp_path: Path, folder:
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can give files away")
+def test_a_folder_below_one_that_a_foreign_group_writes_is_refused(tmp_path: Path, folder: Path) -> None:
+    os.chown(tmp_path, os.geteuid(), OTHER)
+    tmp_path.chmod(0o775)
+    with pytest.raises(MissingDependencyError, match=r"others could put code there(.|\n)*0775"):
+        compiled()
+    tmp_path.chmod(0o755)
+    compiled()
+
+
+def test_a_private_group_may_write_above(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tmp_path.chmod(0o775)
+    monkeypatch.setattr(cache, "_is_alone_in", lambda group: group == tmp_path.stat().st_gid)
+    compiled()
+    monkeypatch.setattr(cache, "_is_alone_in", lambda group: False)
+    with pytest.raises(MissingDependencyError, match="others could put code there"):
+        compiled()
+
+
+@pytest.mark.skipif(not native.PROC.is_dir(), reason="folders have names by descriptor on Linux")
+def test_what_is_put_in_the_place_of_the_build_folder_is_not_loaded(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder is exchanged by name while the compiler runs, with a planted library in the new one."""
+    [kernel] = folder.iterdir()
+    kernel.unlink()
+    content, original = planted(folder), native._run_compiler
+
+    def exchanged(compiler: object, source: str, place: Path) -> None:
+        [build] = folder.glob(f"{NEW}*-build")
+        build.rename(folder.parent / "moved")
+        build.mkdir(mode=0o700)
+        (build / native.LIBRARY).write_bytes(content)
+        original(compiler, source, place)  # type: ignore[arg-type]
+        (build / native.LIBRARY).write_bytes(content)
+
+    monkeypatch.setattr(native, "_run_compiler", exchanged)
+    torch.testing.assert_close(compiled(), dynamics.gravity_force(ROBOT, Q))
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can give files away")
 def test_what_others_own_is_refused(folder: Path, compilations: list[int]) -> None:
     [kernel] = folder.iterdir()
     os.chown(kernel, OTHER, OTHER)

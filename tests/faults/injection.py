@@ -1,7 +1,7 @@
 """Faults at chosen steps: a process that dies, or a call that fails, at its n-th step in the file system.
 
-Every step below a folder is one of Python's audit events (open, mkdir, rename, remove, …); `fsync` and the
-exchange of two folders, which have none, raise events of their own.
+Every step below a folder is one of Python's audit events (open, mkdir, rename, remove, …); `fsync`, which has
+none, raises an event of its own.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from forcegp import exchange as exchange_module
 from forcegp import files as files_module
 
 KILLED, ENDED, REFUSED, RAW, SURVIVED = 77, 0, 3, 4, 5
@@ -87,6 +86,5 @@ def _inject(root: Path, step: int, fault: Fault) -> list[int]:
         setattr(module, name, call)
 
     announced(files_module, "_sync", lambda path: path)
-    announced(exchange_module, "exchange", lambda a, b: a)
     sys.addaudithook(note)
     return fired

@@ -14,7 +14,6 @@ import pytest
 
 from faults.injection import ENDED, KILLED, REFUSED, SURVIVED, die, in_child, limited_child
 from faults.writers import WRITERS, Writer
-from forcegp import exchange as exchange_module
 
 MOST_STEPS = 80
 CODES = [errno.ENOSPC, errno.EROFS]
@@ -32,21 +31,13 @@ def writer(request: pytest.FixtureRequest) -> Writer:
     return request.param
 
 
-@pytest.fixture(params=["exchange", "aside"])
-def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Folders are exchanged, or moved aside where the system cannot."""
-    if request.param == "aside":
-        monkeypatch.setattr(exchange_module, "exchange", lambda a, b: False)
-
-
 def read(writer: Writer, path: Path) -> int | None:
     """The version at a path, `None` where there is nothing; damage raises."""
-    if not path.exists() and not any(path.parent.glob(f".forcegp-aside-*-{path.name}")):
+    if not path.exists():
         return None
     return writer.read(path)
 
 
-@pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("before", [None, 1], ids=["nothing before", "a version before"])
 def test_a_kill_at_any_step_leaves_the_old_or_the_new(
     writer: Writer, before: int | None, tmp_path: Path
@@ -72,7 +63,6 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new(
     assert 2 <= killed < MOST_STEPS - 2, "the steps were found"
 
 
-@pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("code", CODES)
 def test_a_call_that_fails_at_any_step_is_an_os_error_and_keeps_the_old(
     writer: Writer, code: int, tmp_path: Path
@@ -120,7 +110,6 @@ def test_a_read_only_folder_is_refused(writer: Writer, tmp_path: Path) -> None:
     assert read(writer, path) == 1
 
 
-@pytest.mark.usefixtures("way")
 def test_two_writers_and_a_reader_never_see_half(writer: Writer, tmp_path: Path) -> None:
     path, rounds = tmp_path / f"target{writer.ending}", 8
     writer.write(path, 1)
@@ -144,7 +133,7 @@ def test_two_writers_and_a_reader_never_see_half(writer: Writer, tmp_path: Path)
         children.append(child)
     codes: list[int] = []
     while len(codes) < 2:
-        if writer.name not in ("folder", "model"):
+        if writer.name != "folder":
             assert read(writer, path) in (1, 2)
         for child in list(children):
             done, status = os.waitpid(child, os.WNOHANG)

@@ -10,11 +10,10 @@ import torch
 
 import forcegp
 from forcegp.data import Dataset
-from forcegp.exchange import recover
-from forcegp.files import atomic_directory, write_text
-from forcegp.models.base import Predictor
+from forcegp.files import write_text, written_folder
+from forcegp.models.base import FittedModel
 from forcegp.native import cache
-from forcegp.storage.checkpoint import Checkpoint
+from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from logs import random_log
 from random_data import table_system
 
@@ -50,17 +49,18 @@ def read_text_file(path: Path) -> int:
 
 
 def write_folder(path: Path, version: int) -> None:
-    with atomic_directory(path) as temporary:
+    with written_folder(path) as temporary:
         (temporary / "a").write_text(str(version))
-        (temporary / "deeper").mkdir()
-        (temporary / "deeper" / "b").write_text(str(version))
+        (temporary / "b").write_text(str(version))
 
 
 def read_folder(path: Path) -> int:
-    recover(path)
-    a, b = (path / "a").read_text(), (path / "deeper" / "b").read_text()
-    assert a == b, "a mixture of two folders"
-    return int(a)
+    """The version of the last file, beside which all others are of that version or a later one."""
+    if not (path / "b").exists():
+        return 0
+    a, b = (path / "a").read_text(), (path / "b").read_text()
+    assert int(a) >= int(b)
+    return int(b)
 
 
 def read_log(path: Path) -> int:
@@ -69,8 +69,8 @@ def read_log(path: Path) -> int:
     return seed
 
 
-def model(version: int) -> Predictor:
-    """An analytical model, which needs no fit to be saved."""
+def model(version: int) -> FittedModel:
+    """The analytical model of a robot file."""
     robot = SYSTEM.robot.replace(mass=SYSTEM.robot.mass * version)
     return forcegp.AnalyticalModel(SYSTEM.with_robot(robot)).nominal()
 
@@ -81,7 +81,7 @@ def read_model(path: Path) -> int:
 
 
 def write_checkpoint(path: Path, version: int) -> None:
-    checkpoint = Checkpoint(path, "key")
+    checkpoint = Evaluations(Checkpoint(path, "key"))
     objective = checkpoint.recorded(lambda tensors: tensors["a"].sum())
     for number in range(version):
         objective({"a": START["a"] + number})
@@ -98,14 +98,14 @@ def read_kernel(path: Path) -> int:
 
 
 def read_checkpoint(path: Path) -> int:
-    return Checkpoint(path, "key").read(START)
+    return Evaluations(Checkpoint(path, "key")).read(START)
 
 
 WRITERS = (
     Writer("text", ".txt", write_text_file, read_text_file),
-    Writer("folder", "", write_folder, read_folder),
+    Writer("folder", "", write_folder, read_folder, also=0),
     Writer("log", ".parquet", lambda path, version: LOGS[version].write(path), read_log),
-    Writer("model", "", lambda path, version: model(version).save(path), read_model),
+    Writer("model", ".safetensors", lambda path, version: model(version).save(path), read_model),
     Writer("checkpoint", ".ckpt", write_checkpoint, read_checkpoint, also=1),
     Writer("kernels", "", write_kernel, read_kernel, also=0),
 )

@@ -1,11 +1,10 @@
-"""Model folders whose hashes were repaired after a change: every one is read in full or refused by name."""
+"""Model files whose hashes were repaired after a change: every one is read in full or refused by name."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -16,9 +15,9 @@ import torch
 
 import forcegp
 from forcegp.errors import DestinationError, ForceGPError, ModelError
-from forcegp.storage import folder as module
-from forcegp.storage.folder import HEADER_FILE, TENSOR_FILE, check_model_destination
-from forcegp.temporary import ASIDE
+from forcegp.storage import model_file as module
+from forcegp.storage.model_file import check_model_destination, model_path
+from model_files import header_of, rewritten
 from random_data import random_data, table_system
 
 SYSTEM = table_system()
@@ -27,7 +26,7 @@ DATA = random_data(SYSTEM, 8)
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One folder of each kind of models, conditioned or trained for a moment."""
+    """One file of each kind of models, conditioned or trained for a moment."""
     from forcegp.gp.optimise import LearningOptions
     from forcegp.models.minibatch import BatchOptions
     from forcegp.models.registry import create
@@ -38,26 +37,23 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         options = BatchOptions(epochs=1) if name == "nn" else LearningOptions(max_evaluations=1)
         model = model.fit(DATA, options=options)  # type: ignore[call-arg]
         model.save(root / name)
-        found[name] = root / name
+        found[name] = model_path(root / name)
     return found
 
 
 def repaired(source: Path, target: Path, tensors: dict | None = None, **fields: object) -> Path:
     """A copy with other tensors or header fields, and the hash that belongs to them."""
-    target.mkdir()
-    header = json.loads((source / HEADER_FILE).read_text())
-    found = safetensors.torch.load_file(source / TENSOR_FILE)
-    content = safetensors.torch.save(found | (tensors or {}))
-    (target / TENSOR_FILE).write_bytes(content)
-    header["sha256"] = hashlib.sha256(content).hexdigest()
-    for place, value in fields.items():
-        part, *path = place.split("__")
-        inner = header
-        for key in (part, *path)[:-1]:
-            inner = inner[key]
-        inner[(part, *path)[-1]] = value
-    (target / HEADER_FILE).write_text(json.dumps(header))
-    return target
+
+    def change(header: dict, own: dict[str, torch.Tensor]) -> None:
+        own.update(tensors or {})
+        for place, value in fields.items():
+            *path, last = place.split("__")
+            inner = header
+            for key in path:
+                inner = inner[key]
+            inner[last] = value
+
+    return rewritten(source, target, change)
 
 
 def changes(value: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -84,7 +80,7 @@ def changes(value: torch.Tensor) -> dict[str, torch.Tensor]:
 def test_a_changed_tensor_is_refused_or_predicts_finite_numbers(
     name: str, saved: dict[str, Path], tmp_path: Path
 ) -> None:
-    tensors = safetensors.torch.load_file(saved[name] / TENSOR_FILE)
+    tensors = safetensors.torch.load_file(saved[name])
     refused, answered = 0, 0
     for number, (key, value) in enumerate(tensors.items()):
         for kind, changed in changes(value).items():
@@ -108,7 +104,7 @@ def test_a_standard_deviation_that_is_not_positive_is_named(
     tensor: str, saved: dict[str, Path], tmp_path: Path
 ) -> None:
     name = {"data.0.noise_std": "sgp-mean", "training.noise_std": "gp", "std.q": "nn"}[tensor]
-    value = safetensors.torch.load_file(saved[name] / TENSOR_FILE)[tensor]
+    value = safetensors.torch.load_file(saved[name])[tensor]
     for number, wrong in enumerate((-0.1, 0.0)):
         value = value.clone()
         value[0] = wrong
@@ -142,8 +138,7 @@ def test_a_network_of_billions_of_weights_is_refused_before_it_is_allocated(
 
 
 def test_kernels_inside_kernels_without_end_are_refused(saved: dict[str, Path], tmp_path: Path) -> None:
-    header = json.loads((saved["sgp-mean"] / HEADER_FILE).read_text())
-    priors = header["settings"]["priors"]
+    priors = header_of(saved["sgp-mean"])["settings"]["priors"]
     leaf = {"type": "linear", "inputs": None}
     for _ in range(300):
         leaf = {"type": "sum", "left": leaf, "right": {"type": "linear", "inputs": None}}
@@ -158,20 +153,54 @@ def test_kernels_inside_kernels_without_end_are_refused(saved: dict[str, Path], 
 def test_a_folder_for_a_file_and_too_large_a_file_are_refused(
     saved: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = repaired(saved["gp"], tmp_path / "a")
-    (place / TENSOR_FILE).unlink()
-    (place / TENSOR_FILE).mkdir()
-    with pytest.raises(ModelError, match="holds no saved model"):
-        forcegp.load_model(place)
+    (tmp_path / "a.safetensors").mkdir()
+    with pytest.raises(ModelError, match="is not a saved model"):
+        forcegp.load_model(tmp_path / "a")
     monkeypatch.setattr(module, "MODEL_BYTES", 1000)
-    with pytest.raises(ModelError, match=r"model\.safetensors: too large"):
+    with pytest.raises(ModelError, match=r"gp\.safetensors: too large"):
         forcegp.load_model(saved["gp"])
 
 
-def test_a_model_moved_aside_by_a_dead_writer_is_found(saved: dict[str, Path], tmp_path: Path) -> None:
-    place = repaired(saved["nn"], tmp_path / "model")
-    place.rename(tmp_path / f"{ASIDE}0123456789ab-model")
-    forcegp.load_model(place)
+def test_every_flipped_bit_is_noticed(saved: dict[str, Path], tmp_path: Path) -> None:
+    """In the length, the header, the hash and the tensors alike."""
+    content = bytearray(saved["sgp-mean"].read_bytes())
+    damaged = tmp_path / "damaged.safetensors"
+    step = max(1, len(content) // 400)
+    for at in [*range(8), *range(8, len(content), step)]:
+        content[at] ^= 1 << (at % 8)
+        damaged.write_bytes(content)
+        with pytest.raises(ModelError):
+            forcegp.load_model(damaged)
+        content[at] ^= 1 << (at % 8)
+    damaged.write_bytes(content)
+    forcegp.load_model(damaged)
+
+
+def test_a_reader_beside_a_writer_sees_the_old_model_or_the_new_one(
+    saved: dict[str, Path], tmp_path: Path
+) -> None:
+    models = [forcegp.load_model(saved[name]) for name in ("nn", "gp")]
+    models[0].save(tmp_path / "model")
+    done = threading.Event()
+
+    def write() -> None:
+        for turn in range(60):
+            models[turn % 2].save(tmp_path / "model")
+        done.set()
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    kinds = set()
+    while not done.is_set():
+        kinds.add(forcegp.load_model(tmp_path / "model").kind)
+    writer.join()
+    assert kinds <= {models[0].kind, models[1].kind}
+
+
+def test_a_folder_of_an_earlier_release_says_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "model").mkdir()
+    with pytest.raises(ModelError, match="folders before version 3"):
+        forcegp.load_model(tmp_path / "model")
 
 
 def test_the_destination_of_a_model_is_checked_before_the_work(
@@ -179,8 +208,9 @@ def test_the_destination_of_a_model_is_checked_before_the_work(
 ) -> None:
     check_model_destination(tmp_path / "new")
     check_model_destination(saved["gp"])
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(DestinationError, match=r"thesis\.tex"):
-        check_model_destination(tmp_path)
-    with pytest.raises(DestinationError, match="is a file"):
-        check_model_destination(tmp_path / "thesis.tex")
+    (tmp_path / "thesis").write_text("years of work")
+    with pytest.raises(DestinationError, match="cannot be written"):
+        check_model_destination(tmp_path / "thesis" / "model")
+    (tmp_path / "folder.safetensors").mkdir()
+    with pytest.raises(DestinationError, match="is a folder"):
+        check_model_destination(tmp_path / "folder")

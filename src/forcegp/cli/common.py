@@ -37,7 +37,7 @@ RobotName = Annotated[
         "--robot", help="In place of a scene without contacts: URDF or MJCF file, or a bundled robot."
     ),
 ]
-ModelFolder = Annotated[Path, typer.Option("--model", "-m", help="Folder of a fitted model.")]
+ModelFile = Annotated[Path, typer.Option("--model", "-m", help="File of a fitted model.")]
 DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
 Config = Annotated[
     Path | None,

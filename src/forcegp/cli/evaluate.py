@@ -31,7 +31,7 @@ WINDOW_SECONDS = 3.0
 def evaluate(
     data: DataFile,
     model: Annotated[
-        Path | None, typer.Option("--model", "-m", help="Folder of a fitted model; left out, one is fitted.")
+        Path | None, typer.Option("--model", "-m", help="File of a fitted model; left out, one is fitted.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its data.")] = None,
     train: Annotated[
@@ -59,7 +59,7 @@ def evaluate(
 
     [bold]Examples[/bold]
 
-    forcegp evaluate --model model/ --data test.parquet --train train.parquet --out evaluation/
+    forcegp evaluate --model model --data test.parquet --train train.parquet --out evaluation/
 
     forcegp evaluate --scene my_scene.toml --config model.toml --train train.parquet --data test.parquet
     """
@@ -87,14 +87,14 @@ def _written(
 ) -> dict[str, object]:
     """Write the page and its data, and say where they are."""
     from forcegp.destination import write_or_keep
-    from forcegp.files import atomic_directory, write_json
+    from forcegp.files import write_json, written_folder
     from forcegp.report.evaluation import PAGE, write_evaluation
     from forcegp.report.window import opening, predicted_window
 
     window = predicted_window(fitted, opening(test, WINDOW_SECONDS), fitted.kind)
 
     def write(folder: Path) -> None:
-        with atomic_directory(folder) as temporary:
+        with written_folder(folder) as temporary:
             write_json(temporary / "evaluation.json", found.to_dict())
             write_evaluation(temporary, model, data, found, window, train)
 
@@ -103,7 +103,7 @@ def _written(
 
 
 def _model(model: Path | None, scene: str | None, config: Path | None, train: Path | None) -> Predictor:
-    """The fitted model in a folder, or one that is fitted to the training data now.
+    """The fitted model in a file, or one that is fitted to the training data now.
 
     Raises:
         ForceGPError: both are asked for, or neither.

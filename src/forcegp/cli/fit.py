@@ -38,7 +38,7 @@ STREAM_ROWS = 100_000
 
 def fit(
     data: DataFiles,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fitted model.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File for the fitted model (.safetensors).")],
     scene: SceneOrNone = None,
     robot: RobotName = None,
     model: Annotated[
@@ -72,19 +72,20 @@ def fit(
 
     [bold]Examples[/bold]
 
-    forcegp fit --scene kuka_plane --data train.parquet --model sgp-mean --out model/
+    forcegp fit --scene kuka_plane --data train.parquet --model sgp-mean --out model
 
-    forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model/ --json
+    forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model --json
 
-    forcegp fit -s my_scene.toml -d train.parquet --config model.toml -o model/
+    forcegp fit -s my_scene.toml -d train.parquet --config model.toml -o model
 
-    forcegp fit --robot ur3.urdf -d train.parquet -o model/
+    forcegp fit --robot ur3.urdf -d train.parquet -o model
 
-    forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model/
+    forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model
     """
     from forcegp.destination import write_or_keep
     from forcegp.models.configured import configured
-    from forcegp.storage.sums import beside
+    from forcegp.storage.checkpoint import beside
+    from forcegp.storage.model_file import model_path
 
     _check_places(out, checkpoint, data)
     system = system_of(scene, robot)
@@ -104,7 +105,10 @@ def fit(
             file.unlink(missing_ok=True)
     _warn(fitted.result)
     figures = _figures(fitted.result, as_json)
-    show({"model": regression.name, "training_points": len(training), **figures, "folder": str(out)}, as_json)
+    show(
+        {"model": regression.name, "training_points": len(training), **figures, "file": str(model_path(out))},
+        as_json,
+    )
 
 
 def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
@@ -122,20 +126,13 @@ def _check_places(out: Path, checkpoint: Path | None, data: list[Path]) -> None:
         DestinationError: they cannot.
     """
     from forcegp.destination import check_destination
-    from forcegp.errors import DestinationError
-    from forcegp.storage.folder import check_model_destination
+    from forcegp.storage.model_file import check_model_destination, model_path
 
     check_model_destination(out)
     if checkpoint is None:
         return
     check_destination(checkpoint)
-    check_apart(checkpoint, *data)
-    if out.resolve() in checkpoint.resolve().parents:
-        raise DestinationError(
-            "the checkpoint would lie in the folder of the model, which is written as a whole",
-            got=checkpoint,
-            hint="name a file outside of it",
-        )
+    check_apart(checkpoint, model_path(out), *data)
 
 
 def _training(

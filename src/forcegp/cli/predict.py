@@ -10,7 +10,7 @@ import typer
 from forcegp.cli.common import (
     AsJson,
     DataFile,
-    ModelFolder,
+    ModelFile,
     check_data_destination,
     data_of_robot,
     progress_bar,
@@ -33,7 +33,7 @@ PER_CONTACT = ("multiplier", "contact_force")
 
 
 def predict(
-    model: ModelFolder,
+    model: ModelFile,
     data: DataFile,
     out: Annotated[Path, typer.Option("--out", "-o", help="Where the predictions go (.parquet).")],
     quantity: Annotated[
@@ -64,9 +64,9 @@ def predict(
 
     [bold]Examples[/bold]
 
-    forcegp predict --model model/ --data test.parquet --out predicted.parquet
+    forcegp predict --model model --data test.parquet --out predicted.parquet
 
-    forcegp predict -m model/ -d test.parquet --quantity multiplier -o force.parquet
+    forcegp predict -m model -d test.parquet --quantity multiplier -o force.parquet
     """
     import torch
 

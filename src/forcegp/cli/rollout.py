@@ -12,7 +12,7 @@ import typer
 from forcegp.cli.common import (
     AsJson,
     DataFile,
-    ModelFolder,
+    ModelFile,
     SceneName,
     check_data_destination,
     data_of_robot,
@@ -44,7 +44,7 @@ Seed = Annotated[int, typer.Option(help="Seed of the samples.")]
 
 
 def rollout(
-    model: ModelFolder,
+    model: ModelFile,
     data: DataFile,
     out: Out,
     start: Start = 0,
@@ -64,12 +64,12 @@ def rollout(
 
     [bold]Examples[/bold]
 
-    forcegp rollout --model model/ --data test.parquet --out rollout/ --duration 2
+    forcegp rollout --model model --data test.parquet --out rollout/ --duration 2
 
-    forcegp rollout -m model/ -d run.parquet --start 2400 --samples 50 -o rollout/
+    forcegp rollout -m model -d run.parquet --start 2400 --samples 50 -o rollout/
     """
     from forcegp.destination import check_destination, write_or_keep
-    from forcegp.files import atomic_directory
+    from forcegp.files import written_folder
     from forcegp.models.load import load_model
     from forcegp.rollout import RolloutOptions
     from forcegp.rollout.inputs import sampling_period
@@ -88,7 +88,7 @@ def rollout(
     )
 
     def write(folder: Path) -> None:
-        with atomic_directory(folder) as temporary:
+        with written_folder(folder) as temporary:
             rolled.with_step(step).write(temporary / "rollout.parquet")
             _write_page(temporary, title, regression.kind, path, log, dt)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from forcegp.view.shapes import Shape
 
 Target = Annotated[
-    str, typer.Argument(help="Scene file, name of a bundled scene, or folder of a fitted model.")
+    str, typer.Argument(help="Scene file, name of a bundled scene, or file of a fitted model.")
 ]
 Data = Annotated[Path | None, typer.Option("--data", "-d", help="Log whose motion is shown.")]
 RolloutFile = Annotated[
@@ -60,7 +60,7 @@ def view(
 
     forcegp view kuka_plane
 
-    forcegp view model/ --data test.parquet --out view.html
+    forcegp view model --data test.parquet --out view.html
 
     forcegp view my_scene.toml --rollout rollout/rollout.parquet
     """
@@ -95,12 +95,12 @@ def view(
 
 def _target(target: str) -> tuple[ConstrainedSystem, FittedModel | None, list[Shape]]:
     """The system, the model if the target is one, and what the robot looks like."""
+    from forcegp.models.load import load_model
     from forcegp.robot.load import BUNDLED
+    from forcegp.storage.model_file import model_path
     from forcegp.view.shapes import shapes_of
 
-    if Path(target).is_dir():
-        from forcegp.models.load import load_model
-
+    if not target.endswith(".toml") and model_path(target).is_file():
         model = load_model(target)
         return model.system, model, shapes_of(model.system.robot)
     from forcegp.scene import load_scene

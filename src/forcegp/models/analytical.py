@@ -25,9 +25,8 @@ from forcegp.models.base import FitProgress, FittedModel, ForceField, Model, Pre
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, Loss, train
 from forcegp.robot.parameters import AnalyticalParameters
-from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.epochs import EpochCheckpoint
-from forcegp.storage.folder import ModelHeader, Settings, settings_of
+from forcegp.storage.checkpoint import Checkpoint, Evaluations
+from forcegp.storage.model_file import ModelHeader, Settings, settings_of
 from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
 
 KIND = "analytical"
@@ -143,10 +142,10 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         saved = None if checkpoint is None else Path(checkpoint)
         key = "" if saved is None else _key(self.system, measured, options, start, self.seed)
         if isinstance(options, BatchOptions):
-            kept = None if saved is None else EpochCheckpoint(saved, key)
+            kept = None if saved is None else Checkpoint(saved, key)
             learned = train(loss, start, len(measured.q), options, generator, progress, kept)
         else:
-            kept = None if saved is None else Checkpoint(saved, key)
+            kept = None if saved is None else Evaluations(Checkpoint(saved, key))
             learned = _minimise(loss, start, len(measured.q), options, progress, kept)
         theta.load_state_dict(learned.tensors)
         with torch.no_grad():
@@ -265,7 +264,7 @@ def _minimise(
     samples: int,
     options: LearningOptions,
     progress: FitProgress | None,
-    saved: Checkpoint | None,
+    saved: Evaluations | None,
 ) -> Learned:
     """Minimise over all samples at once."""
     rows = torch.arange(samples, device=next(iter(start.values())).device)

@@ -20,7 +20,7 @@ from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Torque
 from forcegp.rollout.law import ForceField
 from forcegp.rollout.trajectory import Rollout
-from forcegp.storage.folder import Settings, write_model
+from forcegp.storage.model_file import Settings, write_model
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -190,7 +190,10 @@ class Predictor(ABC):
 
     @abstractmethod
     def save(self, path: str | Path) -> None:
-        """Write the model as a folder; `forcegp.load_model` reads it back exactly.
+        """Write the model to a file; `forcegp.load_model` reads it back exactly.
+
+        Args:
+            path: the file; `.safetensors` is added if it is left out.
 
         Raises:
             ModelError: a part of the model is Python code.

@@ -32,8 +32,8 @@ from forcegp.models.acceleration import AccelerationFit
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
-from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.folder import Settings
+from forcegp.storage.checkpoint import Checkpoint, Evaluations
+from forcegp.storage.model_file import Settings
 
 KIND = "independent_gp"
 LEARNING = 6
@@ -180,7 +180,7 @@ def _learn(
     joint: int,
     options: LearningOptions,
     report: Progress,
-    saved: Checkpoint | None,
+    saved: Evaluations | None,
 ) -> Learned:
     """Learn the process of one joint; the record of one joint follows that of the one before."""
     blocks = [training.block(joint)]
@@ -199,10 +199,10 @@ def _learn(
 
 def _record(
     path: Path, training: IndependentTraining, priors: Sequence[JointForcePrior], options: LearningOptions
-) -> Checkpoint:
+) -> Evaluations:
     """The record of an interrupted fit, or an empty one."""
     data = (*training.features.values(), training.qdd, training.noise_std)
-    saved = Checkpoint(path, Checkpoint.key_of(KIND, options, len(priors), *data))
+    saved = Evaluations(Checkpoint(path, Checkpoint.key_of(KIND, options, len(priors), *data)))
     saved.read(initial_hyperparameters(priors[:1], [training.block(0)]))
     return saved
 

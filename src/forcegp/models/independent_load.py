@@ -18,7 +18,7 @@ from forcegp.models.independent_gp import (
     joint_processes,
     scale_of,
 )
-from forcegp.storage.folder import ModelHeader, settings_of
+from forcegp.storage.model_file import ModelHeader, settings_of
 from forcegp.storage.system import take
 
 

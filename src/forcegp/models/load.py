@@ -16,7 +16,7 @@ from forcegp.models.independent_load import load_independent
 from forcegp.models.neural import NeuralNetwork, load_network
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_load import load_structured
-from forcegp.storage.folder import HEADER_FILE, ModelHeader, own_tensors, read_model
+from forcegp.storage.model_file import ModelHeader, model_path, own_tensors, parse_model, read_model
 from forcegp.storage.system import unpack_system
 
 Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], FittedModel]
@@ -31,12 +31,12 @@ LOADERS: dict[str, Loader] = {
 
 
 def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> FittedModel:
-    """Read a model that `Model.save` wrote; it predicts the same, bit for bit.
+    """Read a model that `save` wrote; it predicts the same, bit for bit.
 
     Args:
-        path: the folder.
+        path: the file; `.safetensors` is added if it is left out.
         system: where to take constraints from that only Python code describes (an `ImplicitSurface`);
-            robot and other constraints are those in the folder.
+            robot and other constraints are those in the file.
 
     Example:
         >>> import forcegp, torch
@@ -56,8 +56,23 @@ def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> 
         ModelError: no model is there, it is damaged, or a constraint is to be given.
         UnknownNameError: the model is of a kind that this release does not know.
     """
-    header, tensors = read_model(path)
-    source = str(Path(path) / HEADER_FILE)
+    return _restored(*read_model(path), str(model_path(path)), system)
+
+
+def model_of_bytes(data: bytes) -> FittedModel:
+    """The model whose file has this content.
+
+    Raises:
+        ModelError, UnknownNameError: see `load_model`.
+    """
+    source = "a model of another process"
+    return _restored(*parse_model(data, source), source)
+
+
+def _restored(
+    header: ModelHeader, tensors: Mapping[str, Tensor], source: str, system: ConstrainedSystem | None = None
+) -> FittedModel:
+    """The model of a header and tensors."""
     if header.kind not in LOADERS:
         raise UnknownNameError(f"kind of models in {source}", header.kind, LOADERS)
     own = unpack_system(header.system, tensors, source, system)

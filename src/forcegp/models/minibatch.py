@@ -14,8 +14,10 @@ from torch import Tensor
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.optimise import Learned
 from forcegp.models.base import FitProgress
-from forcegp.storage.epochs import HISTORY, EpochCheckpoint
+from forcegp.storage.checkpoint import Checkpoint
 
+HISTORY = "history"
+"""Name of the tensor with one entry per epoch, the only one whose length changes."""
 Loss = Callable[[Mapping[str, Tensor], Tensor], Tensor]
 """Maps tensors and row numbers `(k,)` to the mean squared error of these rows."""
 
@@ -60,7 +62,7 @@ def train(
     options: BatchOptions,
     generator: torch.Generator,
     progress: FitProgress | None = None,
-    saved: EpochCheckpoint | None = None,
+    saved: Checkpoint | None = None,
 ) -> Learned:
     """Minimise a mean over samples; the result is the best epoch on the held-out samples.
 
@@ -83,7 +85,7 @@ def train(
     began = time.perf_counter()
     held, rows = _split(samples, options.held_out, generator, next(iter(start.values())).device)
     state = _State.at(start, options.learning_rate, generator)
-    if saved is not None and (found := saved.read(state.tensors())) is not None:
+    if saved is not None and (found := saved.read(state.tensors(), (HISTORY,))):
         state.restore(found, saved.path)
     while len(state.history) < options.epochs and state.since < options.patience:
         epoch = len(state.history)

@@ -21,8 +21,7 @@ from forcegp.models.base import FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.epochs import EpochCheckpoint
-from forcegp.storage.folder import ModelHeader, Settings, settings_of
+from forcegp.storage.model_file import ModelHeader, Settings, settings_of
 from forcegp.storage.system import take
 
 KIND = "neural_network"
@@ -117,7 +116,7 @@ class NeuralNetwork(Model["NetworkFit"]):
         saved = None
         if checkpoint is not None:
             weights = (part for pair in start.items() for part in pair)
-            saved = EpochCheckpoint(Path(checkpoint), Checkpoint.key_of(options, self.seed, x, y, *weights))
+            saved = Checkpoint(Path(checkpoint), Checkpoint.key_of(options, self.seed, x, y, *weights))
         learned = train(loss, start, len(x), options, generator, progress, saved)
         network.load_state_dict(learned.tensors)
         result = FitResult.of(learned, constant_inputs=inputs.constant)

@@ -32,7 +32,7 @@ from forcegp.models.base import FittedModel, ForceField, Prediction
 from forcegp.models.fit_result import FitResult
 from forcegp.models.structured_learning import prepared, training_for
 from forcegp.models.structured_spec import Specification, pack
-from forcegp.storage.folder import Settings
+from forcegp.storage.model_file import Settings
 
 KIND = "structured_gp"
 

@@ -46,7 +46,7 @@ from forcegp.gp.optimise import Learned, LearningOptions, Progress
 from forcegp.models.base import FitProgress
 from forcegp.models.structured_spec import Specification
 from forcegp.robot.model import RobotModel
-from forcegp.storage.checkpoint import Checkpoint
+from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from forcegp.storage.system import pack_system
 
 OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
@@ -239,7 +239,7 @@ def learned(
         return Lesson(prepared(spec, problem, search.held), search.held)
     saved = None
     if file is not None:
-        saved = Checkpoint(file, _key(spec, problem, search, begin))
+        saved = Evaluations(Checkpoint(file, _key(spec, problem, search, begin)))
         saved.read(search.start)
         search = dataclasses.replace(search, recorded=saved.recorded)
 

@@ -25,7 +25,7 @@ from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_spec import CLASSES, COLUMNS, IN_TIME, Specification, StructuredSettings
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode
-from forcegp.storage.folder import ModelHeader, settings_of
+from forcegp.storage.model_file import ModelHeader, settings_of
 from forcegp.storage.system import take_robot
 
 

@@ -46,7 +46,7 @@ from forcegp.gp.sparse_tensors import tensors_of_posterior
 from forcegp.models.fit_result import FitResult
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import encode
-from forcegp.storage.folder import Settings
+from forcegp.storage.model_file import Settings
 from forcegp.storage.system import robot_tensors
 
 CLASSES: dict[str, type] = {

@@ -34,8 +34,7 @@ from forcegp.gp.sums import Sums
 from forcegp.models.base import FitProgress
 from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED
 from forcegp.models.structured_spec import Specification
-from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.sums import SumsCheckpoint, beside
+from forcegp.storage.checkpoint import Checkpoint, beside
 from forcegp.storage.system import pack_system
 
 SAMPLE_ROWS = 20_000
@@ -157,21 +156,19 @@ class Pass:
             NumericalError: the sums are not finite.
         """
         basis, begin = basis_of(problem, hyperparameters), None
-        saved = (
-            None
-            if self.checkpoint is None
-            else SumsCheckpoint(self._own_file(), self._key(problem, hyperparameters))
-        )
-        kept = {} if saved is None else saved.read()
+        saved = None
+        if self.checkpoint is not None:
+            saved = Checkpoint(self._own_file(), self._key(problem, hyperparameters))
+        kept = {} if saved is None else saved.read(_tensors(basis, Totals.zero(problem, basis)))
         if kept:
-            basis, begin = _restored(problem, basis, kept)
+            basis, begin = _restored(basis, kept)
         elif self.sample.log.distributed:
             basis = share_basis(basis)
         processes = dist.get_world_size() if self.sample.log.distributed else 1
 
         def after(total: Totals) -> None:
             if saved is not None:
-                saved.write_now_and_then(_tensors(basis, total))
+                saved.write_now_and_then(lambda: _tensors(basis, total))
             if self.progress is not None:
                 done = processes * int(total.samples)
                 self.progress(done, self.sample.count, math.nan)
@@ -224,20 +221,8 @@ def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
     return tensors | counts
 
 
-def _restored(
-    problem: Problem, basis: LatentBasis, tensors: Mapping[str, Tensor]
-) -> tuple[LatentBasis, Totals]:
-    """The basis and totals that `_tensors` was given.
-
-    Raises:
-        ModelError: they do not fit the problem.
-    """
-    expected = _tensors(basis, Totals.zero(problem, basis))
-    if {k: x.shape for k, x in tensors.items()} != {k: x.shape for k, x in expected.items()}:
-        raise ModelError("the checkpoint's sums do not fit the model", hint="remove it to start anew")
-    tensors = {name: tensors[name] for name in expected}  # kernel inputs in their order
-    # A kernel that reads all inputs takes them in their order, which a file does not keep.
-    tensors = {name: tensors[name] for name in expected}
+def _restored(basis: LatentBasis, tensors: Mapping[str, Tensor]) -> tuple[LatentBasis, Totals]:
+    """The basis and totals that `_tensors` was given; kernel inputs are in the order of the prior."""
     own = basis_of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
     found = {
         name: Sums(*(tensors[f"{name}.{i}"] for i in range(len(fields(Sums)))))

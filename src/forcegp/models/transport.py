@@ -6,17 +6,15 @@ No attribute of a model travels: what arrives in another process was read and ch
 from __future__ import annotations
 
 import copyreg
-import tempfile
-from pathlib import Path
 from typing import Any
 
 from forcegp.models.analytical import AnalyticalFit
 from forcegp.models.base import FittedModel
 from forcegp.models.independent_gp import IndependentFit
-from forcegp.models.load import load_model
+from forcegp.models.load import model_of_bytes
 from forcegp.models.neural import NetworkFit
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.storage.folder import HEADER_FILE, TENSOR_FILE
+from forcegp.storage.model_file import model_bytes
 
 KINDS = (AnalyticalFit, NetworkFit, IndependentFit, StructuredFit)
 """Fitted models."""
@@ -29,22 +27,9 @@ def register() -> None:
 
 
 def _sent(model: FittedModel) -> tuple[Any, ...]:
-    """How a model is made again: from the content of its two files.
+    """How a model is made again: from the content of its file.
 
     Raises:
         ModelError: a part of the model is Python code.
     """
-    with tempfile.TemporaryDirectory() as parent:
-        folder = Path(parent) / "model"
-        model.save(folder)
-        return _received, tuple((folder / name).read_bytes() for name in (HEADER_FILE, TENSOR_FILE))
-
-
-def _received(header: bytes, tensors: bytes) -> FittedModel:
-    """The model of the content of its files."""
-    with tempfile.TemporaryDirectory() as parent:
-        folder = Path(parent) / "model"
-        folder.mkdir()
-        (folder / HEADER_FILE).write_bytes(header)
-        (folder / TENSOR_FILE).write_bytes(tensors)
-        return load_model(folder)
+    return model_of_bytes, (model_bytes(model.kind, model.system, *model.record()),)

@@ -50,10 +50,23 @@ def _check_owner(folder: Path) -> None:
         if found.st_uid not in ((os.geteuid(),) if place == folder else (os.geteuid(), 0)):
             raise _untrusted(folder, place, f"owned by user {found.st_uid}")
         # In a folder with the sticky bit, such as /tmp, nobody replaces what belongs to another.
-        others = _OTHERS_WRITE if place == folder else stat.S_IWOTH
         sticky = place != folder and bool(found.st_mode & stat.S_ISVTX)
-        if found.st_mode & others and not sticky:
+        shared = bool(found.st_mode & stat.S_IWGRP) and not (place != folder and _is_alone_in(found.st_gid))
+        if (shared or found.st_mode & stat.S_IWOTH) and not sticky:
             raise _untrusted(folder, place, f"permissions {stat.S_IMODE(found.st_mode):04o}")
+
+
+def _is_alone_in(group: int) -> bool:
+    """Whether nobody but the user and root is in a group, as far as the system lists its members."""
+    import grp
+    import pwd
+
+    try:
+        allowed = {pwd.getpwuid(os.geteuid()).pw_name, "root"}
+        members = {*grp.getgrgid(group).gr_mem, *(x.pw_name for x in pwd.getpwall() if x.pw_gid == group)}
+    except KeyError:
+        return False
+    return group == os.getegid() and members <= allowed
 
 
 def _untrusted(folder: Path, place: Path, got: str) -> MissingDependencyError:

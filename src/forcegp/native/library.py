@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import hashlib
 import os
 import platform
 import shutil
+import stat
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,6 +28,11 @@ FLAGS = (
 )
 
 
+LIBRARY = "kernel.so"
+PROC = Path("/proc/self/fd")
+"""Names of open files and folders by their descriptors, on Linux."""
+
+
 def find_compiler() -> str:
     """Path of the C++ compiler: `$CXX`, or the first of c++, g++ and clang++ on the PATH.
 
@@ -35,7 +42,7 @@ def find_compiler() -> str:
     wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
     for name in wanted:
         if found := shutil.which(name):
-            return found
+            return os.path.abspath(found)
     raise MissingDependencyError(
         "compiled kernels need a C++ compiler and none was found",
         expected=" or ".join(wanted) + " on the PATH",
@@ -98,16 +105,31 @@ def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
     build = Temporary(target, folder=True, mode=0o700)
     try:
         build.path.chmod(0o700)
-        library = build.path / "kernel.so"
-        _run_compiler(compiler, source, library)
-        return library.read_bytes()
+        return _built(compiler, source, build.path)
     finally:
         build.close()
 
 
-def _run_compiler(compiler: Sequence[str], source: str, library: Path) -> None:
-    command = [*compiler, *FLAGS, "-x", "c++", "-", "-o", str(library), "-pthread"]
-    done = subprocess.run(command, input=source, capture_output=True, text=True, check=False)
+def _built(compiler: Sequence[str], source: str, folder: Path) -> bytes:
+    """What the compiler writes into a private folder, which is held open: its name may change hands."""
+    if not PROC.is_dir():  # no folder has a name by its descriptor here
+        _run_compiler(compiler, source, folder)
+        return (folder / LIBRARY).read_bytes()
+    held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        found = os.fstat(held)
+        if found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) != 0o700:
+            raise OSError(errno.EPERM, "another folder was put in the place of the build folder", str(folder))
+        _run_compiler(compiler, source, PROC / str(held))
+        with os.fdopen(os.open(LIBRARY, os.O_RDONLY | os.O_NOFOLLOW, dir_fd=held), "rb") as file:
+            return file.read()
+    finally:
+        os.close(held)
+
+
+def _run_compiler(compiler: Sequence[str], source: str, folder: Path) -> None:
+    command = [*compiler, *FLAGS, "-x", "c++", "-", "-o", LIBRARY, "-pthread"]
+    done = subprocess.run(command, input=source, capture_output=True, text=True, check=False, cwd=folder)
     if done.returncode != 0:
         raise MissingDependencyError(
             f"the C++ compiler {compiler[0]} could not build the kernel",

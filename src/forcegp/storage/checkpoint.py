@@ -1,11 +1,11 @@
-"""The evaluations of a long fit on disk, so that an interrupted fit is resumed to the same bits."""
+"""The state of a long fit on disk, so that an interrupted fit is resumed to the same bits."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -24,26 +24,27 @@ from forcegp.limits import CHECKPOINT_BYTES, CHECKPOINT_VALUE, LOGGED_VALUE
 INTERVAL = 10.0
 """Least time between two writings [s]."""
 NAMES = ("positions", "objectives", "gradients")
+SUFFIX = ".sums"
+"""What the name of the file adds to that of the checkpoint of learning."""
+
+
+def beside(checkpoint: str | Path) -> Path:
+    """The file of sums that belongs to the checkpoint of learning."""
+    path = Path(checkpoint)
+    return path.with_name(path.name + SUFFIX)
 
 
 @dataclass
 class Checkpoint:
-    """A safetensors file with every evaluation of an objective: where, its value and its gradient.
-
-    A resumed fit runs the optimiser again from the start and gives it the recorded values, which takes no
-    time, until they end. So it ends with the same bits as a fit that was not interrupted, after warm starts
-    and restarts too. Where the optimiser asks for another point than the recorded one (another machine or
-    release of a library), the rest of the record is dropped and evaluated anew.
+    """A safetensors file with the tensors from which a long fit goes on.
 
     Args:
         path: the file.
-        key: what is being learned; a file that was written for something else is refused.
+        key: what is being learned (`key_of`); a file that was written for something else is refused.
     """
 
     path: Path
     key: str
-    _record: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list, init=False)
-    _next: int = field(default=0, init=False)
     _written: float = field(default=float("-inf"), init=False)
 
     @staticmethod
@@ -53,6 +54,70 @@ class Checkpoint:
         for value in values:
             digest.update(_bytes_of(value))
         return digest.hexdigest()[:16]
+
+    def read(self, like: Mapping[str, Tensor], growing: Container[str] = ()) -> dict[str, Tensor]:
+        """The tensors in the file, none where there is not a file.
+
+        Args:
+            like: tensors of the names, types and shapes that the file holds.
+            growing: names of those whose length may differ.
+
+        Raises:
+            ModelError: the file is damaged, is a folder, holds values that are not finite, or belongs to
+                another fit.
+        """
+        if not self.path.exists():
+            return {}
+        tensors, key = _read(self.path)
+        if key != self.key or _layout(tensors, growing) != _layout(like, growing):
+            raise ModelError(
+                f"{self.path}: the checkpoint belongs to another fit",
+                expected=f"data, settings and system with key {self.key}",
+                got=key,
+                hint="remove it, or name another file",
+            )
+        for name, value in tensors.items():
+            if value.is_floating_point() and not bool((value.abs() <= LOGGED_VALUE).all()):
+                raise ModelError(
+                    f"{self.path}: {name!r} holds a value that no fit reaches",
+                    expected=f"finite numbers up to ±{LOGGED_VALUE:g}",
+                    hint="remove the checkpoint to start anew",
+                )
+        return {name: tensors[name] for name in like}
+
+    def write_now_and_then(self, tensors: Callable[[], Mapping[str, Tensor]]) -> None:
+        """Write tensors if the last writing is long ago."""
+        if time.monotonic() - self._written >= INTERVAL:
+            self.write(tensors())
+
+    def write(self, tensors: Mapping[str, Tensor]) -> None:
+        """Write tensors, whole or not at all.
+
+        Raises:
+            DestinationError: the place cannot be written.
+        """
+        own = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
+        with atomic_file(self.path) as temporary:
+            temporary.write_bytes(safetensors.torch.save(own, {"key": self.key}))
+        self._written = time.monotonic()
+
+
+@dataclass
+class Evaluations:
+    """Every evaluation of an objective: where, its value and its gradient, kept in a checkpoint.
+
+    A resumed fit runs the optimiser again from the start and gives it the recorded values, which takes no
+    time, until they end. So it ends with the same bits as a fit that was not interrupted, after warm starts
+    and restarts too. Where the optimiser asks for another point than the recorded one (another machine or
+    release of a library), the rest of the record is dropped and evaluated anew.
+
+    Args:
+        checkpoint: where they are kept.
+    """
+
+    checkpoint: Checkpoint
+    _record: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list, init=False)
+    _next: int = field(default=0, init=False)
 
     def read(self, start: Mapping[str, Tensor]) -> int:
         """Take up the evaluations in the file, if there is one.
@@ -64,28 +129,24 @@ class Checkpoint:
             How many evaluations will not be repeated.
 
         Raises:
-            ModelError: the file is damaged, is a folder, holds impossible values, or belongs to another fit.
+            ModelError: see `Checkpoint.read`; or a position is one that no fit reaches.
         """
-        if not self.path.exists():
-            return 0
-        tensors, key = read_keyed(self.path)
         size = sum(value.numel() for value in start.values())
-        n = len(tensors["objectives"]) if tensors.get("objectives", torch.zeros(())).ndim == 1 else -1
-        shapes = {"positions": (n, size), "objectives": (n,), "gradients": (n, size)}
-        found = {name: tuple(value.shape) for name, value in tensors.items()}
-        if key != self.key or found != shapes or any(x.dtype != torch.float64 for x in tensors.values()):
-            raise belongs_elsewhere(self.path, self.key, key)
-        for name, value in tensors.items():
-            most = CHECKPOINT_VALUE if name == "positions" else LOGGED_VALUE
-            if not bool((value.abs() <= most).all()):
-                raise ModelError(
-                    f"{self.path}: {name!r} holds a value that no fit reaches",
-                    expected=f"finite numbers up to ±{most:g}",
-                    hint="remove the checkpoint to start anew",
-                )
-        self._record = list(zip(*(tensors[name] for name in NAMES), strict=True))
+        rows = torch.zeros(0, size, dtype=torch.float64)
+        found = self.checkpoint.read(dict(zip(NAMES, (rows, rows[:, 0], rows), strict=True)), NAMES)
+        if not found:
+            return 0
+        lengths = {len(value) for value in found.values()}
+        if len(lengths) > 1 or not bool((found["positions"].abs() <= CHECKPOINT_VALUE).all()):
+            raise ModelError(
+                f"{self.checkpoint.path}: the checkpoint is damaged: 'positions' that no fit reaches, or of "
+                "another length than the objectives",
+                expected=f"finite numbers up to ±{CHECKPOINT_VALUE:g}",
+                hint="remove the checkpoint to start anew",
+            )
+        self._record = list(zip(*(found[name] for name in NAMES), strict=True))
         self._next = 0
-        return n
+        return lengths.pop()
 
     def recorded(self, objective: Objective) -> Objective:
         """The same objective, with its evaluations read from the record as far as it goes, then recorded."""
@@ -99,7 +160,8 @@ class Checkpoint:
                 del self._record[self._next :]
                 value, gradient = _evaluated(objective, tensors, names)
                 self._record.append((here, value, gradient))
-                self._write_now_and_then()
+                if len(self._finite()):
+                    self.checkpoint.write_now_and_then(self._tensors)
             self._next += 1
             like = tensors[names[0]]
             given = value.to(like), gradient.to(like)
@@ -107,46 +169,28 @@ class Checkpoint:
 
         return again
 
-    def _write_now_and_then(self) -> None:
-        if time.monotonic() - self._written >= INTERVAL:
-            self.write()
-
     def write(self) -> None:
-        """Write all evaluations so far, up to the first that is not finite.
+        """Write all evaluations so far, up to the first that is not finite."""
+        if self._finite():
+            self.checkpoint.write(self._tensors())
 
-        Raises:
-            DestinationError: the place cannot be written.
-        """
-        record = []
-        for entry in self._record:
-            if not all(bool((part.abs() <= LOGGED_VALUE).all()) for part in entry):
-                break
-            record.append(entry)
-        if record:
-            parts = (torch.stack(part) for part in zip(*record, strict=True))
-            write_record(self.path, dict(zip(NAMES, parts, strict=True)), self.key)
-        self._written = time.monotonic()
+    def _finite(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """The evaluations before the first that is not finite."""
+        bad = (i for i, entry in enumerate(self._record) if not all(map(_is_finite, entry)))
+        return self._record[: next(bad, None)]
+
+    def _tensors(self) -> dict[str, Tensor]:
+        columns = zip(*self._finite(), strict=True)
+        return dict(zip(NAMES, (torch.stack(column) for column in columns), strict=True))
 
 
-def write_record(path: Path, tensors: Mapping[str, Tensor], key: str) -> None:
-    """Write a checkpoint, whole or not at all.
-
-    Raises:
-        DestinationError: the place cannot be written.
-    """
-    data = safetensors.torch.save({name: x.contiguous() for name, x in tensors.items()}, {"key": key})
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(data)
+def _is_finite(value: Tensor) -> bool:
+    return bool((value.abs() <= LOGGED_VALUE).all())
 
 
-def belongs_elsewhere(path: Path, key: str, found: str | None) -> ModelError:
-    """The error for a checkpoint of another fit."""
-    return ModelError(
-        f"{path}: the checkpoint belongs to another fit",
-        expected=f"data, settings and system with key {key}",
-        got=found,
-        hint="remove it, or name another file",
-    )
+def _layout(tensors: Mapping[str, Tensor], growing: Container[str]) -> dict[str, tuple[object, ...]]:
+    """Type and shape of tensors by name, without the length of those that grow."""
+    return {name: (x.dtype, x.ndim, *x.shape[1 if name in growing else 0 :]) for name, x in tensors.items()}
 
 
 def _flat(tensors: list[Tensor]) -> Tensor:
@@ -187,7 +231,7 @@ def _bytes_of(value: object) -> bytes:
     return f"{value.dtype}{tuple(value.shape)}".encode() + flat.tobytes()
 
 
-def read_keyed(path: Path) -> tuple[dict[str, Tensor], str | None]:
+def _read(path: Path) -> tuple[dict[str, Tensor], str | None]:
     """The tensors of a checkpoint, and the key of what it was written for.
 
     Raises:

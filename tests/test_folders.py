@@ -1,19 +1,16 @@
-"""One folder takes the place of another: at once where the system can, recoverably where it cannot."""
+"""Files take their places in a folder one by one, the last one with all others there."""
 
 from __future__ import annotations
 
 import os
-import sys
 import threading
 from pathlib import Path
 
 import pytest
 
-from forcegp import exchange as module
 from forcegp.errors import DestinationError
-from forcegp.exchange import exchange, is_other_than_folder, recover
-from forcegp.files import atomic_directory, atomic_file, write_text
-from forcegp.temporary import ASIDE, NEW
+from forcegp.files import atomic_file, is_other_than_folder, write_text, written_folder
+from forcegp.temporary import NEW
 
 
 def folder(path: Path, content: str) -> Path:
@@ -24,7 +21,7 @@ def folder(path: Path, content: str) -> Path:
 
 
 def write(path: Path, content: str) -> None:
-    with atomic_directory(path) as temporary:
+    with written_folder(path) as temporary:
         (temporary / "a").write_text(content)
         (temporary / "b").write_text(content)
 
@@ -35,58 +32,26 @@ def content_of(path: Path) -> str:
     return a
 
 
-@pytest.fixture(params=["exchange", "aside"])
-def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Both ways of placing a folder."""
-    if request.param == "aside":
-        monkeypatch.setattr(module, "exchange", lambda a, b: False)
-    return request.param
+def test_the_last_file_is_there_only_with_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen before and after each step; every file is the old one or the new one."""
+    target, seen = folder(tmp_path / "page", "old"), []
+    original = os.replace
 
+    def watched(*args: object) -> None:
+        seen.append(((target / "a").read_text(), (target / "b").read_text()))
+        original(*args)  # type: ignore[arg-type]
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="renameat2 is Linux's")
-def test_two_folders_are_exchanged(tmp_path: Path) -> None:
-    a, b = folder(tmp_path / "a", "one"), folder(tmp_path / "b", "two")
-    assert exchange(a, b)
-    assert (content_of(a), content_of(b)) == ("two", "one")
-    with pytest.raises(FileNotFoundError):
-        exchange(a, tmp_path / "none")
-
-
-def test_there_is_a_folder_at_every_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The old folder is at its path until the new one is: seen before and after each step."""
-    target, seen = folder(tmp_path / "model", "old"), []
-    for name in ("rename", "replace", "unlink", "rmdir"):
-        original = getattr(os, name)
-
-        def watched(*args: object, original=original, **options: object) -> object:
-            seen.append(content_of(target))
-            result = original(*args, **options)
-            seen.append(content_of(target))
-            return result
-
-        monkeypatch.setattr(os, name, watched)
+    monkeypatch.setattr(os, "replace", watched)
     write(target, "new")
-    assert set(seen) == {"old", "new"}
+    assert seen == [("old", "old"), ("new", "old")]
     assert content_of(target) == "new"
-
-
-def test_a_folder_moved_aside_by_a_dead_writer_is_recovered(tmp_path: Path) -> None:
-    aside = tmp_path / f"{ASIDE}0123456789ab-model"
-    folder(aside, "old")
-    recover(tmp_path / "model")
-    assert content_of(tmp_path / "model") == "old"
-    folder(aside, "older")
-    recover(tmp_path / "model")
-    assert content_of(tmp_path / "model") == "old", "a folder in place is never replaced"
-    write(tmp_path / "model", "new")
-    assert os.listdir(tmp_path) == ["model"]
 
 
 def test_litter_of_killed_writers_is_removed_and_work_of_live_ones_is_not(tmp_path: Path) -> None:
     folder(tmp_path / f"{NEW}0123456789ab-model", "half")
     folder(tmp_path / f"{NEW}0123456789ab-other", "half")
     (tmp_path / f"{NEW}0123456789ab-model.json").write_text("half")
-    with atomic_directory(tmp_path / "model") as alive:
+    with written_folder(tmp_path / "model") as alive:
         (alive / "a").write_text("mine")
         (alive / "b").write_text("mine")
         write(tmp_path / "model", "theirs")
@@ -96,7 +61,7 @@ def test_litter_of_killed_writers_is_removed_and_work_of_live_ones_is_not(tmp_pa
     assert sorted(os.listdir(tmp_path)) == [f"{NEW}0123456789ab-other", "model", "model.json"]
 
 
-def test_writers_at_the_same_time_leave_one_whole_folder(tmp_path: Path, way: str) -> None:
+def test_writers_at_the_same_time_leave_whole_files(tmp_path: Path) -> None:
     errors: list[BaseException] = []
 
     def many(name: str) -> None:
@@ -112,7 +77,8 @@ def test_writers_at_the_same_time_leave_one_whole_folder(tmp_path: Path, way: st
     for thread in threads:
         thread.join()
     assert errors == []
-    assert content_of(tmp_path / "model")[1:] == "39"
+    for name in ("a", "b"):
+        assert (tmp_path / "model" / name).read_text()[1:] == "39"
     assert os.listdir(tmp_path) == ["model"]
 
 

@@ -1,0 +1,220 @@
+"""A saved model: one safetensors file whose metadata hold a versioned header, all of it under one hash.
+
+The hash is the SHA-256 of the file with 64 zeros in the place of the hash, so that no bit of header or
+tensors changes unnoticed. The file is put in its place by one `os.replace`: a reader sees the old model or
+the new one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import safetensors
+import safetensors.torch
+from pydantic import BaseModel, ConfigDict, ValidationError
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.destination import check_destination
+from forcegp.errors import ModelError
+from forcegp.files import Header, atomic_file
+from forcegp.limits import HEADER_BYTES, MODEL_BYTES
+from forcegp.resources import announce_memory
+from forcegp.storage.system import PREFIX, pack_system
+from forcegp.storage.validate import check_tensors
+
+SUFFIX = ".safetensors"
+HEADER, HASH = "forcegp", "sha256"
+"""Keys of the file's metadata."""
+NO_HASH = "0" * 64
+COPIES = 3
+"""A model is in memory as the bytes of its file, and as tensors before and after they are aligned."""
+
+
+class ModelHeader(Header):
+    """What a saved model says of itself.
+
+    Attributes:
+        kind: class of models, `Model.kind`.
+        settings: what the kind needs beside its tensors.
+        system: the system, as written by `pack_system`.
+    """
+
+    FORMAT: ClassVar[str] = "forcegp-model"
+    VERSION: ClassVar[int] = 3
+
+    kind: str
+    settings: dict[str, Any]
+    system: dict[str, Any]
+
+
+class Settings(BaseModel):
+    """Base of what a kind of models keeps in `ModelHeader.settings`: frozen, no unknown field."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+SettingsT = TypeVar("SettingsT", bound=Settings)
+
+
+def model_path(path: str | Path) -> Path:
+    """The file of a model: the path, with the ending `.safetensors` if it has another or none."""
+    path = Path(path)
+    return path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
+
+
+def model_bytes(
+    kind: str, system: ConstrainedSystem, settings: Settings, tensors: Mapping[str, Tensor]
+) -> bytes:
+    """The content of the file of a model.
+
+    Args:
+        kind: `Model.kind`.
+        system: written beside the model.
+        settings: of the kind.
+        tensors: of the model, by names that do not begin with `system.`.
+    """
+    record, robot = pack_system(system)
+    own = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
+    header = ModelHeader(kind=kind, settings=settings.model_dump(mode="json"), system=record)
+    data = safetensors.torch.save(own | robot, {HEADER: header.to_json(), HASH: NO_HASH})
+    return data.replace(_entry(NO_HASH), _entry(hashlib.sha256(data).hexdigest()), 1)
+
+
+def write_model(
+    path: str | Path,
+    kind: str,
+    system: ConstrainedSystem,
+    settings: Settings,
+    tensors: Mapping[str, Tensor],
+) -> None:
+    """Write the file of a model, whole or not at all; see `model_bytes`.
+
+    Raises:
+        DestinationError: the place cannot be written.
+    """
+    data = model_bytes(kind, system, settings, tensors)
+    with atomic_file(model_path(path)) as temporary:
+        temporary.write_bytes(data)
+
+
+def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
+    """Header and tensors of a saved model, those of its system among them.
+
+    Raises:
+        ModelError: no model is there, or it is damaged; names the file.
+    """
+    file = model_path(path)
+    if not file.is_file():
+        hint = None
+        if Path(path).is_dir():
+            hint = "models were folders before version 3: fit the model again with this release"
+        raise ModelError(f"{file} is not a saved model", expected="a file that Fit.save wrote", hint=hint)
+    return parse_model(_content(file, MODEL_BYTES), str(file))
+
+
+def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor]]:
+    """Header and tensors of the content of a model's file.
+
+    Raises:
+        ModelError: it is damaged, or not a model.
+    """
+    metadata = _metadata(data, source)
+    digest = _digest(data, metadata.get(HASH, ""))
+    if digest != metadata.get(HASH):
+        raise ModelError(
+            f"{source}: the file is damaged or truncated",
+            expected=f"SHA-256 {metadata.get(HASH, 'in its header')[:12]}…",
+            got=f"{digest[:12]}…",
+            hint="copy the file again from where it was written",
+        )
+    header = ModelHeader.from_json(metadata.get(HEADER, ""), source, ModelError)
+    try:
+        tensors = safetensors.torch.load(data)
+    except (safetensors.SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as cause:
+        raise ModelError(f"{source}: not a safetensors file", got=str(cause)) from cause
+    check_tensors(tensors, source)
+    # Copies, since vectorised kernels may round differently on memory that is not aligned as their own.
+    return header, {name: value.clone() for name, value in tensors.items()}
+
+
+def _metadata(data: bytes, source: str) -> dict[str, str]:
+    """The metadata in the header of a safetensors file."""
+    size = int.from_bytes(data[:8], "little")
+    try:
+        if not 0 < size <= min(len(data) - 8, HEADER_BYTES):
+            raise ValueError(f"header of {size} bytes in a file of {len(data)}")
+        found = json.loads(data[8 : 8 + size])["__metadata__"]
+        if not isinstance(found, dict) or not all(isinstance(x, str) for x in found.values()):
+            raise ValueError("the metadata are not text")
+    except (ValueError, KeyError, TypeError, RecursionError) as cause:
+        raise ModelError(
+            f"{source}: not a model of forcegp, or damaged", expected="a safetensors file", got=str(cause)
+        ) from cause
+    return found
+
+
+def _digest(data: bytes, stated: str) -> str:
+    """SHA-256 of the file with zeros in the place of the stated hash."""
+    start = data.find(_entry(stated), 0, 8 + int.from_bytes(data[:8], "little"))
+    if start < 0 or len(stated) != len(NO_HASH):
+        return hashlib.sha256(data).hexdigest()
+    digest = hashlib.sha256(memoryview(data)[:start])
+    digest.update(_entry(NO_HASH))
+    digest.update(memoryview(data)[start + len(_entry(stated)) :])
+    return digest.hexdigest()
+
+
+def _entry(digest: str) -> bytes:
+    """The hash in the header; within the text of another entry its quotes would be escaped."""
+    return f'"{HASH}":"{digest}"'.encode()
+
+
+def _content(file: Path, most: int) -> bytes:
+    """The bytes of a file of bounded size."""
+    try:
+        size = file.stat().st_size
+        if size > most:
+            raise ModelError(f"{file}: too large", expected=f"at most {most:,} bytes", got=f"{size:,}")
+        announce_memory(COPIES * size, f"reading {file}")
+        return file.read_bytes()
+    except OSError as cause:
+        raise ModelError(f"{file}: cannot be read", got=cause.strerror or str(cause)) from cause
+
+
+def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:
+    """Check, before a long fit, that `write_model` will be able to write a model.
+
+    Args:
+        path: the file.
+        needed_bytes: room that the model takes, where it is known [bytes].
+
+    Raises:
+        DestinationError: the place cannot be written.
+    """
+    check_destination(model_path(path), needed_bytes=needed_bytes)
+
+
+def own_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of the model itself, without its system's."""
+    return {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}
+
+
+def settings_of(header: ModelHeader, kind: type[SettingsT], source: str) -> SettingsT:
+    """The settings of a saved model, checked.
+
+    Raises:
+        ModelError: a field is missing, unknown or not valid; names file and field.
+    """
+    try:
+        return kind.model_validate(header.settings)
+    except ValidationError as cause:
+        first = cause.errors()[0]
+        place = ".".join(str(part) for part in ("settings", *first["loc"]))
+        raise ModelError(
+            f"{source}: field {place!r} is not valid", expected=first["msg"], got=first["input"]
+        ) from cause
