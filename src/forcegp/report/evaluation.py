@@ -40,7 +40,7 @@ def write_evaluation(
 
     Args:
         folder: where the files go.
-        model, data: the model folder and the data file, as the page names them.
+        model, data: the model file and the data file, as the page names them.
         found: the scores.
         window: predictions over a few seconds of the data.
         fitted_to: the file that the trivial predictors were fitted to, if not halves of the data.
