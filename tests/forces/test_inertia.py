@@ -47,8 +47,8 @@ def log(
 ) -> forcegp.Dataset:
     """Torques that move a robot with joint friction along sums of sines, measured with noise.
 
-    With memory, dry friction is four times as large and develops over that distance [rad] (Dahl's model). Noise
-    of accelerations is that of a Savitzky-Golay filter of a window.
+    With memory, dry friction is four times as large and develops over that distance [rad] (Dahl's model).
+    Noise of accelerations is that of a Savitzky-Golay filter of a window.
     """
     generator = torch.Generator().manual_seed(seed)
     t = torch.arange(n, dtype=torch.float64) * 0.01
@@ -137,9 +137,7 @@ def test_links_that_the_file_describes_wrongly_are_identified(file: RobotModel) 
     assert inertia_error(fitted.system.robot, truth, data) < 0.25 * inertia_error(file, truth, data)
     prior = next(prior for prior in model.force_priors if isinstance(prior, InertialPrior))
     assert fitted.problem.pinned == (prior.name,), "its mean is in the robot, its uncertainty remains"
-    assert not fitted.hyperparameters["inertial.log_scale"].any(), (
-        "the robot contains what would show its scale"
-    )
+    assert not fitted.hyperparameters["inertial.log_scale"].any(), "the robot has what would show it"
     again = model.fit(log(truth, 800), learn=["joint_friction"])
     torch.testing.assert_close(again.system.robot.mass, fitted.system.robot.mass, rtol=0.0, atol=0.0)
     assert again.problem.pinned == (prior.name,)
@@ -245,12 +243,8 @@ def test_sums_give_the_dense_least_squares() -> None:
     Phi = torch.randn(n, nq, f, generator=random, dtype=torch.float64)
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
-    by_stretch = sums(
-        Rows(
-            r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, torch.arange(n), Phi[..., :0]
-        ),
-        C,
-    )
+    moves = torch.ones_like(r, dtype=torch.bool)
+    by_stretch = sums(Rows(r, r, r, r, Phi, moves, group, group, torch.arange(n), Phi[..., :0]), C)
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
         H, h = given.quadratic(NOISE)

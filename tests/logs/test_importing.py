@@ -109,6 +109,7 @@ def test_position_only_logs_get_velocity_and_acceleration(tmp_path: Path, robot:
     path, toml = write_csv(tmp_path, m)
     a, b = toml.index("[velocity]"), toml.index("[torque]")
     data = read_log(path, robot, parse_mapping((toml[:a] + toml[b:]).encode(), "mapping.toml"))
+    assert data.header.filter_span == pytest.approx(11.0 * data.header.dt), "the default window"
     inner = slice(6, -6)
     # Bias of a cubic over 11 samples at 3 rad/s.
     np.testing.assert_allclose(data.qd.numpy()[inner], m.qd[inner], atol=1e-3)

@@ -136,39 +136,39 @@ def _noise(every: Sums) -> Tensor:
     return every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
 
 
-def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
-    """Inertia of drives beyond the file's `(nq,)`, raised where accelerations need it.
+def _excess(rows: Rows, every: Sums, M: Tensor, armature: Tensor) -> float:
+    """Logarithm of the squared acceleration error over that of the mean acceleration, mean of the joints."""
+    friction = every.friction(armature)
+    left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
+    missed = torch.linalg.solve(M + torch.diag(armature), left[..., None])[..., 0]
+    spread = rows.qdd - rows.qdd.mean(0)
+    return float((missed.square().mean(0) / spread.square().mean(0)).log().mean())
 
-    They need it, in the geometric mean of the joints, where their mean predicts them better; only the drives of
-    joints of which that is true are raised.
+
+def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
+    """Inertia of drives beyond the file's `(nq,)`, raised where accelerations are below the noise of torques.
+
+    They are if their mean predicts them better than the torques and friction with memory do: what that
+    friction explains is no noise.
 
     Args:
         rows: the samples.
         M: mass matrix of the file at the samples.
         found: inertia of drives that torques ask for.
     """
-    by_stretch = sums(rows, torch.diag_embed(rows.qdd))
-    noise = _noise(by_stretch.total())
-
-    def excess(armature: Tensor) -> Tensor:
-        """Logarithm of the squared acceleration error over that of the mean acceleration `(nq,)`."""
-        friction = by_stretch.total().friction(armature)
-        left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
-        missed = torch.linalg.solve(M + torch.diag(armature), left[..., None])[..., 0]
-        spread = rows.qdd - rows.qdd.mean(0)
-        return (missed.square().mean(0) / spread.square().mean(0)).log()
-
-    begin = excess(found)
-    light = begin > 0.0
-    if float(begin.mean()) <= 0.0:
+    remembering, C = rows.with_memory(), torch.diag_embed(rows.qdd)
+    if _excess(remembering, sums(remembering, C).total(), M, found) <= 0.0:
         return found
+    by_stretch = sums(rows, C)
+    every = by_stretch.total()
+    noise = _noise(every)
     alone = held_out(by_stretch, lambda given: _drives(given, noise, M, 0.0))
     for weight in WEIGHTS:
+        if _excess(rows, every, M, found) <= 0.0:
+            break
         if not is_harmless(held_out(by_stretch, lambda given, v=weight: _drives(given, noise, M, v)), alone):
             break
-        found = torch.where(light, _drives(by_stretch.total(), noise, M, weight), found)
-        if float(excess(found).mean()) <= 0.0:
-            break
+        found = _drives(every, noise, M, weight)
     return found
 
 
