@@ -27,6 +27,7 @@ from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.forces.quantities import States, states
 from forcegp.gp.kernels import Linear, SquaredExponential
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.simulate import SimulationConfig, simulate
 
@@ -97,7 +98,7 @@ def fit_ways(
 
 
 @torch.no_grad()
-def judge(way: str, model: StructuredGP, test: Dataset, free: Dataset) -> Separation:
+def judge(way: str, model: StructuredFit, test: Dataset, free: Dataset) -> Separation:
     """Errors of a way on held-out data, where the simulator's forces are known.
 
     Args:

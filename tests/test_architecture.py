@@ -184,5 +184,5 @@ def test_public_names_exist_and_are_documented() -> None:
         thing = getattr(forcegp, name)
         assert inspect.getdoc(thing), f"forcegp.{name} has no docstring"
     with pytest.raises(AttributeError, match="No forcegp attribute StructuredGp"):
-        forcegp.StructuredGp  # noqa: B018
+        forcegp.StructuredGp  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
     assert importlib.import_module("forcegp.gp")

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import forcegp
+from forcegp.models.prediction import Prediction
 from forcegp.resources import one_thread
 from random_data import random_data, table_system
 
@@ -63,7 +64,7 @@ def test_threads_that_predict_get_the_same_numbers() -> None:
     )
     test = random_data(system, 20, seed=1)
     alone = model.predict(test.q, test.qd, test.tau)
-    found: list[forcegp.Prediction | BaseException] = []
+    found: list[Prediction | BaseException] = []
 
     def predict() -> None:
         try:

@@ -1,3 +1,5 @@
+__all__: list[str]
+
 from . import compiled as compiled
 from . import derivatives as derivatives
 from . import dynamics as dynamics

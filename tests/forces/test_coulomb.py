@@ -149,13 +149,9 @@ def test_the_coefficient_is_learned_and_the_multiplier_found(tmp_path: Path) -> 
 def test_updates_and_samples_carry_the_error_of_learned_friction() -> None:
     train, test = pressed(0.12, 30), pressed(0.12, 10, seed=7)
     prior = SlidingFrictionPrior("table", Linear(), coupled=True)
-    model = forcegp.StructuredGP(
-        table_system(), "analytical", [prior], noise=forcegp.Noise(acceleration=0.05, torque=None)
-    )
-    fit = model.fit(train[:20])
-    updated = model.update(train[20:])
-    model.adopt(fit)
-    whole = model.condition(train)
+    noise = forcegp.Noise(acceleration=0.05, torque=None)
+    fit = forcegp.StructuredGP(table_system(), "analytical", [prior], noise=noise).fit(train[:20])
+    updated, whole = fit.update(train[20:]), fit.condition(train)
     one, other = (f.predict(test.q, test.qd, test.tau, "multiplier").variance for f in (updated, whole))
     assert one is not None and other is not None
     torch.testing.assert_close(one, other, rtol=1e-6, atol=0.0)

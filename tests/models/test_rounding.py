@@ -99,11 +99,10 @@ def test_noise_learned_from_noise_free_accelerations_warns_and_is_right() -> Non
 
 def test_a_variance_that_is_rounding_and_a_negative_eigenvalue_are_refused() -> None:
     system, train, test = drawn("pendulum_wire", 40)
-    model = forcegp.StructuredGP(system)
-    fit = model.fit(train, options=FEW)
+    fit = forcegp.StructuredGP(system).fit(train, options=FEW)
     strong = {k: v + 16.0 if k.endswith("_std") else v for k, v in fit.hyperparameters.items()}
     with pytest.raises(NumericalError, match="does not resolve"):
-        model = model.condition(train, strong)
+        fit.condition(train, strong)
     covariance = torch.tensor([[1.0, 1.1], [1.1, 1.0]], dtype=torch.float64).expand(3, 2, 2)
     with pytest.raises(NumericalError, match=r"3 of 3 covariances .* not positive"):
         Prediction(torch.zeros(3, 2), covariance)

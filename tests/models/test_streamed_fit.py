@@ -18,7 +18,7 @@ from forcegp.forces.priors.joint_friction import JointFrictionPrior
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models import structured_stream
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.storage import sums
+from forcegp.storage.checkpoint import beside
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 from models.stream_worker import PIECE, model, run
 
@@ -104,10 +104,10 @@ def test_a_fit_goes_on_where_it_stopped(files: StreamedDataset, tmp_path: Path, 
     file = tmp_path / "checkpoint"
     with pytest.raises(Interrupted):
         model().fit(files, options=SHORT, checkpoint=file, progress=stop)
-    assert sums.beside(file).is_file()
+    assert beside(file).is_file()
     again = model().fit(files, options=SHORT, checkpoint=file, progress=stop)
     assert seen == [16, 32, 48, 64, 70, 86, 100]
-    assert file.is_file() and sums.beside(file).is_file(), "kept until the caller has saved the fit"
+    assert file.is_file() and beside(file).is_file(), "kept until the caller has saved the fit"
     assert_same(again, reference, 0.0)
 
 
@@ -117,7 +117,7 @@ def test_a_checkpoint_of_another_log(files: StreamedDataset, tmp_path: Path) -> 
     data[5:].write(files.paths[1])
     with pytest.raises(ModelError, match="belongs to another fit"):
         model().fit(StreamedDataset(files.paths), learn=[], checkpoint=file)
-    sums.beside(file).write_bytes(b"cut off")
+    beside(file).write_bytes(b"cut off")
     with pytest.raises(ModelError, match="damaged"):
         model().fit(files, learn=[], checkpoint=file)
 

@@ -24,7 +24,7 @@ from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.storage.checkpoint import Checkpoint
+from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from forces.cases import all_priors, conditioned, draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
 from model_files import rewritten
@@ -465,7 +465,7 @@ def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.M
 
     model = forcegp.StructuredGP(two_contacts())
     with pytest.raises(Interrupted):
-        model = model.fit(data, options=options, progress=stop, checkpoint=path)
+        model.fit(data, options=options, progress=stop, checkpoint=path)
     assert path.is_file()
     again: list[float] = []
     note = lambda done, most, value: again.append(value)  # noqa: E731
@@ -480,7 +480,7 @@ def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.M
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fit.safetensors"
     start = {"joint.log_std": torch.zeros(7, dtype=torch.float64)}
-    Checkpoint(path, "another").recorded(lambda tensors: tensors["joint.log_std"].sum())(start)
+    Evaluations(Checkpoint(path, "another")).recorded(lambda tensors: tensors["joint.log_std"].sum())(start)
     with pytest.raises(ModelError, match="belongs to another fit"):
         forcegp.StructuredGP(two_contacts()).fit(logged(two_contacts(), 5), checkpoint=path)
     path.write_bytes(b"not a checkpoint")
@@ -504,7 +504,7 @@ def test_a_fit_begins_at_the_hyperparameters_of_another() -> None:
     model = forcegp.StructuredGP(two_contacts(), "analytical")
     small = model.fit(data[:12])
     seen: list[float] = []
-    model = model.fit(data, after=small, progress=lambda e, m, value: seen.append(value))
+    model.fit(data, after=small, progress=lambda e, m, value: seen.append(value))
     start = model.fit(data, learn=[])
     prior = float(negative_log_prior(small.hyperparameters, start.hyperparameters))
     again = start.condition(data, small.hyperparameters)
@@ -514,7 +514,7 @@ def test_a_fit_begins_at_the_hyperparameters_of_another() -> None:
     with pytest.raises(
         ModelError, match=r"incompatible initial hyperparameters: joint\.left\.left\.log_bias_std"
     ):
-        model = model.fit(data, after=dataclasses.replace(small, hyperparameters=missing))
+        model.fit(data, after=dataclasses.replace(small, hyperparameters=missing))
 
 
 def test_a_part_of_the_data_has_distinct_states() -> None:

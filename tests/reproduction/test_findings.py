@@ -10,7 +10,7 @@ from forcegp.report.rollouts import rollout_table
 from forcegp.report.tables import number
 from report_samples import band, figures, identification, model_path, multiplier, results, rollouts, score
 from reproduction.learning import FLOOR, TASK, UNKNOWN, curve_table
-from reproduction.page import findings, render_markdown
+from reproduction.page import findings, render_markdown, render_page
 from reproduction.results import Results, paper_numbers
 from reproduction.scores import error_table, overview_table
 from reproduction.trajectories import bands, tip_error
