@@ -179,7 +179,8 @@ class StructuredGP(Model[StructuredFit]):
             problem = dataclasses.replace(problem, system=system, pinned=given.pinned)
         before = {} if after is None else after.hyperparameters
         search = search_of(spec, problem, before, chosen, options)
-        begin = {key: before[key] for key in search.start if key in before} if chosen is None else None
+        begins = chosen is None and after is not None
+        begin = {key: before[key] for key in search.start if key in before} if begins else None
         lesson = learned(spec, problem, search, file, progress, begin, neighbours)
         values, doubts = lesson.hyperparameters, (*given.doubts, *lesson.warnings)
         if sample is not None and lesson.problem.inducing is not None:
