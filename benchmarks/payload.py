@@ -21,7 +21,7 @@ import torch
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.forces.priors.payload import PayloadPrior
+from forcegp.forces.priors.inertial import PayloadPrior
 from forcegp.models.following import follow
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP

@@ -14,7 +14,7 @@ import forcegp
 from forcegp.evaluation.least_squares import LeastSquares, identify_rigid
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.structured_fit import StructuredFit
 

@@ -23,10 +23,10 @@ from forcegp.forces.coulomb import (
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.measurements import Measurement
+from forcegp.forces.posterior import ForceSamples
 from forcegp.forces.priors.contact import SlidingFrictionPrior
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.quantities import States, affine_map, states
-from forcegp.forces.samples import ForceSamples
 from forcegp.gp.kernels import Linear
 from forces.cases import CONTACTS, draw, logged, mixed_contacts, two_contacts
 from random_data import table_system

@@ -25,8 +25,7 @@ from forcegp.forces.inverse_dynamics import (
 )
 from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import AnalyticalMean
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.robot.model import RobotModel
 
 NOISE = torch.tensor([0.2, 0.05], dtype=torch.float64)

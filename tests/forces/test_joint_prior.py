@@ -9,10 +9,8 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import ForcePrior, check_priors, prior_rows
-from forcegp.forces.priors.disturbance import DisturbancePrior
-from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
-from forcegp.forces.priors.normal_force import NormalForcePrior
+from forcegp.forces.priors.contact import NormalForcePrior
+from forcegp.forces.priors.joint import AnalyticalMean, DisturbancePrior, JointForcePrior, JointFrictionPrior
 from forcegp.forces.quantities import QUANTITIES, States, affine_map, states
 from forcegp.gp.features import Standardization
 from forces.cases import draw, mixed_contacts, two_contacts

@@ -13,7 +13,7 @@ import forcegp
 from forcegp import dynamics
 from forcegp.forces.calibration import autocorrelation_time, correlation_times
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.identification import regressor
 
 NOISE = torch.tensor([0.2, 0.05], dtype=torch.float64)

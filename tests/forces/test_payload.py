@@ -7,7 +7,7 @@ import torch
 
 from forcegp import dynamics
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.priors.payload import PayloadPrior
+from forcegp.forces.priors.inertial import PayloadPrior
 from forcegp.forces.quantities import states
 from forces.cases import draw, mixed_contacts, two_contacts
 

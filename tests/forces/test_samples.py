@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from forcegp.forces.posterior import CHUNK_STATES, draw_samples
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import states
-from forcegp.forces.samples import CHUNK_STATES, draw_samples
 from forces.cases import conditioned, draw, logged, mixed_contacts, two_contacts
 
 COUNT = 1500

@@ -12,8 +12,8 @@ from torch import Tensor
 import forcegp
 from forcegp.forces import slopes
 from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.noise import learned_slopes, state_jacobian
 from forcegp.forces.quantities import States, states
-from forcegp.forces.state_noise import learned_slopes, state_jacobian
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, mixed_contacts, two_contacts
 

@@ -12,7 +12,7 @@ from torch import Tensor
 import forcegp
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Measurement
-from forcegp.forces.state_noise import state_jacobian
+from forcegp.forces.noise import state_jacobian
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from forcegp.errors import ModelError
-from forcegp.gp.drift import drifted
+from forcegp.gp.sparse import drifted
 from forcegp.gp.sums import Sums
 
 SAME = 1e-10

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from forcegp.gp.kernel_terms import kernel_terms
 from forcegp.gp.kernels import Constant, Kernel, Linear, Matern32, SquaredExponential
+from forcegp.gp.pathwise import kernel_terms
 
 SAME = 1e-12
 """Of sums of some hundred terms in float64."""

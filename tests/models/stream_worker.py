@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 import forcegp
 from forcegp.data import stream
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forces.cases import two_contacts
 
 PIECE = 16

@@ -30,7 +30,7 @@ from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
 from forcegp.scene import load_model_table, load_scene
-from forcegp.scene.model_section import LearningSection, ModelSection, NoiseSection
+from forcegp.scene.sections import LearningSection, ModelSection, NoiseSection
 from logs import random_log
 
 ROOT = Path(__file__).parents[2]

@@ -8,8 +8,8 @@ import torch
 import forcegp
 from forcegp import dynamics
 from forcegp.errors import ModelError
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
-from forcegp.forces.priors.payload import PayloadPrior
+from forcegp.forces.priors.inertial import PayloadPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.models.following import follow
 from forcegp.models.structured_fit import StructuredFit
 

@@ -9,9 +9,8 @@ import torch
 
 import forcegp
 from forcegp import LearningOptions, Observation
-from forcegp.forces.priors.contact import ContactForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.priors.normal_force import NormalForcePrior
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 

@@ -9,7 +9,7 @@ import torch
 
 import forcegp
 from forcegp.errors import ModelError
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 
 SAME = 1e-8

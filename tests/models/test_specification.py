@@ -10,7 +10,7 @@ import torch
 
 import forcegp
 from forcegp import LearningOptions
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.models.analytical import Window
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.structured_fit import StructuredFit

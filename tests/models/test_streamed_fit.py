@@ -14,7 +14,7 @@ from forcegp import LearningOptions, StreamedDataset
 from forcegp.data import stream
 from forcegp.errors import ModelError
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models import structured_stream
 from forcegp.models.structured_fit import StructuredFit

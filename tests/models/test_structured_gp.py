@@ -14,9 +14,9 @@ import forcegp
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, UnknownNameError
 from forcegp.forces.observations import Observation
+from forcegp.forces.priors.base import OperatorForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.priors.operator import OperatorForcePrior
 from forcegp.forces.quantities import QUANTITIES
 from forcegp.forces.start import negative_log_prior
 from forcegp.gp.exact import ExactPosterior

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import forcegp
-from forcegp.forces.totals import Totals, basis_of
+from forcegp.forces.inference import Totals, basis_of
 from forcegp.models import structured_stream
 from random_data import random_data, table_system
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from forcegp.report.html import Finding
+from forcegp.report.html import Finding, number
 from forcegp.report.rollout_data import with_bands
 from forcegp.report.rollouts import rollout_table
-from forcegp.report.tables import number
 from report_samples import band, figures, identification, model_path, multiplier, results, rollouts, score
 from reproduction.learning import FLOOR, TASK, UNKNOWN, curve_table
 from reproduction.page import findings, render_markdown, render_page

@@ -10,8 +10,8 @@ import torch
 from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError
+from forcegp.forces.posterior import draw_samples
 from forcegp.forces.quantities import states
-from forcegp.forces.samples import draw_samples
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import AnalyticalFit, AnalyticalModel
 from forcegp.models.base import FittedModel

@@ -182,7 +182,7 @@ def model_table(config: Path | None, scene: str | None) -> ModelTable:
 
 def warn_beyond(model: Predictor, data: Dataset) -> None:
     """Print a warning where a model is asked for states far from those that it was trained on."""
-    from forcegp.forces.torque_noise import warnings_beyond
+    from forcegp.forces.noise import warnings_beyond
     from forcegp.models.structured_fit import StructuredFit
 
     beyond = model.beyond(data.qd, data.tau) if isinstance(model, StructuredFit) else None

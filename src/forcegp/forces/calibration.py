@@ -18,9 +18,7 @@ from torch import Tensor
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Measurement, Training
-from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.quantities import affine_map
-from forcegp.forces.torque_noise import (
+from forcegp.forces.noise import (
     GROWTH,
     RELATIVE,
     TORQUE_NOISE,
@@ -28,6 +26,8 @@ from forcegp.forces.torque_noise import (
     stick_variance,
     trained_region,
 )
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.quantities import affine_map
 
 STRETCHES = 8
 """Contiguous stretches that a log of fewer than three segments is divided into."""

@@ -18,10 +18,9 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombFriction, coulomb_response, with_coulomb
-from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.posterior import ForcePosterior, ForceSamples
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.quantities import States
-from forcegp.forces.samples import ForceSamples
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]
 """The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""

@@ -23,7 +23,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.calibration import stretches
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.priors.base import ForceMean
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
 
 LEAST, MOST = 200, 4000
 """Samples in free motion needed at least, and used at most, evenly spaced."""

@@ -13,10 +13,9 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.measurements import Training
+from forcegp.forces.noise import TORQUE_NOISE, state_jacobian, stick_variance
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForcePrior
 from forcegp.forces.projection import ForceMean, ForceNoise, WhitenedRows, combine, whiten
-from forcegp.forces.state_noise import state_jacobian
-from forcegp.forces.torque_noise import TORQUE_NOISE, stick_variance
 from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.kernels import sub

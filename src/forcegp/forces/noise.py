@@ -1,18 +1,42 @@
-"""The noise of what a log measures, as a model states it: accelerations, motor torques, and the state."""
+"""The noise of what a log measures, as a model states it: accelerations, motor torques, and the state.
+
+Unknown torques that are no function of the state: noise of the sensor, sticking, and what lies beyond
+the trained region.
+
+Inside its static friction, the friction of a joint is whatever balances the other forces, and no function of
+its velocity. A joint that hardly moves therefore has an unknown force of variance σ_s² e^{−(q̇/v_s)²} more.
+
+Noise learned where nothing moves says little about a jump. Beyond the range of speeds and torques that a
+joint was trained on, its force has a standard deviation g D more, with D the distance from that range in
+training standard deviations. `calibration.growth` estimates g.
+
+Noise of the measured state, carried to measured quantities to first order.
+
+At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts z(x + δ) ≈ z(x) + G δ, so a sample's rows
+have the noise G Σ_x Gᵀ more, with G = ∂z/∂(q, q̇) (McHutchon and Rasmussen, *Gaussian process training with
+input noise*, 2011). G is that of the robot file's equations of motion under the measured torque, or, once
+forces have been learned, that of q̈ = L b + H F̄ with their posterior mean F̄ (`forces/slopes.py`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
+from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
+from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.observations import NoiseStd
-from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.base import NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.quantities import States, linearize_field
+from forcegp.robot.model import RobotModel
 
 
 @dataclass(frozen=True)
@@ -26,7 +50,7 @@ class Noise:
         torque: standard deviation of the motor torque's white noise [N m, N], one or one per joint;
             `"learn"`, `None` for none, or `"auto"`: learned with the priors of measured robots.
         state: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number or
-            one per joint; `None` for none. It counts to first order (`forces/state_noise.py`).
+            one per joint; `None` for none. It counts to first order (`forces/noise.py`).
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
             impacts and other outliers; `None` for Gaussian noise (`forces/student_t.py`).
 
@@ -76,3 +100,143 @@ class Noise:
             return self
         measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
         return dataclasses.replace(self, torque="learn" if measured else None)
+
+
+TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
+"""Name of the learned noise of the motor torque."""
+STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
+"""Names of the learned σ_s and v_s of each joint."""
+STICKING = 0.02
+"""v_s where learning begins [rad/s, m/s]."""
+REGION = f"{NOISE}.region."
+LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
+"""Names of the trained region: limits and standard deviation of the speed and torque of each joint `(2, nq)`,
+and g `(nq,)` [N m, N]."""
+OUTERMOST = 0.01
+"""Share of the training samples that lies beyond either limit of the region."""
+RELATIVE = 0.05
+"""Growth g over the typical load of a joint that is expected before the log says more: torque constants and
+friction that depends on load are uncertain by some 5 %."""
+FAR = 3.0
+"""Distance beyond the trained region from which a prediction warns."""
+
+
+def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
+    """Where learning begins, from the root mean square of unexplained torque `(nq,)` [N m, N]."""
+    std = (0.5 * residual).clamp(min=1e-4).log().double()
+    return {
+        TORQUE_NOISE: std,
+        STICK_NOISE: std.clone(),
+        STICK_SPEED: torch.full_like(std, math.log(STICKING)),
+    }
+
+
+def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
+    """Variance of the friction of joints that stick, `(n, nq)`; zero where it is not learned."""
+    if STICK_NOISE not in tensors:
+        return torch.zeros_like(at.q)
+    std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
+    return std**2 * torch.exp(-((at.qd / speed) ** 2))
+
+
+def trained_region(qd: Tensor, tau: Tensor, load: Tensor) -> dict[str, Tensor]:
+    """The region of the training samples `(n, nq)`, by the names of `LOW`, `HIGH` and `SPREAD`.
+
+    Args:
+        qd, tau: of samples in motion.
+        load: typical torque of each joint `(nq,)`, a fraction of which is the least spread of its torque.
+    """
+    x = torch.stack([qd, tau], dim=1)
+    low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
+    least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
+    return {LOW: low, HIGH: high, SPREAD: x.std(0, correction=0).maximum(least)}
+
+
+def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
+    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or
+    where none is known."""
+    if LOW not in tensors:
+        return torch.zeros_like(qd)
+    x = torch.stack([qd, tau], dim=-2)
+    beyond = (tensors[LOW] - x).maximum(x - tensors[HIGH]).clamp(min=0.0)
+    return (beyond / tensors[SPREAD]).norm(dim=-2)
+
+
+def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
+    """A warning where states lie far beyond the trained region.
+
+    Args:
+        distance: D `(*batch, nq)`.
+        joints: their names.
+    """
+    rows = distance.reshape(-1, distance.shape[-1])
+    far = int((rows > FAR).any(-1).sum())
+    if not far:
+        return ()
+    most, joint = rows.amax(0).max(0)
+    return (
+        f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} "
+        f"training standard deviations ({joints[int(joint)]}); their error bars are a guess: train on such "
+        "motion",
+    )
+
+
+def unknown_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
+    """Variance of forces that only a prediction has: of joints that stick, and beyond the trained region
+    `(n, nq)`."""
+    variance = stick_variance(tensors, at)
+    if GROWTH not in tensors:
+        return variance
+    return variance + (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
+
+
+ForceField = Callable[[ConstrainedSystem, States], Tensor]
+"""The impressed force Q̄ at states, `(n, nq)`."""
+
+
+def state_jacobian(
+    system: ConstrainedSystem, m: Measurement, force: ForceField | None = None
+) -> Tensor | None:
+    """G = dz/d(q, q̇) `(n, d, 2 nq)` of measured accelerations or multipliers; `None` for other quantities.
+
+    Args:
+        system: robot and contacts.
+        m: the measurement.
+        force: all impressed forces; by default those of the robot file and the measured torque.
+    """
+    if m.quantity not in ("qdd", "multiplier"):
+        return None
+    if force is None:
+        at = system.linearize(m.q, m.qd, m.tau, m.active)
+    else:
+        at = linearize_field(force, system, m.q, m.qd, m.tau, m.active)
+    pair = (at.dq, at.dqd) if m.quantity == "qdd" else (at.multiplier_dq, at.multiplier_dqd)
+    return torch.cat(pair, dim=-1)
+
+
+def learned_slopes(training: Training, system: ConstrainedSystem, force: ForceField) -> Training:
+    """Training data with G of a force field at each sample."""
+    slopes = tuple(state_jacobian(system, m, force) for m in training.measurements)
+    return dataclasses.replace(training, slopes=slopes)
+
+
+def state_std_of(given: Sequence[NoiseStd] | None, robot: RobotModel) -> Tensor | None:
+    """Standard deviation of the noise of q and q̇ as one vector `(2 nq,)`; `None` for none.
+
+    Raises:
+        ModelError: these are no two standard deviations, each one number or one per joint, 0 or above.
+    """
+    if given is None:
+        return None
+    try:
+        std = [torch.as_tensor(x, dtype=robot.dtype, device=robot.device).expand(robot.nq) for x in given]
+        valid = len(std) == 2 and all(bool(((x >= 0.0) & torch.isfinite(x)).all()) for x in std)
+    except (TypeError, ValueError, RuntimeError):
+        valid, std = False, []
+    if not valid:
+        raise ModelError(
+            "the noise of the state is not valid",
+            expected=f"two standard deviations, of q and q̇, each one number or {robot.nq}, 0 or above",
+            got=given,
+        )
+    return torch.cat(std)

@@ -1,18 +1,23 @@
-"""The posterior over latent forces, and every other quantity read off it (eqs. 22 to 25)."""
+"""The posterior over latent forces, and every other quantity read off it (eqs. 22 to 25).
+
+Force functions drawn from the posterior: each is a deterministic force field that can be integrated.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombFriction, coupled, with_coulomb
-from forcegp.forces.priors.base import ForceMean, ForcePrior, prior_rows
+from forcegp.forces.priors.base import CONTACT, ForceMean, ForcePrior, prior_rows
 from forcegp.forces.quantities import AffineMap, States
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Features, Standardization
+from forcegp.gp.pathwise import FunctionSamples
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block
 
@@ -85,3 +90,100 @@ class ForcePosterior:
         """Posterior mean o + B(m + Σ E f) of a quantity at states, `(n, d)`."""
         rows = self.rows(system, at, z)
         return rows.target + (self.central or self.latent).mean(rows)
+
+
+CHUNK_STATES = 256
+"""States at which samples are evaluated at once, so that intermediate arrays stay in the cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class ForceSamples:
+    """Forces drawn from the posterior.
+
+    Attributes:
+        posterior: what they are drawn from.
+        functions: the latent functions.
+    """
+
+    posterior: ForcePosterior
+    functions: FunctionSamples
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return self.functions.count
+
+    def forces(
+        self, system: ConstrainedSystem, at: States, sample: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Sampled joint force Q and dissipative contact force Q_z.
+
+        Args:
+            system: robot and contacts.
+            at: n states.
+            sample: `(n,)` which sample each state belongs to; all samples at all states by default.
+
+        Returns:
+            Q and Q_z `(samples, n, nq)`, or `(n, nq)` where `sample` is given [N m, N].
+        """
+        Q = self.posterior.mean(system, at)
+        Q = Q if sample is not None else Q.expand(self.count, *Q.shape)
+        Q_z = torch.zeros_like(Q)
+        for p, prior in enumerate(self.posterior.priors):
+            features = self.posterior.features_of(p, system, at)
+            latent = self.functions.latent(p, features, sample) + self.posterior.shift(p, features)
+            force = (prior.operator(system, at) @ latent[..., None])[..., 0]
+            Q, Q_z = (Q, Q_z + force) if prior.target == CONTACT else (Q + force, Q_z)
+        return Q, with_coulomb(system, at, Q + Q_z, self.posterior.coulomb) - Q
+
+    def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
+        """Q̄ = Q + Q_z of one sample per trajectory, the force field of a rollout.
+
+        Args:
+            system: robot and contacts.
+            at: samples × k states, of which the s-th run of k belongs to sample s.
+
+        Returns:
+            `(samples · k, nq)` [N m, N].
+        """
+        priors = range(len(self.posterior.priors))
+        Q_bar = self.posterior.mean(system, at) + self.unknown_force(system, at, priors)
+        return with_coulomb(system, at, Q_bar, self.posterior.coulomb)
+
+    def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
+        """Σ E f over some priors, without Coulomb friction of contacts."""
+        unknown: Tensor | float = 0.0
+        runs = len(at.q) // self.count
+        step = max(1, CHUNK_STATES // max(runs, 1))
+        chunks = [range(i, min(i + step, self.count)) for i in range(0, self.count, step)]
+        for p in priors:
+            prior, features = self.posterior.priors[p], self.posterior.features_of(p, system, at)
+            force = torch.cat(
+                [
+                    self.functions.by_runs(
+                        p,
+                        {n: x[own.start * runs : own.stop * runs] for n, x in features.items()},
+                        own,
+                        runs,
+                    )
+                    for own in chunks
+                ]
+            )
+            force = force + self.posterior.shift(p, features)
+            unknown = unknown + (prior.operator(system, at) @ force[..., None])[..., 0]
+        return unknown
+
+
+def draw_samples(
+    posterior: ForcePosterior, count: int, generator: torch.Generator, features: int | None = None
+) -> ForceSamples:
+    """Draw force functions from the posterior.
+
+    Args:
+        posterior: what to draw from.
+        count: number of functions.
+        generator: source of randomness, on the CPU.
+        features: random features per component; by default as many as the kind of posterior needs.
+    """
+    given = () if features is None else (features,)
+    return ForceSamples(posterior, posterior.latent.draw(count, generator, *given))

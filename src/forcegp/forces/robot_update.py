@@ -11,9 +11,9 @@ from torch import Tensor
 from forcegp.dynamics import mass_matrix
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem
+from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.torque_noise import TORQUE_NOISE
 from forcegp.gp.structured_covariance import Block
 from forcegp.robot.model import RobotModel
 

@@ -19,8 +19,8 @@ import dataclasses
 from forcegp.errors import NumericalError
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem
+from forcegp.forces.noise import learned_slopes
 from forcegp.forces.start import Search
-from forcegp.forces.state_noise import learned_slopes
 from forcegp.gp.optimise import Learned, Progress
 
 ROUNDS = 3

@@ -21,9 +21,9 @@ from torch import Tensor
 from forcegp.errors import ModelError
 from forcegp.forces.coulomb import below_jamming, initial_coulomb
 from forcegp.forces.learn import OWN, Problem, Tensors, kernel_parameters, noise_key, typical
+from forcegp.forces.noise import initial_torque_noise
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, ForcePrior
 from forcegp.forces.projection import WhitenedRows
-from forcegp.forces.torque_noise import initial_torque_noise
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.optimise import Bounds, Learned, LearningOptions, Objective, Progress, minimise
 from forcegp.gp.structured_covariance import Block

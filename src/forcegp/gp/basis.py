@@ -15,11 +15,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from forcegp.gp.decomposition import Split, split
+from forcegp.gp.decomposition import Spectrum, Split, split
 from forcegp.gp.draws import FunctionDraw
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters, sub
-from forcegp.gp.spectrum import Spectrum
 from forcegp.gp.structured_covariance import Process, points
 
 

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from forcegp.gp.factor import bordered
 from forcegp.gp.features import Features
-from forcegp.gp.kernel_terms import kernel_terms
 from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.likelihood import Conditioned, condition, require_exact_fits, target_of
-from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors
+from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors, kernel_terms
 from forcegp.gp.rounding import require_resolved_noise, require_resolved_variance
 from forcegp.gp.structured_covariance import Block, Process, add_rows, chunked, cross_gram, gram, offsets
 

@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.gp.decomposition import Part, split
+from forcegp.gp.decomposition import TRUNCATION, Part, split
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters, sub
-from forcegp.gp.spectrum import TRUNCATION
 from forcegp.gp.structured_covariance import Block, Process, points, rows_of
 
 CANDIDATES = 4000

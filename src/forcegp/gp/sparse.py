@@ -3,6 +3,17 @@
 With A = I + Σ V_i S_i V_iᵀ and v = Σ V_i W_iᵀ y_i, the latent mean is V_*ᵀA⁻¹v and the latent covariance
 k_** − V_*ᵀV_* + V_*ᵀA⁻¹V_* (Titsias 2009; Hensman et al. 2013). A prediction costs the same after a
 hundred samples and after a million.
+
+Weights of basis functions that drift: a component that changes while the others stay.
+
+A drifting weight is an Ornstein–Uhlenbeck process with its prior as stationary distribution,
+w′ = ρ w + √(1 − ρ²) ξ, ξ ~ N(0, I). In information form, with A = I + G, v and the drifting weights p,
+
+    S = A_pp + ρ²a I,  a = 1/(1 − ρ²),
+    A′_oo = A_oo − A_op S⁻¹ A_po,  A′_op = ρa A_op S⁻¹,  A′_pp = a I − ρ²a² S⁻¹,
+    v′_o = v_o − A_op S⁻¹ v_p,  v′_p = ρa S⁻¹ v_p.
+
+What a sparse posterior loses by its inducing points.
 """
 
 from __future__ import annotations
@@ -14,16 +25,45 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.diagnostics import Diagnostics
-from forcegp.gp.drift import drifted
 from forcegp.gp.factor import cholesky, extended
 from forcegp.gp.features import Features
-from forcegp.gp.pathwise import FunctionSamples
+from forcegp.gp.pathwise import MISSED_FEATURES, FunctionSamples, draw_functions
 from forcegp.gp.rounding import require_resolved_noise, require_resolved_variance
-from forcegp.gp.sparse_draws import FEATURES, draw_functions
 from forcegp.gp.structured_covariance import Block, chunked
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
+
+
+def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
+    """The sums after some weights have drifted; predictions of the others stay as they are.
+
+    Args:
+        sums: over the samples so far.
+        weights: positions of the weights that drift `(k,)`.
+        factor: ρ, their correlation with what they were: 1 keeps them, 0 returns them to their prior.
+
+    Raises:
+        ModelError: the factor is not between 0 and 1.
+    """
+    if not 0.0 <= factor <= 1.0:
+        raise ModelError("invalid forgetting factor", expected="from 0 to 1", got=factor)
+    if factor == 1.0 or not len(weights):
+        return sums
+    a, p = 1.0 / (1.0 - factor**2), weights
+    A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
+    eye = torch.eye(len(p), dtype=A.dtype, device=A.device)
+    L = torch.linalg.cholesky(A[p][:, p] + factor**2 * a * eye)
+    inverse = torch.cholesky_inverse(L)
+    A_ap, gain = A[:, p], A[:, p] @ inverse
+    G, v = sums.G - gain @ A_ap.mT, sums.v - gain @ sums.v[p]
+    G[:, p] = factor * a * gain
+    G[p, :] = G[:, p].mT
+    G[p[:, None], p[None, :]] = a * eye - (factor * a) ** 2 * inverse - eye
+    v[p] = factor * a * (inverse @ sums.v[p])
+    yy = sums.yy - sums.v[p] @ (inverse @ sums.v[p])
+    return Sums(v, yy, sums.rows, sums.prior, sums.missed, G)
+
 
 CHUNK_PREDICTIONS = 256
 """Samples whose covariance is computed at a time."""
@@ -177,7 +217,9 @@ class SparsePosterior:
             residual=float(residual / sums.rows) if float(sums.rows) > 0.0 else 0.0,
         )
 
-    def draw(self, count: int, generator: torch.Generator, features: int = FEATURES) -> FunctionSamples:
+    def draw(
+        self, count: int, generator: torch.Generator, features: int = MISSED_FEATURES
+    ) -> FunctionSamples:
         """Functions from the posterior.
 
         Args:
@@ -228,3 +270,34 @@ class SparsePosterior:
             NumericalError: the samples were not among them.
         """
         return SparsePosterior.of(self.basis, self.sums - accumulate(self.basis, blocks))
+
+
+MISSED = 0.1
+"""Missed variance, as a fraction of what the noise leaves, above which more points would help."""
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What a sparse posterior loses by its inducing points.
+
+    Attributes:
+        size: number of basis functions.
+        rows: number of rows, less what is forgotten.
+        learned: how many basis functions the rows determine, tr A⁻¹G; in units of the noise variance this is
+            the variance that noise leaves in all rows together.
+        missed: the prior variance that the points miss in all rows together, in the same units.
+        relative: missed prior variance of each process as a fraction of all of it.
+        residual: mean square of the rows' residuals, 1 where the model and its noise fit.
+    """
+
+    size: int
+    rows: float
+    learned: float
+    missed: float
+    relative: tuple[float, ...]
+    residual: float
+
+    @property
+    def more_points_would_help(self) -> bool:
+        """Whether the points miss a tenth or more of the variance that the noise leaves."""
+        return self.missed > MISSED * self.learned

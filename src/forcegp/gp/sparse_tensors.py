@@ -13,10 +13,9 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis, ProcessBasis
-from forcegp.gp.decomposition import split
+from forcegp.gp.decomposition import Spectrum, split
 from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.spectrum import Spectrum
 from forcegp.gp.structured_covariance import Process
 from forcegp.gp.sums import Moments
 

@@ -1,5 +1,5 @@
 """Models of the forward dynamics: what they are made of, fitting, predicting, and reading them back."""
 
-from forcegp.models import transport
+from forcegp.models.load import register
 
-transport.register()
+register()

@@ -27,7 +27,7 @@ from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.scene import ModelTable
-from forcegp.scene.model_section import NoiseSection
+from forcegp.scene.sections import NoiseSection
 from forcegp.storage.descriptions import decode
 
 DEFAULT = "sgp-mean"

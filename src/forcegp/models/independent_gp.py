@@ -1,6 +1,8 @@
 """The Gaussian-process baseline: each joint acceleration has a process of its own, blind to mechanics.
 
 q̈_j ~ GP(0, k_j(x, x′)) with x = (q, q̇, τ) and squared-exponential k_j (section 5.4 of the paper).
+
+Reading independent Gaussian processes.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ModelError
+from forcegp.errors import ForceGPError, ModelError
 from forcegp.forces.inference import require_double
 from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
@@ -28,12 +30,12 @@ from forcegp.gp.features import Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
 from forcegp.gp.structured_covariance import Block
-from forcegp.models.acceleration import AccelerationFit
-from forcegp.models.base import FitProgress, Model
+from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
-from forcegp.storage.model_file import Settings
+from forcegp.storage.model_file import ModelHeader, Settings, settings_of
+from forcegp.storage.system import take
 
 KIND = "independent_gp"
 LEARNING = 6
@@ -294,3 +296,32 @@ def _variance(posterior: ExactPosterior, features: dict[str, Tensor]) -> Tensor:
     n, like = len(features["q"]), posterior.alpha
     rows = Block((features,), (like.new_ones(n, 1, 1),), like.new_zeros(n, 1))
     return posterior.covariance(rows)[:, 0, 0]
+
+
+def load_independent(
+    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+) -> IndependentFit:
+    """The model that `IndependentFit.save` wrote."""
+    settings = settings_of(header, IndependentSettings, source)
+    nq, dtype = system.robot.nq, system.robot.dtype
+    n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
+    features = {
+        name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
+    }
+    noise = take(tensors, "training.noise_std", None, dtype, source)
+    if noise.shape not in ((nq,), (n, nq)) or not bool((noise > 0.0).all()):
+        raise ModelError(f"{source}: tensor 'training.noise_std' is not valid", expected="positive numbers")
+    qdd = take(tensors, "training.qdd", (n, nq), dtype, source)
+    training = IndependentTraining(features, qdd, noise, scale_of(features, settings.standardize))
+    hyperparameters = {
+        f"{prior.name}.{name}": take(
+            tensors, f"hyperparameters.{prior.name}.{name}", tuple(value.shape), torch.float64, source
+        )
+        for prior in joint_processes(nq)
+        for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
+    }
+    announce(training, 0)
+    try:
+        return fitted(system, settings.noise_std, training, hyperparameters, standardize=settings.standardize)
+    except ForceGPError as cause:
+        raise ModelError.at(f"{source}: the training data", cause) from cause

@@ -1,22 +1,36 @@
-"""Reading a saved model of any kind."""
+"""Reading a saved model of any kind.
+
+Fitted models through process pools and `copy.deepcopy`, as the bytes of their saved form.
+
+No attribute of a model travels: what arrives in another process was read and checked as a saved model is.
+"""
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
-from forcegp.models.analytical import AnalyticalModel, load_analytical
+from forcegp.models.analytical import AnalyticalFit, AnalyticalModel, load_analytical
 from forcegp.models.base import FittedModel
-from forcegp.models.independent_gp import IndependentGP
-from forcegp.models.independent_load import load_independent
-from forcegp.models.neural import NeuralNetwork, load_network
+from forcegp.models.independent_gp import IndependentFit, IndependentGP, load_independent
+from forcegp.models.neural import NetworkFit, NeuralNetwork, load_network
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_load import load_structured
-from forcegp.storage.model_file import ModelHeader, model_path, own_tensors, parse_model, read_model
+from forcegp.storage.model_file import (
+    ModelHeader,
+    model_bytes,
+    model_path,
+    own_tensors,
+    parse_model,
+    read_model,
+)
 from forcegp.storage.system import unpack_system
 
 Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], FittedModel]
@@ -77,3 +91,22 @@ def _restored(
         raise UnknownNameError(f"kind of models in {source}", header.kind, LOADERS)
     own = unpack_system(header.system, tensors, source, system)
     return LOADERS[header.kind](header, own_tensors(tensors), own, source)
+
+
+KINDS = (AnalyticalFit, NetworkFit, IndependentFit, StructuredFit)
+"""Fitted models."""
+
+
+def register() -> None:
+    """Let the copying and sending of models go through their saved form."""
+    for kind in KINDS:
+        copyreg.pickle(kind, _sent)  # pyright: ignore[reportArgumentType]
+
+
+def _sent(model: FittedModel) -> tuple[Any, ...]:
+    """How a model is made again: from the content of its file.
+
+    Raises:
+        ModelError: a part of the model is Python code.
+    """
+    return model_of_bytes, (model_bytes(model.kind, model.system, *model.record()),)

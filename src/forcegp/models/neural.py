@@ -16,8 +16,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.quantities import FlatStates
 from forcegp.gp.features import Standardization
-from forcegp.models.acceleration import AccelerationFit
-from forcegp.models.base import FitProgress, Model
+from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.storage.checkpoint import Checkpoint

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
-from forcegp.forces.torque_noise import warnings_beyond
+from forcegp.forces.noise import warnings_beyond
 from forcegp.gp.rounding import require_semidefinite
 
 if TYPE_CHECKING:
@@ -102,6 +102,6 @@ class Prediction:
             ShapeError: the mean is not of shape `(n, d)`, or an argument does not fit it.
             ParameterError: the number of axes is not that of the components.
         """
-        from forcegp.models.plot import plot_prediction
+        from forcegp.models.measured import plot_prediction
 
         return plot_prediction(self.mean, self.std, tuple(self.parts), t, measured, names, ax)

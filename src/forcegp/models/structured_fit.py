@@ -18,14 +18,19 @@ from forcegp.forces.identifiability import doubts_of
 from forcegp.forces.inference import forces_and_constant, is_sparse, log_likelihood, lost_by_inducing
 from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Training
+from forcegp.forces.noise import (
+    LOW,
+    STICK_NOISE,
+    TORQUE_NOISE,
+    distance_beyond,
+    learned_slopes,
+    unknown_variance,
+)
 from forcegp.forces.observations import Observation
-from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.posterior import ForcePosterior, draw_samples
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
-from forcegp.forces.samples import draw_samples
-from forcegp.forces.state_noise import learned_slopes
-from forcegp.forces.torque_noise import LOW, STICK_NOISE, TORQUE_NOISE, distance_beyond, unknown_variance
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel, ForceField, Prediction

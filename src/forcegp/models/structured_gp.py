@@ -15,12 +15,11 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError
 from forcegp.forces.inference import check_method, require_double
-from forcegp.forces.noise import Noise
+from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.observations import NoiseStd, Observation
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.default import default_priors
 from forcegp.forces.priors.joint import AnalyticalMean, mean_of
-from forcegp.forces.state_noise import state_std_of
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model

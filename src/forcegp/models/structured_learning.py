@@ -24,7 +24,6 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import calibrated_noise, likelihood_power, residual_times
-from forcegp.forces.impacts import without_impacts
 from forcegp.forces.inference import (
     is_finite,
     is_sparse,
@@ -32,7 +31,8 @@ from forcegp.forces.inference import (
     without_inducing,
 )
 from forcegp.forces.learn import Problem
-from forcegp.forces.measurements import Training
+from forcegp.forces.measurements import Training, without_impacts
+from forcegp.forces.noise import REGION, TORQUE_NOISE
 from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
 from forcegp.forces.priors.inertial import InertialPrior
@@ -40,7 +40,6 @@ from forcegp.forces.robot_update import with_updated_robot
 from forcegp.forces.slopes import with_learned_slopes, without_slopes
 from forcegp.forces.start import Search, initial
 from forcegp.forces.student_t import left_out, weighted
-from forcegp.forces.torque_noise import REGION, TORQUE_NOISE
 from forcegp.gp.likelihood import require_exact_fits
 from forcegp.gp.optimise import Learned, LearningOptions, Progress
 from forcegp.models.base import FitProgress

@@ -17,7 +17,7 @@ from forcegp.errors import UnknownNameError
 from forcegp.forces.inertia import Inertia, inertia_of
 from forcegp.forces.learn import Problem, analytical_parameters
 from forcegp.forces.measurements import Training
-from forcegp.forces.noise import Noise
+from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.observations import (
     Observation,
     is_simulated,
@@ -27,16 +27,16 @@ from forcegp.forces.observations import (
 )
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
-from forcegp.forces.priors.coregional import CoregionalPrior
+from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.default import measured_priors
-from forcegp.forces.priors.disturbance import DisturbancePrior
-from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
-from forcegp.forces.priors.normal_force import NormalForcePrior
-from forcegp.forces.priors.payload import PayloadPrior
-from forcegp.forces.state_noise import state_std_of
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
+from forcegp.forces.priors.joint import (
+    AnalyticalMean,
+    CoregionalPrior,
+    DisturbancePrior,
+    JointForcePrior,
+    JointFrictionPrior,
+)
 from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.inducing import LIMIT

@@ -19,12 +19,12 @@ from forcegp.data import Dataset
 from forcegp.data.stream import StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
 from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
+from forcegp.forces.inference import Totals, basis_of, posterior_of, total_over
 from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training
 from forcegp.forces.observations import training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.totals import Totals, basis_of, posterior_of, total_over
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.distributed import share_basis
 from forcegp.gp.features import Standardization

@@ -7,12 +7,24 @@ window and trajectories in open loop come as data with a schema and as the plots
 """
 
 from forcegp.report.check import write_check
-from forcegp.report.html import Block, Finding, render
+from forcegp.report.html import (
+    NONE,
+    Block,
+    Finding,
+    Part,
+    Series,
+    Table,
+    as_tensor,
+    cell,
+    columns,
+    matrix,
+    number,
+    render,
+    series,
+)
 from forcegp.report.rollout_data import RolloutData, rollout_data, together, with_bands
 from forcegp.report.rollouts import rollout_section, rollout_table
 from forcegp.report.style import AXES, INK, MARKERS, Picture, colour, draw, label, shade
-from forcegp.report.tables import NONE, Table, cell, number
-from forcegp.report.values import Part, Series, as_tensor, columns, matrix, series
 from forcegp.report.window import WindowData, common_limit, draw_errors, draw_predictions, predicted_window
 
 __all__ = [

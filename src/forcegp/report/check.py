@@ -1,17 +1,193 @@
-"""The page of a checked log: the verdict, where findings lie, and each finding with a picture."""
+"""The page of a checked log: the verdict, where findings lie, and each finding with a picture.
+
+Pictures of findings: the columns concerned, around the rows concerned.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from forcegp import dynamics
 from forcegp.checks import KINDS, Finding, Log, Report
-from forcegp.checks.log import describe, of_robot
-from forcegp.constraints import ConstrainedSystem
+from forcegp.checks.contact import tip_path
+from forcegp.checks.log import Array, describe, of_robot
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.files import write_text
-from forcegp.report.check_pictures import draw_overview, picture_of
 from forcegp.report.html import render
-from forcegp.report.style import Picture
+from forcegp.report.style import INK, OTHER, Picture, draw
+
+COLOURS = {"error": "#a1121f", "warning": "#d08c00", "note": "#0072b2"}
+POINTS = 1500
+"""Points of a curve: more cannot be told apart on a page."""
+CONTEXT = 3.0
+"""Rows shown, in lengths of the interval."""
+LEAST_ROWS = 200
+JOINTS = 3
+"""Joints shown of a finding on many."""
+SIZE = (6.2, 1.35)
+"""Width of a picture and height of a panel [inch]."""
+
+Paint = Callable[[Axes, Log, slice, int], None]
+
+
+def draw_overview(report: Report) -> Picture:
+    """A lane per finding, with the rows that it concerns."""
+
+    def paint(figure: Figure) -> None:
+        axes = figure.subplots()
+        for lane, finding in enumerate(reversed(report.findings)):
+            least = report.samples / 300.0
+            spans = [(a, max(b - a, least)) for a, b in finding.intervals]
+            axes.broken_barh(spans, (lane - 0.35, 0.7), color=COLOURS[finding.severity], linewidth=0)
+        lanes = [" or ".join(finding.kinds) for finding in reversed(report.findings)]
+        axes.set_yticks(range(len(lanes)), lanes)
+        axes.set_xlim(0, report.samples)
+        axes.set_xlabel("row")
+
+    kinds = ", ".join(" or ".join(finding.kinds) for finding in report.findings)
+    return draw(paint, (6.2, 0.7 + 0.22 * len(report.findings)), f"Rows concerned by each finding: {kinds}")
+
+
+def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture:
+    """What a finding looks like, by its family."""
+    rows = _window(finding, log)
+    family = KINDS[finding.kind].family
+    index = [log.joint_names.index(name) for name in finding.joints][:JOINTS] or _largest(log)
+    if family == "contact" and finding.contact is not None:
+        return _contact(finding, system, log, rows)
+    if family in ("torque", "mechanics"):
+        return _panels(finding, log, rows, index, _torque(system, log, rows), "torque [N m]")
+    painters: dict[str, tuple[Paint, str]] = {
+        "clock": (_steps, "time step [s]"),
+        "values": (_position, "q"),
+        "kinematics": (_rates, "qd"),
+        "noise": (_acceleration, "qdd"),
+        "excitation": (_position, "q"),
+    }
+    paint, label = painters.get(family, (_position, "q"))
+    if finding.message.startswith("qd "):
+        paint, label = painters["kinematics"]
+    column = next((name for name in ("tau", "qdd", "qd", "q") if f"{name}." in finding.message), None)
+    if family == "values" and (column or finding.kind in ("torque-saturated", "torque-limit")):
+        name = column or "tau"
+        paint, label = (lambda axes, log, rows, j: _line(axes, rows, getattr(log, name)[rows, j])), name
+    return _panels(finding, log, rows, index if family != "clock" else [0], paint, label)
+
+
+def _window(finding: Finding, log: Log) -> slice:
+    """The first interval with some context, or the whole log."""
+    start, stop = finding.intervals[0] if finding.intervals else (0, len(log))
+    margin = max(LEAST_ROWS, round(CONTEXT * (stop - start))) // 2
+    return slice(max(start - margin, 0), min(stop + margin, len(log)))
+
+
+def _largest(log: Log) -> list[int]:
+    """The joints with the largest torques."""
+    size = np.nan_to_num(np.nanmean(log.tau**2, axis=0))
+    return sorted(np.argsort(-size)[:JOINTS].tolist())
+
+
+def _panels(finding: Finding, log: Log, rows: slice, joints: list[int], paint: Paint, label: str) -> Picture:
+    """One panel per joint, with the rows of the finding shaded."""
+
+    def fill(figure: Figure) -> None:
+        panels = figure.subplots(len(joints), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, j in zip(panels, joints, strict=True):
+            _shade(axes, finding, rows, len(log))
+            paint(axes, log, rows, j)
+            axes.set_ylabel(label)
+            if label != "time step [s]":
+                axes.set_title(log.joint_names[j], loc="left")
+        panels[-1].set_xlabel("row")
+
+    names = ", ".join(log.joint_names[j] for j in joints)
+    alt = f"{label} of {names} in rows {rows.start} to {rows.stop - 1}: {finding.message}"
+    return draw(fill, (SIZE[0], 0.5 + SIZE[1] * len(joints)), alt)
+
+
+def _shade(axes: Axes, finding: Finding, rows: slice, n: int) -> None:
+    if finding.intervals == ((0, n),):
+        return
+    for a, b in finding.intervals:
+        if a < rows.stop and b > rows.start:
+            axes.axvspan(a - 0.5, b - 0.5, color=COLOURS[finding.severity], alpha=0.18, linewidth=0)
+
+
+def _line(axes: Axes, rows: slice, y: Array, colour: str = INK, name: str | None = None) -> None:
+    """A curve over row numbers, thinned to what can be seen by the extremes of each bin."""
+    x = np.arange(rows.start, rows.start + len(y))
+    if len(y) > POINTS:
+        width = -(-len(y) // (POINTS // 2))
+        whole = len(y) // width * width
+        bins = y[:whole].reshape(-1, width)
+        y = np.stack([bins.min(axis=1), bins.max(axis=1)], axis=1).ravel()
+        x = np.repeat(x[:whole:width], 2)
+    axes.plot(x, y, color=colour, label=name, linewidth=0.9)
+
+
+def _steps(axes: Axes, log: Log, rows: slice, j: int) -> None:
+    _line(axes, rows, np.diff(log.t[rows], prepend=np.nan))
+
+
+def _position(axes: Axes, log: Log, rows: slice, j: int) -> None:
+    _line(axes, rows, log.q[rows, j])
+
+
+def _acceleration(axes: Axes, log: Log, rows: slice, j: int) -> None:
+    middle = (rows.start + rows.stop) // 2
+    few = slice(max(rows.start, middle - LEAST_ROWS // 2), min(rows.stop, middle + LEAST_ROWS // 2))
+    _line(axes, few, log.qdd[few, j])
+
+
+def _rates(axes: Axes, log: Log, rows: slice, j: int) -> None:
+    with np.errstate(all="ignore"):
+        _line(
+            axes, rows, np.gradient(log.q[rows, j]) / np.gradient(log.t[rows]), OTHER, "rate of change of q"
+        )
+    _line(axes, rows, log.qd[rows, j], COLOURS["error"], "qd")
+    axes.legend(loc="upper right", ncols=2)
+
+
+def _torque(system: ConstrainedSystem, log: Log, rows: slice) -> Paint:
+    """Logged torque beside the one that the robot file needs for the motion."""
+    q, qd, qdd = (torch.from_numpy(np.ascontiguousarray(x[rows])) for x in (log.q, log.qd, log.qdd))
+    robot = system.robot.to("cpu", torch.float64)
+    with torch.no_grad():
+        needed = (dynamics.inverse_dynamics(robot, q, qd, qdd) - dynamics.damping_force(robot, qd)).numpy()
+
+    def paint(axes: Axes, log: Log, rows: slice, j: int) -> None:
+        _line(axes, rows, needed[:, j], OTHER, "robot file")
+        _line(axes, rows, log.tau[rows, j], COLOURS["error"], "logged")
+        axes.legend(loc="upper right", ncols=2)
+
+    return paint
+
+
+def _contact(finding: Finding, system: ConstrainedSystem, log: Log, rows: slice) -> Picture:
+    """Distance of the tip from the surface, with the label."""
+    contact = system.contact(finding.contact or "")
+    c = tip_path(system, contact, log).c if isinstance(contact, SurfaceContact) else np.full(len(log), np.nan)
+
+    def fill(figure: Figure) -> None:
+        axes = figure.subplots()
+        _shade(axes, finding, rows, len(log))
+        _line(axes, rows, 1e3 * c[rows], INK, "distance")
+        if contact.name in log.contact:
+            closed = np.where(log.contact[contact.name][rows], 1e3 * c[rows], np.nan)
+            _line(axes, rows, closed, COLOURS["warning"], "labelled closed")
+        axes.axhline(0.0, color=OTHER, linewidth=0.6)
+        axes.set_ylabel("distance [mm]")
+        axes.set_xlabel("row")
+        axes.legend(loc="upper right", ncols=2)
+
+    return draw(fill, (SIZE[0], 2.4), f"Distance of the tip from {contact.name}: {finding.message}")
 
 
 @dataclass(frozen=True)

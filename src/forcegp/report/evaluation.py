@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from forcegp.evaluation import Evaluation
 from forcegp.evaluation.scores import JointErrors
 from forcegp.files import write_text
-from forcegp.report.html import Block, render
+from forcegp.report.html import Block, Table, cell, render
 from forcegp.report.style import INK, Picture, colour, draw, label
-from forcegp.report.tables import Table, cell
 from forcegp.report.window import WindowData, draw_errors, draw_predictions
 
 PAGE, WINDOW = "evaluation.html", "window.json"

@@ -1,12 +1,97 @@
-"""Pages as single HTML files: templates, style and plots in one file that fetches nothing."""
+"""Pages as single HTML files: templates, style and plots in one file that fetches nothing.
+
+Tables as rows of text, for pages and for Markdown.
+
+Numbers in result files: rounded series, and parts of a file that reject unknown fields.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jinja2
+import torch
+from pydantic import BaseModel, ConfigDict
+from torch import Tensor
 
 from forcegp.report.style import Picture
+
+Series = list[float]
+DIGITS = 7
+"""Significant digits kept in series that are only drawn."""
+
+
+class Part(BaseModel):
+    """A part of a result file: frozen, no unknown field, no NaN."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def series(values: Tensor) -> Series:
+    """A tensor `(n,)` as numbers for a file, rounded to what a plot can show."""
+    return [float(f"{value:.{DIGITS}g}") for value in values.detach().cpu().tolist()]
+
+
+def columns(values: Tensor) -> list[Series]:
+    """A tensor `(n, d)` as d series."""
+    return [series(column) for column in values.unbind(-1)]
+
+
+def matrix(values: Tensor) -> list[Series]:
+    """A tensor `(n, d)` as n rows."""
+    return [series(row) for row in values.unbind(0)]
+
+
+def as_tensor(values: Series | list[Series]) -> Tensor:
+    """Series `(n,)` or `(d, n)` as a tensor."""
+    return torch.tensor(values, dtype=torch.float64)
+
+
+NONE = "–"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table as text.
+
+    Attributes:
+        caption: what it contains, with units.
+        head: names of the columns; the first column names the rows.
+        rows: the cells of each row.
+        bad: `(row, column)` of cells to print in red.
+    """
+
+    caption: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    bad: frozenset[tuple[int, int]] = frozenset()
+
+    def markdown(self) -> str:
+        """The table with its caption as Markdown."""
+
+        def line(cells: tuple[str, ...]) -> str:
+            return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+        rule = "|" + "---|" * len(self.head)
+        return "\n".join([f"{self.caption}:", "", line(self.head), rule, *map(line, self.rows)])
+
+
+def number(values: Sequence[float | int | None], digits: int = 3) -> str:
+    """The mean of values over seeds, with half their range if there are several."""
+    known = [float(v) for v in values if v is not None]
+    if not known:
+        return NONE
+    mean = sum(known) / len(known)
+    plain = 1e-3 <= abs(mean) < 1e4 or mean == 0.0
+    text = f"{mean:.{digits}f}" if plain else f"{mean:.1e}"
+    spread = (max(known) - min(known)) / 2.0
+    return text if len(known) == 1 or not plain or mean == 0.0 else f"{text} ± {spread:.{digits}f}"
+
+
+def cell(value: object, digits: int = 4) -> str:
+    """One value as text: floats with significant digits, a dash for nothing."""
+    return f"{value:.{digits}g}" if isinstance(value, float) else NONE if value is None else str(value)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp import kinematics
 from forcegp.files import Header
-from forcegp.report.values import Part, Series, series
+from forcegp.report.html import Part, Series, series
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.rollout.comparison import HORIZONS, LEVEL, Comparison
 

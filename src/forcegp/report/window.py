@@ -13,8 +13,8 @@ from forcegp.data import Dataset
 from forcegp.files import Header
 from forcegp.models.base import Predictor
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.report.html import Series, as_tensor, columns, series
 from forcegp.report.style import INK, Picture, colour, draw, label
-from forcegp.report.values import Series, as_tensor, columns, series
 
 WIDTH, ROW, MARGIN = 4.1, 0.92, 0.55
 """Size of a plot with one row per joint [inch]."""

@@ -34,10 +34,9 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, NumericalError
 from forcegp.forces.dry_friction import DryFriction, ForceField, split
-from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.posterior import ForcePosterior, ForceSamples
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import States
-from forcegp.forces.samples import ForceSamples
 from forcegp.rollout.inputs import Inputs, Reached
 
 REGULARIZATION = 1e-10

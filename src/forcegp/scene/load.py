@@ -13,8 +13,7 @@ from forcegp.errors import SceneError, did_you_mean
 from forcegp.robot import RobotModel, load_robot
 from forcegp.robot.load import BUNDLED as BUNDLED_ROBOTS
 from forcegp.scene.document import Document
-from forcegp.scene.model_section import ModelFile, ModelSection
-from forcegp.scene.sections import SceneSections
+from forcegp.scene.sections import ModelFile, ModelSection, SceneSections
 from forcegp.simulate.config import SimulationConfig
 
 BUNDLED = (

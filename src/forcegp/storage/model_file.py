@@ -3,18 +3,22 @@
 The hash is the SHA-256 of the file with 64 zeros in the place of the hash, so that no bit of header or
 tensors changes unnoticed. The file is put in its place by one `os.replace`: a reader sees the old model or
 the new one.
+
+What every tensor in a saved model must be, checked once, when the file is read.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import safetensors
 import safetensors.torch
+import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 from torch import Tensor
 
@@ -22,10 +26,49 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.destination import check_destination
 from forcegp.errors import ModelError
 from forcegp.files import Header, atomic_file
-from forcegp.limits import HEADER_BYTES, MODEL_BYTES
+from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
 from forcegp.resources import announce_memory
-from forcegp.storage.system import PREFIX, pack_system
-from forcegp.storage.validate import check_tensors
+from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
+
+TYPES = (torch.float64, torch.float32, torch.int64, torch.bool)
+"""Types of tensors that a model holds."""
+
+_MAY_BE_INFINITE = re.compile(rf"(system|start)\.({'|'.join(MAY_BE_INFINITE)})")
+_POSITIVE = re.compile(r"(data\.\d+|training)\.noise_std|std\.[^.]+|scale\..+\.std\.[^.]+")
+"""Standard deviations: of the noise, and those that inputs are divided by."""
+
+
+def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
+    """Check the number, types and values of tensors that were read.
+
+    Only joint limits may be infinite, nothing may be NaN, and standard deviations are positive. Which
+    tensors a model has, and their shapes, its loader checks.
+
+    Args:
+        tensors: by name.
+        source: name of the file, for messages.
+
+    Raises:
+        ModelError: a tensor is of another type, not finite, or not positive where it must be.
+    """
+    if len(tensors) > TENSORS:
+        raise ModelError(f"{source}: too many tensors", expected=f"at most {TENSORS}", got=len(tensors))
+    for name, value in tensors.items():
+        if value.dtype not in TYPES:
+            raise ModelError(
+                f"{source}: tensor {name!r} has a type that no model has",
+                expected=", ".join(str(dtype) for dtype in TYPES),
+                got=value.dtype,
+            )
+        infinite = _MAY_BE_INFINITE.fullmatch(name) is not None
+        if bool(value.isnan().any()) or not (infinite or bool(torch.isfinite(value).all())):
+            raise ModelError(f"{source}: tensor {name!r} holds values that are not finite")
+        if _POSITIVE.fullmatch(name) and not bool((value > 0.0).all()):
+            raise ModelError(
+                f"{source}: tensor {name!r} holds a standard deviation that is not positive",
+                got=value.min().item(),
+            )
+
 
 SUFFIX = ".safetensors"
 HEADER, HASH = "forcegp", "sha256"

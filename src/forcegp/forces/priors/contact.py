@@ -8,6 +8,8 @@ Friction proportional to the normal force couples force and multiplier. With one
 g = Lᵀ u, the equations λ = λ_K − Lᵀ Q_z and Q_z = μ λ u have the solution λ = λ_K / (1 + μ g), where λ_K is
 the multiplier without friction. A latent function must enter the force linearly, and μ does not: the operator
 is the secant at a given μ̂, u λ_K / (1 + μ̂ g).
+
+A prior on the part of the joint force along the constraint, which no acceleration shows.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import ContactPoint, SurfaceContact
 from forcegp.errors import ModelError
-from forcegp.forces.priors.base import CONTACT, ForcePrior, check_inputs
+from forcegp.forces.priors.base import CONSTRAINT, CONTACT, ForcePrior, check_inputs
+from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
@@ -254,3 +257,41 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         about = (at.eom.contact_points[self.contact].unit_normal[..., None, :] @ angular)[..., 0, :]
         rate = (about * at.qd).sum(-1, keepdim=True)
         return -about * rate / (rate.square() + self.torsion_smoothing**2).sqrt()
+
+
+@dataclass(frozen=True)
+class NormalForcePrior(ForcePrior):
+    """What accelerations in contact never show: a joint force along the constraint, E = Aᵀ Lᵀ = I − P.
+
+    H Aᵀ = 0, so a force Aᵀ g(x) changes the multiplier by −g(x) and no acceleration. A joint force prior
+    alone is overconfident along the normal. This independent process, with the hyperparameters of the joint
+    force prior, keeps the uncertainty of that part until a force sensor or the like reduces it.
+
+    Args:
+        like: the joint force prior whose kernel, inputs and hyperparameters it shares.
+
+    Example:
+        >>> from forcegp import JointForcePrior
+        >>> NormalForcePrior(JointForcePrior()).target
+        'constraint'
+    """
+
+    like: JointForcePrior = field(default_factory=JointForcePrior)
+    target: str = CONSTRAINT
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", f"{self.like.name}_normal")
+        object.__setattr__(self, "kernel", self.like.kernel)
+
+    @property
+    def prefix(self) -> str:
+        return self.like.name
+
+    def outputs(self, robot: RobotModel) -> int:
+        return self.like.outputs(robot)
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return self.like.features(system, at)
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        return at.eom.A.mT @ at.eom.L.mT

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
-from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, mean_of
-from forcegp.forces.priors.joint_friction import JointFrictionPrior
-from forcegp.forces.priors.normal_force import NormalForcePrior
+from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, JointFrictionPrior, mean_of
 from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
 
 PAPER = SquaredExponential()

@@ -1,7 +1,29 @@
-"""What is known of the joint force Q before data: its mean from the robot file, and one process per joint."""
+"""What is known of the joint force Q before data: its mean from the robot file, and one process per joint.
+
+A prior on the friction of each joint, a function of its own velocity, and on the offset of its torque
+sensor.
+
+Friction that no robot file declares is the rule: viscous, Coulomb, a transition between the two (Stribeck),
+and a part that grows with the load on the bearing. Each joint reads only its own velocity, so the prior
+extrapolates to
+motions in which other joints do something new, and it never reads τ: in a closed loop the likeliest force
+would be the one that cancels the noise of the torque sensor.
+
+A prior on torques that are correlated in time and no function of the state.
+
+Temperature, hysteresis and filters leave residuals that last for a while and are another time different. A
+function of the state would take them for signal, white noise for more evidence than there is.
+
+A prior on joint forces that are correlated with each other.
+
+One cause moves several joints: a cable, a payload, a contact that the scene does not have. Independent
+processes must learn such a force once per joint.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,9 +33,10 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import damping_force
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.priors.base import JOINT, ForcePrior, check_inputs
+from forcegp.forces.priors.base import JOINT, MIXING, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
-from forcegp.gp.kernels import Kernel, SquaredExponential
+from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
+from forcegp.gp.ornstein_uhlenbeck import SEGMENT, TIME, OrnsteinUhlenbeck
 from forcegp.robot.model import RobotModel
 
 TERMS = ("bias", "gravity", "friction", "actuation")
@@ -117,3 +140,172 @@ class JointForcePrior(PerJointPrior):
             angle = x["q"][:, turns]
             x["q"] = torch.cat([torch.sin(angle), torch.cos(angle), x["q"][:, ~turns]], dim=-1)
         return x
+
+
+SPEEDS = (0.02, 0.1, 0.5)
+"""Velocities at which the Coulomb features saturate [rad/s, m/s]: a sharp step, and two slower
+transitions."""
+OFFSET = 0.3
+"""Where the standard deviation of an offset starts, as a fraction of that of a friction weight."""
+
+
+@dataclass(frozen=True)
+class JointFrictionPrior(PerJointPrior):
+    """Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)).
+
+    The weights w_i and the offset c_i are Gaussian and marginalised. Three things are learned: how large the
+    friction of each joint is, which features matter, and how large offsets are beside friction; the last two
+    are the same for all joints. A joint that moved in one direction only does not tell its offset from its
+    friction, but the other joints show which is likely. With a standard deviation for each weight alone,
+    learning takes most of them for zero, and the joint is overconfident where it does something new. A kernel
+    with a smooth part, such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))`, adds a
+    smooth remainder.
+
+    Args:
+        kernel: covariance of each component; linear in the features by default.
+        speeds: v_1, v_2, … [rad/s, m/s].
+        load: whether friction proportional to the load |Q_G,i| is a feature.
+        name: prefix of the hyperparameters.
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> prior = JointFrictionPrior()
+        >>> prior.outputs(robot), prior.target
+        (2, 'joint')
+
+    Raises:
+        ModelError: a speed is not positive and finite.
+    """
+
+    kernel: Kernel = field(default_factory=lambda: Linear(shared=True, offset=OFFSET))
+    speeds: tuple[float, ...] = SPEEDS
+    load: bool = True
+    name: str = "joint_friction"
+    target: str = JOINT
+
+    centred = False
+    sticks = True
+
+    def __post_init__(self) -> None:
+        if not self.speeds or not all(0.0 < v < float("inf") for v in self.speeds):
+            raise ModelError(
+                f"force prior {self.name!r} has an invalid speed",
+                expected="positive finite speeds [rad/s]",
+                got=self.speeds,
+            )
+
+    @property
+    def sharpest(self) -> int:
+        """Which Coulomb feature is the dry friction of a joint that may stick."""
+        return self.speeds.index(min(self.speeds))
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        v = at.qd[..., None]
+        columns = {"velocity": v}
+        columns |= {f"coulomb_{i}": torch.tanh(v / speed) for i, speed in enumerate(self.speeds)}
+        if at.slip is not None:
+            columns[f"coulomb_{self.sharpest}"] = at.slip[..., None]
+        if self.load:
+            columns["load"] = at.eom.Q_G.abs()[..., None] * columns["coulomb_0"]
+        return columns
+
+
+NEW_MOTION = -1.0
+"""Number of the trajectory of states that are not of the training log."""
+
+
+@dataclass(frozen=True)
+class DisturbancePrior(PerJointPrior):
+    """Q_i = d_i(t), an Ornstein–Uhlenbeck process of each joint, independent from one trajectory to the next.
+
+    Its standard deviation σ_i and correlation time T_i are learned. A new motion tells nothing of it, so it
+    adds σ_i² to the variance of the joint force there, and zero to the mean. Inference is exact: sums over
+    samples, as in sparse inference, take samples to be independent.
+
+    Args:
+        kernel: covariance over time.
+        name: prefix of the hyperparameters.
+
+    Example:
+        >>> import forcegp
+        >>> DisturbancePrior().outputs(forcegp.load_robot("kuka_iiwa"))
+        7
+    """
+
+    kernel: Kernel = field(default_factory=OrnsteinUhlenbeck)
+    name: str = "disturbance"
+    target: str = JOINT
+
+    scaled = False
+    in_time = True
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        if at.time is None:
+            return {TIME: torch.zeros_like(at.q[:, :1]), SEGMENT: torch.full_like(at.q[:, :1], NEW_MOTION)}
+        return {TIME: at.time[:, :1], SEGMENT: at.time[:, 1:]}
+
+
+@dataclass(frozen=True)
+class CoregionalPrior(ForcePrior):
+    """Q_i = Σ_r W_ir g_r(x) + h_i(x): covariance k(x, x′) (W Wᵀ + diag κ) between the joints.
+
+    The causes g_r and the remainders h_i are independent processes with the same length-scales, W has a
+    column for each cause, and κ is the variance of the remainders (the intrinsic coregionalisation model;
+    Álvarez, Rosasco and Lawrence, *Kernels for vector-valued functions*, 2012, section 4.2). All are learned;
+    the length of a column of W is the standard deviation of its cause. With a kernel whose length-scales are
+    not shared every process has its own (the linear model of coregionalisation).
+
+    Args:
+        kernel: covariance of each process.
+        causes: number of columns of W.
+        inputs: which of `q`, `qd`, `tau` the force depends on.
+        name: prefix of the hyperparameters.
+
+    Example:
+        >>> import forcegp
+        >>> CoregionalPrior(causes=2).outputs(forcegp.load_robot("kuka_iiwa"))
+        9
+
+    Raises:
+        ModelError: there is no cause.
+        UnknownNameError: an input is not one of the three.
+    """
+
+    kernel: Kernel = field(default_factory=lambda: SquaredExponential(shared=True))
+    causes: int = 1
+    inputs: tuple[str, ...] = ("q", "qd")
+    name: str = "coregional"
+    target: str = JOINT
+    _mixing: Tensor | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        check_inputs(self.name, self.inputs, ("q", "qd", "tau"))
+        if self.causes < 1:
+            raise ModelError("a coregionalised force needs a cause", expected="1 or more", got=self.causes)
+
+    def outputs(self, robot: RobotModel) -> int:
+        return self.causes + robot.nq
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return {name: getattr(at, name) for name in self.inputs}
+
+    def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
+        """Columns of a cosine transform: the sum of all joints first."""
+        i, r = torch.arange(robot.nq) + 0.5, torch.arange(self.causes)
+        return {MIXING: torch.cos(math.pi / robot.nq * i[:, None] * r).to(robot.mass)}
+
+    def with_parameters(self, params: Mapping[str, Tensor]) -> CoregionalPrior:
+        if MIXING not in params:
+            return self
+        known = CoregionalPrior(self.kernel, self.causes, self.inputs, self.name)
+        object.__setattr__(known, "_mixing", params[MIXING])
+        return known
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        robot = system.robot
+        W = self.initial_parameters(robot)[MIXING] if self._mixing is None else self._mixing
+        # Unit columns: their length is the standard deviation of the cause.
+        columns = W / W.norm(dim=0).clamp(min=1e-12)
+        eye = torch.eye(robot.nq, dtype=at.q.dtype, device=at.q.device)
+        return torch.cat([columns.to(at.q), eye], dim=-1).expand(len(at.q), -1, -1)
