@@ -85,16 +85,16 @@ def unfitted(system: ConstrainedSystem, noise_std: float) -> StructuredGP:
 
 def fit_ways(
     system: ConstrainedSystem, contact: Dataset, free: Dataset, noise_std: float
-) -> dict[str, StructuredGP]:
+) -> dict[str, StructuredFit]:
     """The three ways of learning, by name, from training data in contact and in free motion."""
-    ways = {way: unfitted(system, noise_std) for way in ("contact", "two_stages", "both")}
-    both = [Observation(free), Observation(contact)]
-    joint, friction = (prior.name for prior in ways["both"].force_priors)
-    ways["contact"].fit(contact)
-    ways["two_stages"].fit([Observation(free)], learn=[joint])
-    ways["two_stages"].fit(both, learn=[friction])
-    ways["both"].fit(both)
-    return ways
+    model, both = unfitted(system, noise_std), [Observation(free), Observation(contact)]
+    joint, friction = (prior.name for prior in model.force_priors)
+    first = model.fit([Observation(free)], learn=[joint])
+    return {
+        "contact": model.fit(contact),
+        "two_stages": model.fit(both, learn=[friction], after=first),
+        "both": model.fit(both),
+    }
 
 
 @torch.no_grad()

@@ -62,6 +62,15 @@ def test_a_loaded_model_goes_on_learning_analytical_parameters(tmp_path: Path) -
     assert not torch.equal(again.system.robot.mass, mass)
 
 
+@pytest.mark.parametrize("learn", [[], ["joint"]])
+def test_a_later_stage_has_the_noise_of_its_own_model(learn: list[str]) -> None:
+    first = model().fit(data, learn=[])
+    noisier = forcegp.StructuredGP(two_contacts(), "analytical", first.force_priors, noise=0.5)
+    second = noisier.fit(data, learn=learn, after=first, options=SHORT)
+    assert float(second.training.noise_std[0].min()) == 0.5
+    assert float(first.training.noise_std[0].max()) == 0.1
+
+
 def test_a_fit_stays_as_it_is() -> None:
     """A fitted object does not change when the model is fitted again."""
     one = model()
@@ -107,8 +116,8 @@ def test_the_correlation_does_not_depend_on_the_order_of_observations() -> None:
 def test_an_undetermined_multiplier_is_a_warning() -> None:
     """Free joint forces of any size along the normal leave the multiplier open."""
     closed = data[data.active(two_contacts().contact_names)[:, 0].nonzero()[:, 0]]
-    wide = {"joint.log_std": torch.full((7,), 12.0, dtype=torch.float64)}
-    one = forcegp.StructuredGP(two_contacts(), "analytical", [JointForcePrior()], noise=0.1)
+    wide = {"joint.log_std": torch.full((7,), 8.0, dtype=torch.float64)}
+    one = forcegp.StructuredGP(two_contacts(), "analytical", [JointForcePrior()], noise=1.0)
     quiet = one.fit(closed, learn=[])
     assert not any("multiplier" in warning for warning in quiet.result.warnings)
     loud = quiet.condition(closed, {**quiet.hyperparameters, **wide})

@@ -163,7 +163,7 @@ class StructuredGP(Model[StructuredFit]):
         spec = spec.for_data(known)
         chosen = None if learn is None else chosen_of(spec, learn)
         if chosen == () and after is not None and sample is None:
-            return after.condition(known)
+            return dataclasses.replace(after, specification=spec).condition(known)
         given = given_to(spec, None if after is None else after.problem, known, chosen)
         spec, training = given.specification, given.training
         file = None if checkpoint is None else Path(checkpoint)
@@ -187,18 +187,21 @@ class StructuredGP(Model[StructuredFit]):
         return conditioned(spec, lesson.problem, values, lesson.learned, doubts, lesson.learned_on, forces)
 
     def _continued(self, after: StructuredFit) -> Specification:
-        """What an earlier fit of this model was fitted with: priors that were left to its data are filled in.
+        """This model with the priors of an earlier fit, which those that were left to its data belong to.
 
         Raises:
             ModelError: the fit is of a model with other priors or contacts.
         """
-        spec = after.specification
+        spec = self.specification
         own = () if self.specification.automatic else tuple(prior.name for prior in self.force_priors)
-        names = tuple(prior.name for prior in spec.priors)
-        if names[: len(own)] != own or spec.system.contact_names != self.system.contact_names:
+        names = tuple(prior.name for prior in after.force_priors)
+        contacts = after.system.contact_names
+        if names[: len(own)] != own or contacts != self.system.contact_names:
             raise ModelError(
                 "`after` is a fit of another model",
                 expected=f"priors {', '.join(own)} and contacts {', '.join(self.system.contact_names)}",
-                got=f"priors {', '.join(names)} and contacts {', '.join(spec.system.contact_names)}",
+                got=f"priors {', '.join(names)} and contacts {', '.join(contacts)}",
             )
-        return spec
+        if spec.automatic:
+            return after.specification
+        return dataclasses.replace(spec, priors=after.specification.priors)
