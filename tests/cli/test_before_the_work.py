@@ -98,10 +98,10 @@ def test_both_parts_of_a_selection_are_not_one_file(made: Path, tmp_path: Path) 
         run("select", made / "run.parquet", "-n", 5, "-o", out, "--rest", tmp_path / "." / "part.parquet")
 
 
-def test_a_checkpoint_inside_the_models_folder_is_refused(made: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_in_the_place_of_the_model_is_refused(made: Path, tmp_path: Path) -> None:
     fit = arguments("fit", made, tmp_path / "model")
-    with pytest.raises(DestinationError, match="would lie in the folder of the model"):
-        run(*fit, "--checkpoint", tmp_path / "model" / "fit.ckpt")
+    with pytest.raises(DestinationError, match="would be overwritten"):
+        run(*fit, "--checkpoint", tmp_path / "model.safetensors")
 
 
 @pytest.mark.parametrize("command", ["simulate", "select", "select --rest", "predict"])

@@ -95,7 +95,7 @@ def test_the_paper_s_own_models_make_a_page(tmp_path: Path) -> None:
     assert made.results.exact
     text = made.page.read_text(encoding="utf-8")
     assert "its kernel alone on inputs in their units" in text and "state where learning starts" in text
-    model = load_model(next(tmp_path.glob("stages/fit/**/sgp-zero-20/model")))
+    model = load_model(next(tmp_path.glob("stages/fit/**/sgp-zero-20/model.safetensors")))
     assert isinstance(model, StructuredFit)
     assert model.hyperparameters["joint.log_lengthscale"].numel() == 147
 

@@ -77,7 +77,7 @@ def test_the_view_shows_the_first_held_out_stretch(
         written[path.name] = shown
 
     monkeypatch.setattr(study, "write_view", write)
-    monkeypatch.setattr(study, "load_model", lambda _: forcegp.AnalyticalModel(system))
+    monkeypatch.setattr(study, "load_model", lambda _: forcegp.AnalyticalModel(system).nominal())
     monkeypatch.setattr(study.Task, "read", lambda *_: task)
     study.make_view(tmp_path, tmp_path, tmp_path, tmp_path)
     shown = written["view.html"]
