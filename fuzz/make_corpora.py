@@ -69,7 +69,7 @@ def models() -> None:
             file = model_path(Path(parent) / "model")
             fit.save(file)
             with safetensors.safe_open(file, "pt") as opened:
-                header = opened.metadata()[HEADER].encode()
+                header = opened.metadata()[HEADER].partition("\n")[2].encode()
             tensors = safetensors.torch.save(safetensors.torch.load_file(file))
         keep("model", name, len(header).to_bytes(4, "little") + header + tensors)
 

@@ -15,7 +15,7 @@ import forcegp
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
-from forcegp.storage.model_file import HASH, HEADER, NO_HASH, SUFFIX
+from forcegp.storage.model_file import HEADER, NO_HASH, SUFFIX
 
 CORPORA = Path(__file__).parent / "corpora"
 
@@ -65,11 +65,11 @@ def model_of(data: bytes, folder: Path) -> None:
     start = int.from_bytes(tensors[:8], "little")
     try:
         table = json.loads(tensors[8 : 8 + start])
-        table["__metadata__"] = {HEADER: header.decode("utf-8", "replace"), HASH: NO_HASH}
+        table["__metadata__"] = {HEADER: f"{NO_HASH}\n" + header.decode("utf-8", "replace")}
         text = json.dumps(table, separators=(",", ":")).encode()
         content = len(text).to_bytes(8, "little") + text + tensors[8 + start :]
         digest = hashlib.sha256(content).hexdigest()
-        content = content.replace(f'"{HASH}":"{NO_HASH}"'.encode(), f'"{HASH}":"{digest}"'.encode(), 1)
+        content = content.replace(f'"{HEADER}":"{NO_HASH}'.encode(), f'"{HEADER}":"{digest}'.encode(), 1)
     except (ValueError, TypeError, RecursionError):
         content = tensors
     file = folder / f"model{SUFFIX}"

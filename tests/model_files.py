@@ -12,7 +12,7 @@ import safetensors
 import safetensors.torch
 from torch import Tensor
 
-from forcegp.storage.model_file import HASH, HEADER, NO_HASH, model_path
+from forcegp.storage.model_file import HEADER, NO_HASH, model_path
 
 Change = Callable[[dict, dict[str, Tensor]], object]
 
@@ -20,7 +20,7 @@ Change = Callable[[dict, dict[str, Tensor]], object]
 def header_of(source: Path) -> dict:
     """The header of a saved model."""
     with safetensors.safe_open(model_path(source), "pt") as file:
-        return json.loads(file.metadata()[HEADER])
+        return json.loads(file.metadata()[HEADER].partition("\n")[2])
 
 
 def rewritten(source: Path, target: Path, change: Change) -> Path:
@@ -31,9 +31,8 @@ def rewritten(source: Path, target: Path, change: Change) -> Path:
     sys.setrecursionlimit(50_000)
     text = json.dumps(header)
     sys.setrecursionlimit(limit)
-    content = safetensors.torch.save(tensors, {HEADER: text, HASH: NO_HASH})
-    entry = f'"{HASH}":"%s"'
+    content = safetensors.torch.save(tensors, {HEADER: f"{NO_HASH}\n{text}"})
     digest = hashlib.sha256(content).hexdigest()
-    content = content.replace((entry % NO_HASH).encode(), (entry % digest).encode(), 1)
+    content = content.replace(f'"{HEADER}":"{NO_HASH}'.encode(), f'"{HEADER}":"{digest}'.encode(), 1)
     model_path(target).write_bytes(content)
     return model_path(target)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import threading
@@ -16,7 +17,7 @@ import torch
 import forcegp
 from forcegp.errors import DestinationError, ForceGPError, ModelError
 from forcegp.storage import model_file as module
-from forcegp.storage.model_file import check_model_destination, model_path
+from forcegp.storage.model_file import HEADER, check_model_destination, model_path
 from model_files import header_of, rewritten
 from random_data import random_data, table_system
 
@@ -174,6 +175,14 @@ def test_every_flipped_bit_is_noticed(saved: dict[str, Path], tmp_path: Path) ->
         content[at] ^= 1 << (at % 8)
     damaged.write_bytes(content)
     forcegp.load_model(damaged)
+
+
+@pytest.mark.parametrize("stated", ["", "0" * 64, "\ud800" * 64, '"' * 64])
+def test_a_hash_that_is_none_is_refused(stated: str, tmp_path: Path) -> None:
+    text = json.dumps({"__metadata__": {HEADER: f"{stated}\n{{}}"}}).encode()
+    (tmp_path / "model.safetensors").write_bytes(len(text).to_bytes(8, "little") + text)
+    with pytest.raises(ModelError, match="damaged or truncated"):
+        forcegp.load_model(tmp_path / "model")
 
 
 def test_a_reader_beside_a_writer_sees_the_old_model_or_the_new_one(

@@ -71,8 +71,8 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
 
 
 SUFFIX = ".safetensors"
-HEADER, HASH = "forcegp", "sha256"
-"""Keys of the file's metadata."""
+HEADER = "forcegp"
+"""Key of the file's metadata: the hash, then the header in JSON."""
 NO_HASH = "0" * 64
 COPIES = 3
 """A model is in memory as the bytes of its file, and as tensors before and after they are aligned."""
@@ -124,7 +124,7 @@ def model_bytes(
     record, robot = pack_system(system)
     own = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
     header = ModelHeader(kind=kind, settings=settings.model_dump(mode="json"), system=record)
-    data = safetensors.torch.save(own | robot, {HEADER: header.to_json(), HASH: NO_HASH})
+    data = safetensors.torch.save(own | robot, {HEADER: f"{NO_HASH}\n{header.to_json()}"})
     return data.replace(_entry(NO_HASH), _entry(hashlib.sha256(data).hexdigest()), 1)
 
 
@@ -166,16 +166,16 @@ def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor
     Raises:
         ModelError: it is damaged, or not a model.
     """
-    metadata = _metadata(data, source)
-    digest = _digest(data, metadata.get(HASH, ""))
-    if digest != metadata.get(HASH):
+    stated, _, text = _metadata(data, source).partition("\n")
+    digest = _digest(data, stated)
+    if digest != stated:
         raise ModelError(
             f"{source}: the file is damaged or truncated",
-            expected=f"SHA-256 {metadata.get(HASH, 'in its header')[:12]}…",
+            expected=f"SHA-256 {stated[:12]!a}…",
             got=f"{digest[:12]}…",
             hint="copy the file again from where it was written",
         )
-    header = ModelHeader.from_json(metadata.get(HEADER, ""), source, ModelError)
+    header = ModelHeader.from_json(text, source, ModelError)
     try:
         tensors = safetensors.torch.load(data)
     except (safetensors.SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as cause:
@@ -185,14 +185,14 @@ def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor
     return header, {name: value.clone() for name, value in tensors.items()}
 
 
-def _metadata(data: bytes, source: str) -> dict[str, str]:
-    """The metadata in the header of a safetensors file."""
+def _metadata(data: bytes, source: str) -> str:
+    """Hash and header of a model in the metadata of a safetensors file."""
     size = int.from_bytes(data[:8], "little")
     try:
         if not 0 < size <= min(len(data) - 8, HEADER_BYTES):
             raise ValueError(f"header of {size} bytes in a file of {len(data)}")
-        found = json.loads(data[8 : 8 + size])["__metadata__"]
-        if not isinstance(found, dict) or not all(isinstance(x, str) for x in found.values()):
+        found = json.loads(data[8 : 8 + size])["__metadata__"][HEADER]
+        if not isinstance(found, str):
             raise ValueError("the metadata are not text")
     except (ValueError, KeyError, TypeError, RecursionError) as cause:
         raise ModelError(
@@ -203,8 +203,9 @@ def _metadata(data: bytes, source: str) -> dict[str, str]:
 
 def _digest(data: bytes, stated: str) -> str:
     """SHA-256 of the file with zeros in the place of the stated hash."""
-    start = data.find(_entry(stated), 0, 8 + int.from_bytes(data[:8], "little"))
-    if start < 0 or len(stated) != len(NO_HASH):
+    is_hash = len(stated) == len(NO_HASH) and stated.isascii()
+    start = data.find(_entry(stated), 0, 8 + int.from_bytes(data[:8], "little")) if is_hash else -1
+    if start < 0:
         return hashlib.sha256(data).hexdigest()
     digest = hashlib.sha256(memoryview(data)[:start])
     digest.update(_entry(NO_HASH))
@@ -214,7 +215,7 @@ def _digest(data: bytes, stated: str) -> str:
 
 def _entry(digest: str) -> bytes:
     """The hash in the header; within the text of another entry its quotes would be escaped."""
-    return f'"{HASH}":"{digest}"'.encode()
+    return f'"{HEADER}":"{digest}'.encode()
 
 
 def _content(file: Path, most: int) -> bytes:
