@@ -160,6 +160,7 @@ def test_a_structured_gp_with_learned_noise_is_held_against_that() -> None:
     assert max(found.noise_std or ()) < 0.29
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_wrong_use_is_refused() -> None:
     with pytest.raises(DataError, match="nothing to evaluate on"):
         evaluate(forcegp.AnalyticalModel(system).nominal(), data[:0])
