@@ -57,15 +57,17 @@ def drawn(chance: random.Random) -> dict[str, Any]:
         "special": chance.choices(("", "outlier", "clean"), (8, 1, 1))[0],
         "options": {},
     }
-    structured = case["model"] != "gp"
+    structured, noise = case["model"] != "gp", {}
     if chance.random() < 0.3:
-        case["options"]["noise_std"] = 10.0 ** chance.uniform(-4.0, 0.5)
+        noise["acceleration"] = 10.0 ** chance.uniform(-4.0, 0.5)
     if structured and chance.random() < 0.2:
-        case["options"]["learn_noise"] = True
+        noise["learn"] = True
     if structured and chance.random() < 0.2:
         case["options"]["inference"] = "sparse"
     if structured and chance.random() < 0.1:
-        case["options"]["degrees_of_freedom"] = 4.0
+        noise["degrees_of_freedom"] = 4.0
+    if noise:
+        case["options"]["noise"] = noise
     return case
 
 
@@ -84,7 +86,8 @@ def run(case: dict[str, Any]) -> dict[str, Any]:
         train = dataclasses.replace(train, qdd=train.extras["qdd_clean"])
     result: dict[str, Any] = {**case, "error": None}
     try:
-        fit = create(case["model"], system, **case["options"]).fit(train)
+        options = {**case["options"], "noise": forcegp.Noise(**case["options"].get("noise", {}))}
+        fit = create(case["model"], system, **options).fit(train)
         result |= {"converged": fit.result.converged, "warnings": list(fit.result.warnings)}
         result |= {"evaluations": fit.result.evaluations, "objective": fit.result.objective}
         result["not_positive"] = sum(_not_positive(fit, part) for part in (train, test))

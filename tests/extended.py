@@ -135,8 +135,8 @@ def deviation_errors(fit: StructuredFit, at: Dataset, quantity: str = "qdd") -> 
     """
     states, _ = states_at(fit.system, at.q, at.qd, at.tau, at.active(fit.system.contact_names))
     rows = fit.posterior.rows(fit.system, states, affine_maps(fit.system, states, quantity)[0])
-    data = fit.problem.rows(fit.hyperparameters).blocks
-    params = kernel_parameters(fit.hyperparameters)
+    problem, values = fit.problem.with_coulomb_errors(fit.hyperparameters)
+    data, params = problem.rows(values).blocks, kernel_parameters(values)
     prior, _, variance = posterior(fit.posterior.priors, params, data, rows)
     found = fit.posterior.latent.covariance(rows).diagonal(dim1=-2, dim2=-1).numpy()
     known = prior > 0

@@ -51,7 +51,8 @@ def test_the_force_of_a_wiping_robot_by_commands_alone(tmp_path: Path) -> None:
     run("select", log, "-n", 100, "--split", "stretches", "--out", train, "--rest", rest)
     fit = ("fit", "--scene", "ur5_wiping", "--data", train)
     run(*fit, "--config", config, "--out", tmp_path / "model")
-    run(*fit, "--model", "sgp-mean-se", "--out", tmp_path / "plain")
+    # Derivatives of exact angles have a noise of 1e-6 rad/s², which is rounding beside any joint force.
+    run(*fit, "--model", "sgp-mean-se", "--noise-std", 0.1, "--out", tmp_path / "plain")
 
     test = Dataset.read(rest)
     rows = rows_of(Dataset.read(log), truth)[torch.searchsorted(Dataset.read(log).t, test.t)]

@@ -111,7 +111,7 @@ def test_the_region_stays_where_noise_is_not_learned_again(pendulum: forcegp.Rob
     model = forcegp.StructuredGP(forcegp.ConstrainedSystem(pendulum), "analytical", noise=0.01)
     data = swing(pendulum, 200, 0.5, 0.0, 0)
     first = model.fit(data)
-    second = model.fit(data, learn=["joint_friction"])
+    second = model.fit(data, learn=["joint_friction"], after=first)
     assert torch.equal(first.hyperparameters[GROWTH], second.hyperparameters[GROWTH])
 
 

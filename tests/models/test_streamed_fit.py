@@ -18,6 +18,7 @@ from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models import structured_stream
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.storage import checkpoint
 from forcegp.storage.checkpoint import beside
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 from models.stream_worker import PIECE, model, run
@@ -33,7 +34,7 @@ data = logged(two_contacts(), 100)
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StreamedDataset:
     monkeypatch.setattr(stream, "PIECE_ROWS", PIECE)
-    monkeypatch.setattr(sums, "INTERVAL", 0.0)
+    monkeypatch.setattr(checkpoint, "INTERVAL", 0.0)
     data[:70].write(tmp_path / "a.parquet")
     data[70:].write(tmp_path / "b.parquet")
     return StreamedDataset((tmp_path / "a.parquet", tmp_path / "b.parquet"))

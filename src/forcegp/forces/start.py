@@ -25,7 +25,7 @@ from forcegp.forces.noise import initial_torque_noise
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, ForcePrior
 from forcegp.forces.projection import WhitenedRows
 from forcegp.gp.kernels import Parameters
-from forcegp.gp.optimise import Bounds, Learned, LearningOptions, Objective, Progress, minimise
+from forcegp.gp.optimise import FIRST_STEP, Bounds, Learned, LearningOptions, Objective, Progress, minimise
 from forcegp.gp.structured_covariance import Block
 
 LIMITS = {
@@ -345,7 +345,11 @@ class Search:
             progress(evaluations, value + constant, best)
 
         report = None if progress is None else whole
-        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report)
+        # Coulomb friction begins at the best of a search of its own, and a mixing matrix is no logarithm:
+        # there a first step in e-folds ends in worse optima.
+        free = problem.has_coulomb or any(_kind(key) == MIXING for key in hyper)
+        step = math.inf if free else FIRST_STEP
+        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report, step)
         history = [value + constant for value in learned.history]
         doubts = doubts_at_bounds(learned.tensors, bounds)
         return dataclasses.replace(learned, value=learned.value + constant, history=history, doubts=doubts)

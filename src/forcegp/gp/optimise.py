@@ -129,6 +129,7 @@ def minimise(
     analytical: frozenset[str] = frozenset(),
     bounds: Bounds | None = None,
     progress: Progress | None = None,
+    first_step: float = FIRST_STEP,
 ) -> Learned:
     """Minimise an objective over tensors.
 
@@ -139,14 +140,17 @@ def minimise(
         analytical: names of the analytical parameters θ_A, which have an ADAM of their own.
         bounds: box of each tensor, for L-BFGS.
         progress: called after each evaluation.
+        first_step: largest change of an entry in the first step of L-BFGS.
 
     Raises:
         NumericalError: the objective is not finite at the start.
     """
     began = time.perf_counter()
     recorder = _Recorder(objective, start, progress)
-    run = _lbfgs if options.optimizer == "lbfgs" else _adam
-    converged, message = run(recorder, start, options, analytical, bounds or {})
+    if options.optimizer == "lbfgs":
+        converged, message = _lbfgs(recorder, start, options, bounds or {}, first_step)
+    else:
+        converged, message = _adam(recorder, start, options, analytical, bounds or {})
     if not np.isfinite(recorder.value):
         raise NumericalError("the objective is not finite at the start", got=recorder.history[:1])
     seconds = time.perf_counter() - began
@@ -159,8 +163,8 @@ def _lbfgs(
     recorder: _Recorder,
     start: Mapping[str, Tensor],
     options: LearningOptions,
-    analytical: frozenset[str],
     bounds: Bounds,
+    first_step: float,
 ) -> tuple[bool, str]:
     shapes = {key: value.shape for key, value in start.items()}
     like = next(iter(start.values()))
@@ -188,7 +192,7 @@ def _lbfgs(
         return False, "not finite at the start"
     # In a box, L-BFGS-B's first step is the whole gradient, to the corners of the box where that is steep. In
     # units of √(first step ÷ gradient) the gradient is that step.
-    unit = min(1.0, math.sqrt(FIRST_STEP / max(steepest, 1e-300)))
+    unit = min(1.0, math.sqrt(first_step / max(steepest, 1e-300)))
 
     def scaled(u: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = function(np.clip(x + unit * u, low, high)) if u.any() else first
