@@ -345,8 +345,8 @@ class Search:
             progress(evaluations, value + constant, best)
 
         report = None if progress is None else whole
-        # Coulomb friction begins at the best of a search of its own, and a mixing matrix is no logarithm:
-        # there a first step in e-folds ends in worse optima.
+        # The entries of a mixing matrix are not logarithms. With Coulomb friction, either rule ends in the
+        # better optimum on some logs (benchmarks/notes/inference.md), so its first step is not limited.
         free = problem.has_coulomb or any(_kind(key) == MIXING for key in hyper)
         step = math.inf if free else FIRST_STEP
         learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report, step)
