@@ -101,7 +101,7 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
 
 @contextmanager
 def written_folder(path: str | Path) -> Iterator[Path]:
-    """A temporary folder whose files take their places in a folder when the block ends without an error.
+    """A temporary folder; its files move into the target folder when the block ends without an error.
 
     Each file replaces its namesake in one step, in the order in which they were written, so that the last one
     is there only with the others; then what else was in the folder is removed.

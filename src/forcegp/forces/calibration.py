@@ -201,7 +201,7 @@ def _torque_noise(
 
 
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Torque noise as held-out samples ask for it, the trained region, and the growth of errors beyond it."""
+    """Torque noise calibrated on held-out samples, the trained region, and the growth of errors beyond it."""
     load, training = problem.typical_load(), problem.training
     learned = hyperparameters[TORQUE_NOISE].exp().maximum(problem.hidden_torque())
     noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}

@@ -25,7 +25,7 @@ ROUNDING = 1e-12
 
 
 def require_resolved_noise(prior: Tensor) -> None:
-    """Refuse a prior beside which the noise is rounding.
+    """Refuse a prior so large that the noise is lost in rounding.
 
     Args:
         prior: variance of the prior of a row, in units of the noise variance `()`.
@@ -44,7 +44,7 @@ def require_resolved_noise(prior: Tensor) -> None:
 
 
 def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
-    """A posterior covariance `(n, d, d)`, every variance of which is resolved.
+    """Return a posterior covariance `(n, d, d)` if all of its variances are resolved.
 
     Args:
         covariance: of the rows of each sample.

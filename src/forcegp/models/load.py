@@ -74,7 +74,7 @@ def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> 
 
 
 def model_of_bytes(data: bytes) -> FittedModel:
-    """The model whose file has this content.
+    """Read a model from the content of its file.
 
     Raises:
         ModelError, UnknownNameError: see `load_model`.
