@@ -7,10 +7,10 @@ PROFILE ?= quick
 RESOLUTION ?= lowest-direct
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce test lint types package docs benchmark clean attack audit ends
+.PHONY: help setup reproduce test test-slow lint types package docs benchmark clean attack audit ends
 
 help:            ## list the targets
-	@grep -hE '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
 
 setup: $(READY)  ## make the environment in .venv
 
@@ -29,9 +29,13 @@ reproduce: $(READY)  ## the main job: simulate, select, train, report
 	$(BIN)/python -m reproduction --profile $(PROFILE) --out $(OUT)/$(PROFILE)
 	@echo "[reproduce] open $(OUT)/$(PROFILE)/report.html"
 
-test: lint types $(READY)  ## lint, types and tests
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
-	@echo "[test] all passed: lint, types and the tests summed up above"
+test: lint types $(READY)  ## lint, types and tests but for slow ones
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+	@echo "[test] all passed: lint, types and the tests summed up above; the slow ones: make test-slow"
+
+test-slow: $(READY)  ## the slow tests, which continuous integration runs too
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+	@echo "[test-slow] all passed"
 
 lint: $(READY)   ## ruff, check and format
 	$(BIN)/ruff check .

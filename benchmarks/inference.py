@@ -28,7 +28,7 @@ from torch import Tensor
 import forcegp
 from forcegp.data import split_by_stretches
 from forcegp.forces.learn import Problem, kernel_parameters
-from forcegp.forces.priors.default import PAPER, default_priors
+from forcegp.forces.priors.sets import PAPER, default_priors
 from forcegp.forces.quantities import states
 from forcegp.forces.start import initial
 from forcegp.gp.likelihood import negative_log_likelihood

@@ -30,7 +30,7 @@ from forcegp.models.structured_fit import StructuredFit
 from forcegp.scene import BUNDLED
 from forcegp.simulate import simulate
 
-MODELS = ("sgp-zero", "sgp-mean", "sgp-real", "sgp-contact", "sgp-zero-se", "sgp-mean-se", "gp")
+MODELS = ("sgp-zero", "sgp-mean", "sgp", "sgp-contact", "sgp-zero-se", "sgp-mean-se", "gp")
 SIZES = (20, 30, 40, 60, 80, 150, 300, 600)
 WEIGHTS = (3, 3, 3, 3, 3, 3, 2, 1)
 LARGEST_REFERENCE = 80

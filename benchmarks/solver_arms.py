@@ -33,8 +33,8 @@ from torch import Tensor
 
 import forcegp
 from forcegp.evaluation.least_squares import identify_rigid
+from forcegp.forces.inertia import latent_precision, one_row
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.robot_update import latent_precision, one_row
 from forcegp.identification import regressor
 from forcegp.logs import parse_mapping
 from forcegp.models.structured_fit import StructuredFit

@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from forcegp.forces.priors.default import REMAINING
+from forcegp.forces.priors.sets import REMAINING
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.distributed import reduce_sums, shard
 from forcegp.gp.inducing import select_inducing

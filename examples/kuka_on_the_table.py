@@ -12,10 +12,10 @@ from forcegp.simulate import SimulationConfig, simulate
 figure = next((x for x in sys.argv[1:] if x.endswith(".png")), "kuka_on_the_table.png")
 system = forcegp.load_scene("kuka_plane").system()
 data = simulate(system, SimulationConfig(duration=3.0)).data
-train, test = data[:480:12], data[480:]
+train, test = data[:480:4], data[480:]
 print(data)
 
-# %% A Gaussian process on the joint forces, around those of the robot file, fitted to 40 samples
+# %% Gaussian processes on the unknown forces, around those of the robot file, fitted to 120 samples
 fit = forcegp.StructuredGP(system, mean="analytical").fit(train)
 print(fit)
 

@@ -11,7 +11,7 @@ import dataclasses
 import sys
 
 import forcegp
-from forcegp.forces.priors.default import measured_priors
+from forcegp.forces.priors.sets import friction_priors
 from forcegp.simulate import simulate
 
 figure = next((x for x in sys.argv[1:] if x.endswith(".png")), "ur5_wiping.png")
@@ -22,7 +22,7 @@ train, test = data[:1250:10], data[1250:]
 print(data)
 
 # %% Priors on the friction of each joint and of the contact; the noise is learned
-fit = forcegp.StructuredGP(system, "analytical", measured_priors(system)).fit(train)
+fit = forcegp.StructuredGP(system, "analytical", friction_priors(system)).fit(train)
 print(fit)
 
 # %% The normal force of the last three seconds beside MuJoCo's, which the model has never seen

@@ -97,7 +97,7 @@ def covariance_blocks(model: StructuredFit, data: Dataset, name: str) -> Covaria
     )
 
 
-def covariance_block(data: CovarianceData) -> report.Block:
+def covariance_block(data: CovarianceData) -> report.PictureBlock:
     """Figure 1 under its caption."""
     n, rows = len(data.t), len(data.acceleration)
     panels = (
@@ -108,7 +108,7 @@ def covariance_block(data: CovarianceData) -> report.Block:
         ("Result H k_Q Hᵀ", report.as_tensor(data.acceleration),
          f"Covariance of the accelerations: every block is full; {rows} rows and columns, rank {data.rank}."),
     )  # fmt: skip
-    return report.Block(
+    return report.PictureBlock(
         "Figure 1: structured covariance",
         f"H k_Q Hᵀ block by block, for {n} training points, with the learned hyperparameters of the "
         "zero-mean S-GP. Left: the operators H(xᵢ), given by the known mechanics. Middle: the prior on the "

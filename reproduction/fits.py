@@ -8,8 +8,8 @@ from typing import Any
 
 from forcegp.evaluation import evaluate
 from forcegp.files import write_text
-from forcegp.forces.priors.default import PAPER
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.sets import PAPER
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import Model
 from forcegp.models.independent_gp import IndependentGP

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,7 +17,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.files import Header
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.default import contact_priors
+from forcegp.forces.priors.sets import contact_priors, default_priors
 from forcegp.gp.optimise import LearningOptions, minimise
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
@@ -133,7 +134,10 @@ def make_identification(folder: Path, run: Path, rows: Path, *, points: int, eva
     task = Task.read(run, rows)
     system, train, seed = task.system, task.train("stretches", points), task.seed
     runs = [identify_alone(system, train, seed=seed, evaluations=evaluations)]
-    for name, priors in (("sgp-mean", None), ("sgp-contact", list(contact_priors(system)))):
+    for name, priors in (
+        ("sgp-mean", default_priors(system, "analytical")),
+        ("sgp-contact", contact_priors(system)),
+    ):
         options = {"noise_std": task.noise_std, "seed": seed, "evaluations": evaluations}
         runs.append(identify_structured(system, train, priors, name=name, **options))
     true_mass = float(system.robot.mass[-1])
@@ -143,7 +147,7 @@ def make_identification(folder: Path, run: Path, rows: Path, *, points: int, eva
 def identify_structured(
     system: ConstrainedSystem,
     data: Dataset,
-    force_priors: list[ForcePrior] | None,
+    force_priors: Sequence[ForcePrior],
     *,
     name: str,
     noise_std: float,
@@ -155,7 +159,7 @@ def identify_structured(
     Args:
         system: the true system.
         data: training samples.
-        force_priors: on the unknown forces; a joint force prior by default.
+        force_priors: on the unknown forces.
         name: of the model, for the plot.
         noise_std: of the accelerations [rad/s²].
         seed: of the data, for the plot.
@@ -197,9 +201,9 @@ def _options(evaluations: int) -> LearningOptions:
     return dataclasses.replace(WITH_PARAMETERS, max_evaluations=evaluations)
 
 
-def identification_block(data: IdentificationData) -> report.Block:
+def identification_block(data: IdentificationData) -> report.PictureBlock:
     """The figure under its caption."""
-    return report.Block(
+    return report.PictureBlock(
         "Identification (main paper)",
         f"Mass of the last link, started at {WRONG_MASS} kg, and error of the last joint's position, "
         f"started {WRONG_OFFSET} m off along each axis, learned from {data.points} points together with the "
@@ -256,7 +260,7 @@ def _legend(figure: Figure, axes: Axes, columns: int) -> None:
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=min(columns, len(unique)))
 
 
-def identification_finding(data: IdentificationData) -> report.Finding | None:
+def identification_finding(data: IdentificationData) -> report.Statement | None:
     """Whether mass and offset are found."""
     words, good = [], []
     for model in dict.fromkeys(run.model for run in data.runs):
@@ -269,7 +273,7 @@ def identification_finding(data: IdentificationData) -> report.Finding | None:
             + (f", within tolerance from evaluation {max(_settled(r, data) for r in runs)} on" if ok else "")
         )
     text = f"After learning from {data.points} points without knowing the friction (worst seed): "
-    return report.Finding("Identification", all(good), text + "; ".join(words) + ".") if data.runs else None
+    return report.Statement("Identification", all(good), text + "; ".join(words) + ".") if data.runs else None
 
 
 def _settled(run: IdentificationRun, data: IdentificationData) -> int:

@@ -50,7 +50,7 @@ def about_task(results: Results) -> str:
     return f"{TASK} {EXACT}" if results.exact else TASK
 
 
-def learning_block(results: Results, paper: PaperNumbers) -> report.Block:
+def learning_block(results: Results, paper: PaperNumbers) -> report.PictureBlock:
     """The learning curves under their caption."""
     pictures = [
         draw_learning_curve(results, paper, split, kind) for kind in ("noisy", "clean") for split in SPLITS
@@ -60,7 +60,7 @@ def learning_block(results: Results, paper: PaperNumbers) -> report.Block:
         ours = "Solid: the paper's models, learned here."
     seeds = len(results.seeds)
     spread = f" Lines are means over {seeds} seeds, bands their range." if seeds > 1 else ""
-    return report.Block(
+    return report.PictureBlock(
         "Learning curves (main paper, error over N)",
         f"Mean absolute error over the number of training points, and the mean constraint residual. {ours} "
         "Short dashes: the paper's curves, read off its plots, where they are comparable: noisy "
@@ -200,7 +200,7 @@ def residual_table(results: Results, paper: PaperNumbers) -> report.Table:
     )
 
 
-def against_paper(results: Results, paper: PaperNumbers, model: str) -> report.Finding | None:
+def against_paper(results: Results, paper: PaperNumbers, model: str) -> report.Statement | None:
     """Our error on the paper's split against the paper's at every N, with the paper's kernel first."""
     same = like(results, model)
     pairs = {
@@ -222,12 +222,12 @@ def against_paper(results: Results, paper: PaperNumbers, model: str) -> report.F
     if same != model:
         n, best = max(results.sizes(model)), results.mean(model, "selection", None, "noisy_mae")
         text += "" if best is None else f". With our default kernels {best:.3f} at N = {n}"
-    return report.Finding(
+    return report.Statement(
         f"{report.label(model)} against the paper", not above, f"{text}. {UNKNOWN}", ERROR_WORDS
     )
 
 
-def efficiency(results: Results, paper: PaperNumbers) -> report.Finding | None:
+def efficiency(results: Results, paper: PaperNumbers) -> report.Statement | None:
     """How many points the zero-mean structured model needs to reach the paper's best error."""
     target, words, reached = paper.noisy_mae["sgp-zero"][-1], [], []
     for model in (m for m in (PAPER_KERNELS["sgp-zero"], "sgp-zero") if m in results.models):
@@ -245,4 +245,4 @@ def efficiency(results: Results, paper: PaperNumbers) -> report.Finding | None:
         f"noise, {FLOOR * results.noise_std:.4f} rad/s²; close to it, only the error against noise-free "
         f"accelerations separates models. {UNKNOWN}"
     )
-    return report.Finding("Points needed", reached[0], text, POINTS_WORDS)
+    return report.Statement("Points needed", reached[0], text, POINTS_WORDS)

@@ -122,9 +122,9 @@ def spans(t: Tensor, marked: Tensor) -> list[tuple[float, float]]:
     return [(float(t[i]), float(t[j])) for i, j in zip(begins, ends, strict=True)]
 
 
-def multiplier_block(data: MultiplierData) -> report.Block:
+def multiplier_block(data: MultiplierData) -> report.PictureBlock:
     """Figure 2 under its caption."""
-    return report.Block(
+    return report.PictureBlock(
         "Figure 2: surface error and multiplier",
         "The error of the surface equation in simulation, and the Lagrange multiplier λ (the normal force) "
         "that the equations of motion give with the forces learned from accelerations, beside the "
@@ -180,7 +180,7 @@ def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> report.Pictur
     return report.draw(paint, (WIDTH, 4.2), alt, report.label(band.model))
 
 
-def multiplier_finding(data: MultiplierData) -> report.Finding | None:
+def multiplier_finding(data: MultiplierData) -> report.Statement | None:
     """Whether the multiplier is positive and within its band."""
     listed = "; ".join(
         f"{report.label(b.model)}: ±2σ coverage {100 * b.inside:.0f} %"
@@ -199,4 +199,4 @@ def multiplier_finding(data: MultiplierData) -> report.Finding | None:
             " Accelerations do not show the force along the surface normal, as H Aᵀ = 0; with a zero mean "
             "nothing else does, so only models with the analytical mean (eq. 25) can predict λ."
         )
-    return report.Finding("Multiplier", agrees, text) if data.bands else None
+    return report.Statement("Multiplier", agrees, text) if data.bands else None

@@ -32,7 +32,7 @@ class FigureData:
     rollouts: report.RolloutData
 
 
-def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list[report.Finding]:
+def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list[report.Statement]:
     """All findings that the results allow."""
     found = [learning.against_paper(results, paper, model) for model in paper.noisy_mae]
     found += [
@@ -72,7 +72,7 @@ def render_page(results: Results, figures: FigureData, view: str | None = None) 
     )
 
 
-def _opening(results: Results, paper: PaperNumbers, figures: FigureData) -> report.Block:
+def _opening(results: Results, paper: PaperNumbers, figures: FigureData) -> report.PictureBlock:
     """What the page shows first: how error falls with data, and the contact force with its band."""
     drawn = {"Error over training points": learning.draw_learning_curve(results, paper, "stretches", "clean")}
     band = next((b for b in figures.multiplier.bands if b.model == OPENING), None)
@@ -83,7 +83,7 @@ def _opening(results: Results, paper: PaperNumbers, figures: FigureData) -> repo
         "Error of predicted accelerations on motion without training points, and the contact force predicted "
         "without a force sensor; the shaded time contains no training point."
     )
-    return report.Block("In short", caption, pictures, "results.json")
+    return report.PictureBlock("In short", caption, pictures, "results.json")
 
 
 def _tables(results: Results, paper: PaperNumbers) -> dict[str, report.Table]:
@@ -99,17 +99,19 @@ def _tables(results: Results, paper: PaperNumbers) -> dict[str, report.Table]:
     }
 
 
-def prediction_blocks(windows: Sequence[report.WindowData]) -> tuple[report.Block, report.Block]:
+def prediction_blocks(
+    windows: Sequence[report.WindowData],
+) -> tuple[report.PictureBlock, report.PictureBlock]:
     """Both figures under their captions."""
     seconds, limit = f"{windows[0].seconds:.1f} s" if windows else "", report.common_limit(windows)
-    predictions = report.Block(
+    predictions = report.PictureBlock(
         "Figure 4: predictions",
         f"Accelerations of all joints over the same {seconds} of held-out motion without training points: "
         "noisy measurements in black, predicted mean in colour, with the ±2σ band of models that give one.",
         tuple(report.draw_predictions(window) for window in windows),
         WINDOWS,
     )
-    errors = report.Block(
+    errors = report.PictureBlock(
         "Figure 5: errors of the predictions",
         "The same window less the predicted mean: noise-free acceleration in black, noisy in grey, the "
         "model's "

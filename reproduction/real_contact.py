@@ -37,7 +37,6 @@ from reproduction.stages import Stage
 SCENES = ("ur5_wiping", "panda_sphere")
 SOURCES = ("distance", "wrench")
 """What contact is detected from; the first is what the models are fitted with."""
-MODEL = "sgp-real"
 RUN, LOG, IMPORTED, EVALUATED = "run.parquet", "log.parquet", "import.json", "evaluation.json"
 VARIANTS = ("file", "torques", "sensor")
 """The robot file alone; fitted to accelerations; and to the wrist sensor's force too, which is then also a
@@ -117,7 +116,7 @@ def make_fit(folder: Path, run: Path, log: Path, *, scene: str, variant: str) ->
 def _model(variant: str, system: ConstrainedSystem, train: Dataset) -> FittedModel:
     if variant == "file":
         return AnalyticalModel(system).nominal()
-    model = create(MODEL, system)
+    model = create("sgp", system, force_priors="friction", inertia="auto")
     assert isinstance(model, StructuredGP)
     if variant == "sensor":
         return model.fit(with_sensor(train, system, sensor_noise_std(train, system)))

@@ -26,8 +26,8 @@ GAP = 0.5
 """Time between two stretches at least [s]."""
 NAMES = {
     "file": "robot file",
-    "torques": real_contact.MODEL,
-    "sensor": f"{real_contact.MODEL} with wrist sensor",
+    "torques": "sgp",
+    "sensor": "sgp with wrist sensor",
 }
 ROWS_RIGHT, OFFSET_MM, TILT_DEGREES = 0.99, 0.2, 0.2
 """What contact detection and the surface fit are asked for."""
@@ -130,22 +130,22 @@ def tables(results: dict[str, dict[str, Any]]) -> tuple[report.Table, report.Tab
     return first, report.Table("Normal force against MuJoCo's, held-out rows in contact", head, tuple(rows))
 
 
-def findings(results: dict[str, dict[str, Any]]) -> list[report.Finding]:
+def findings(results: dict[str, dict[str, Any]]) -> list[report.Statement]:
     """What was asked, and whether it holds."""
     shares = [share for numbers in results.values() for share in numbers["rows_right"].values()]
     text = f"At least {100 * min(shares):.2f} % of rows are right; asked: {100 * ROWS_RIGHT:.0f} %."
-    said = [report.Finding("Contact detection", min(shares) >= ROWS_RIGHT, text)]
+    said = [report.Statement("Contact detection", min(shares) >= ROWS_RIGHT, text)]
     surface = [numbers["surface"] for numbers in results.values()]
     offset, tilt = (max(one[name] for one in surface) for name in ("offset_mm", "tilt_degrees"))
     text = f"Offset within {offset:.2f} mm, tilt within {tilt:.3f}°; asked: {OFFSET_MM} mm, {TILT_DEGREES}°."
-    said.append(report.Finding("Surface", offset <= OFFSET_MM and tilt <= TILT_DEGREES, text))
+    said.append(report.Statement("Surface", offset <= OFFSET_MM and tilt <= TILT_DEGREES, text))
     for scene, numbers in results.items():
         for variant in ("torques", "sensor"):
             said.append(_force_finding(f"{scene}, {NAMES[variant]}", numbers[variant]))
     return said
 
 
-def _force_finding(topic: str, score: dict[str, Any]) -> report.Finding:
+def _force_finding(topic: str, score: dict[str, Any]) -> report.Statement:
     low, high = COVERAGE
     agrees = (
         abs(score["bias"]) <= BIAS
@@ -158,11 +158,11 @@ def _force_finding(topic: str, score: dict[str, Any]) -> report.Finding:
         f"{score['correlation']:.3f}; ±2σ hold {100 * score['coverage']:.0f} %. Asked: {BIAS} ± {SPREAD} N, "
         f"{CORRELATION}, {100 * low:.0f} to {100 * high:.0f} %."
     )
-    return report.Finding(topic, agrees, text)
+    return report.Statement(topic, agrees, text)
 
 
 @torch.no_grad()
-def _block(line: real_contact.Line) -> report.Block:
+def _block(line: real_contact.Line) -> report.PictureBlock:
     """λ over the first held-out stretch, by the fitted models."""
     system = load_scene(line.scene).system()
     data, truth = (
@@ -186,7 +186,9 @@ def _block(line: real_contact.Line) -> report.Block:
     caption = (
         f"Normal force in {line.scene} on the first held-out stretch; the contact is open where it is shaded."
     )
-    return report.Block(line.scene, caption, tuple(draw_multiplier(drawn, b) for b in bands), "results.json")
+    return report.PictureBlock(
+        line.scene, caption, tuple(draw_multiplier(drawn, b) for b in bands), "results.json"
+    )
 
 
 def _first_stretch(t: torch.Tensor) -> int:

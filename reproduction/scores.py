@@ -72,7 +72,7 @@ def quality_table(results: Results) -> report.Table:
     return report.Table("Uncertainty, constraint and cost, held-out stretches", head, tuple(rows))
 
 
-def order(results: Results) -> report.Finding | None:
+def order(results: Results) -> report.Statement | None:
     """The order of the models by their error on held-out stretches, pair by pair as the paper has it.
 
     Structured models and the GP are compared at their largest common number of training points, with the
@@ -97,7 +97,7 @@ def order(results: Results) -> report.Finding | None:
             pairs.append(_pair(results, ("analytical", results.sizes("analytical")[-1]), gp))
     listed = "; ".join(text for _, text in pairs)
     text = f"Error on held-out stretches [rad/s²], beside the paper's order: {listed}."
-    return report.Finding("Order of the models", all(same for same, _ in pairs), text)
+    return report.Statement("Order of the models", all(same for same, _ in pairs), text)
 
 
 def _pair(
@@ -116,7 +116,7 @@ def _pair(
     return found == wanted, text
 
 
-def splits(results: Results) -> report.Finding | None:
+def splits(results: Results) -> report.Statement | None:
     """How much the paper's split flatters."""
     rows = []
     for model in (m for m in GP_MODELS if m in results.models):
@@ -126,10 +126,10 @@ def splits(results: Results) -> report.Finding | None:
         "Clean error on stretches of motion without any training point, against the paper's split, whose "
         f"test samples lie next to training points: {'; '.join(rows)} rad/s²."
     )
-    return report.Finding("Held-out stretches", None, text) if rows else None
+    return report.Statement("Held-out stretches", None, text) if rows else None
 
 
-def calibration(results: Results) -> report.Finding | None:
+def calibration(results: Results) -> report.Statement | None:
     """Whether the ±2σ bands have the right coverage."""
     models = (m for m in GP_MODELS if m in results.models)
     found = {m: results.mean(m, "stretches", None, "coverage_noisy") for m in models}
@@ -138,10 +138,10 @@ def calibration(results: Results) -> report.Finding | None:
     listed = ", ".join(f"{report.label(m)} {share:.3f}" for m, share in shares.items())
     verdict = f"not calibrated: {', '.join(outside)}" if outside else "all are calibrated"
     text = f"±2σ coverage of noisy accelerations (nominal 0.954): {listed}; {verdict}."
-    return report.Finding("Uncertainty", not outside, text) if shares else None
+    return report.Statement("Uncertainty", not outside, text) if shares else None
 
 
-def constraint(results: Results) -> report.Finding | None:
+def constraint(results: Results) -> report.Statement | None:
     """Whether predictions obey the constraint."""
     found = {m: [s.residual for s in results.scores if s.model == m and s.residual] for m in GP_MODELS}
     worst = {m: max(values) for m, values in found.items() if values}
@@ -153,4 +153,4 @@ def constraint(results: Results) -> report.Finding | None:
         else f"a structured model is above {RESIDUAL:.0e}, which should not happen"
     )
     text = f"Largest mean |A q̈ − b| over all fits: {listed} m/s²; {verdict}."
-    return report.Finding("Constraint", agrees, text) if worst else None
+    return report.Statement("Constraint", agrees, text) if worst else None

@@ -63,9 +63,9 @@ def task_space_motion(t: Tensor, motion: Mapping[str, Tensor], rows: Tensor) -> 
     )
 
 
-def task_space_block(data: TaskSpaceData) -> report.Block:
+def task_space_block(data: TaskSpaceData) -> report.PictureBlock:
     """Figure 3 under its caption."""
-    return report.Block(
+    return report.PictureBlock(
         "Figure 3: task-space motion",
         "The tool moves along straight lines between random points on the surface, with a trapezoidal "
         "speed profile and a stop at every point; dashed: planned, wide: executed under torque control "

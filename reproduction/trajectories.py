@@ -82,7 +82,7 @@ def _calibration_starts(task: Task, seconds: float, most: int) -> torch.Tensor:
     return torch.tensor(rows)
 
 
-def tip_error(data: report.RolloutData) -> report.Finding | None:
+def tip_error(data: report.RolloutData) -> report.Statement | None:
     """The S-GP with analytical mean against models that do not learn forces, one second ahead."""
     if HORIZON not in data.horizons:
         return None
@@ -102,10 +102,12 @@ def tip_error(data: report.RolloutData) -> report.Finding | None:
         f"Open loop, median over {data.starts} starts, {HORIZON:g} s ahead: {report.label(OURS)} "
         f"{_millimetres(ours)} (target: at most a fifth of each of the following); {listed}{beside}."
     )
-    return report.Finding("Tip error of trajectories", all(ratio <= FIFTH for ratio in ratios.values()), text)
+    return report.Statement(
+        "Tip error of trajectories", all(ratio <= FIFTH for ratio in ratios.values()), text
+    )
 
 
-def bands(data: report.RolloutData) -> report.Finding | None:
+def bands(data: report.RolloutData) -> report.Statement | None:
     """Whether bands over function samples have the right coverage of the simulated motion."""
     sampled = [path for path in data.models if path.coverage is not None]
     if not sampled:
@@ -126,7 +128,7 @@ def bands(data: report.RolloutData) -> report.Finding | None:
         + "; ".join(listed)
         + (f"; outside: {', '.join(outside)}." if outside else ".")
     )
-    return report.Finding("Bands of trajectories", not outside, text)
+    return report.Statement("Bands of trajectories", not outside, text)
 
 
 def _millimetres(error: float) -> str:

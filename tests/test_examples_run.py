@@ -40,6 +40,7 @@ def numbers(pattern: str, text: str) -> tuple[float, ...]:
     return tuple(map(float, found.groups()))
 
 
+# Two examples run in `make test`; the others take 7 to 14 s each and run in `make test-slow`.
 EXAMPLES = sorted(path.stem for path in (ROOT / "examples").glob("*.py"))
 
 
@@ -70,6 +71,7 @@ def test_double_pendulum_on_a_wire(tmp_path: Path) -> None:
     assert numbers(r"\|A qdd - b\|: (\S+)", text)[0] < 1e-12
 
 
+@pytest.mark.slow
 def test_kuka_on_the_table(tmp_path: Path) -> None:
     text = example("kuka_on_the_table", tmp_path)
     model, file = numbers(r"mean error ([\d.]+) rad/s2, of the robot file alone ([\d.]+)", text)
@@ -78,6 +80,7 @@ def test_kuka_on_the_table(tmp_path: Path) -> None:
     assert abs(mean - true) <= bar + 0.1, "both are printed with one decimal"
 
 
+@pytest.mark.slow
 def test_ur5_wiping(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     text = example("ur5_wiping", tmp_path)
@@ -87,6 +90,7 @@ def test_ur5_wiping(tmp_path: Path) -> None:
     assert inside >= 90
 
 
+@pytest.mark.slow
 def test_payload_followed_online(tmp_path: Path) -> None:
     rows = re.findall(
         r"([\d.]+) \+- ([\d.]+) kg, true ([\d.]+)", example("payload_followed_online", tmp_path)
@@ -96,6 +100,7 @@ def test_payload_followed_online(tmp_path: Path) -> None:
         assert abs(mass - true) <= 2.0 * bar + 0.01
 
 
+@pytest.mark.slow
 def test_two_contacts(tmp_path: Path) -> None:
     text = example("two_contacts", tmp_path)
     for contact in ("table", "rail"):
@@ -106,6 +111,7 @@ def test_two_contacts(tmp_path: Path) -> None:
         assert model < 0.2 * file and inside >= 90
 
 
+@pytest.mark.slow
 def test_custom_prior(tmp_path: Path) -> None:
     text = example("custom_prior", tmp_path)
     (own,), (general,) = (
@@ -114,6 +120,7 @@ def test_custom_prior(tmp_path: Path) -> None:
     assert own < 0.7 * general
 
 
+@pytest.mark.slow
 def test_learn_a_surface(tmp_path: Path) -> None:
     text = example("learn_a_surface", tmp_path)
     off, bar = numbers(r"is ([\d.]+) degrees off .* ([\d.]+) \(1 sigma\)", text)
@@ -122,6 +129,7 @@ def test_learn_a_surface(tmp_path: Path) -> None:
     assert learned < 0.01 * claimed
 
 
+@pytest.mark.slow
 def test_real_iiwa_friction(tmp_path: Path) -> None:
     text = example("real_iiwa_friction", tmp_path)
     rows = re.findall(r"iiwa_joint_\d +([\d.]+) +([\d.]+) +(\d+)%", text)
@@ -135,7 +143,11 @@ def test_real_iiwa_friction(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("script", "log"), [("real_logs", "kuka_iiwa14"), ("real_contact", "hopper/teststand.urdf")]
+    ("script", "log"),
+    [
+        pytest.param("real_logs", "kuka_iiwa14", marks=pytest.mark.slow),
+        ("real_contact", "hopper/teststand.urdf"),
+    ],
 )
 def test_missing_logs_are_named(script: str, log: str) -> None:
     done = run(f"benchmarks/{script}.py", "--logs", "/nowhere")

@@ -113,6 +113,7 @@ print(after[:3] == before[:3])
 """
 
 
+@pytest.mark.slow
 def test_calls_of_the_library_leave_the_numbers_of_threads() -> None:
     paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"PYTHONPATH": paths}

@@ -46,6 +46,7 @@ print(forcegp.StreamedDataset(("a.parquet", "b.parquet")).header.dt, forcegp.Dat
 PYRIGHT = shutil.which("pyright", path=str(Path(sys.executable).parent))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(PYRIGHT is None, reason="no pyright")
 def test_strict_type_checker_accepts_code_that_uses_the_interface(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)

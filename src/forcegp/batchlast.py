@@ -99,6 +99,6 @@ def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
         rest = torch.addcmul(rest[1:, 1:], rest[1:, :1], rows[-1], value=-1)
     x = rows[-1].unsqueeze(0)
     for row in reversed(rows[:-1]):
-        known = len(x)
-        x = torch.cat([(row[known:] - dot(row[:known, None], x)).unsqueeze(0), x])
+        solved = len(x)
+        x = torch.cat([(row[solved:] - dot(row[:solved, None], x)).unsqueeze(0), x])
     return x.reshape(n, -1, B)

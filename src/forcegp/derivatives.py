@@ -36,11 +36,11 @@ class ForwardDynamicsDerivatives(NamedTuple):
     dforce: JointMatrix
 
 
-def _pairs(robot: RobotModel, own: Tensor, down: Tensor) -> Tensor:
-    """D with D_ij = own_ij where joint j moves link i, and down_ij where joint i moves link j."""
+def _pairs(robot: RobotModel, up: Tensor, down: Tensor) -> Tensor:
+    """D with D_ij = up_ij where joint j moves link i, and down_ij where joint i moves link j."""
     E = robot.ancestors[..., None]
     strictly = torch.tril(robot.ancestors, -1).mT[..., None]
-    return own * E + down * strictly
+    return up * E + down * strictly
 
 
 def _gyration(links: dynamics.LinkInertia, omega: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:

@@ -48,7 +48,7 @@ def check_destination(
         if folder and is_other_than_folder(target):
             raise DestinationError(f"{target} is a file, and a folder is to be written there")
         if folder and target.is_dir():
-            _check_own(target, tuple(own_files))
+            _check_replaceable(target, tuple(own_files))
         parent = _existing_parent(target)
         _probe(parent, needed_bytes)
     except DestinationError:
@@ -103,9 +103,9 @@ def _kept(write: Callable[[Path], object], name: str) -> Path | None:
     return None
 
 
-def _check_own(folder: Path, own_files: tuple[str, ...]) -> None:
+def _check_replaceable(folder: Path, own_files: tuple[str, ...]) -> None:
     names = sorted(entry.name for entry in folder.iterdir())
-    foreign = [name for name in names if not any(fnmatchcase(name, own) for own in own_files)]
+    foreign = [name for name in names if not any(fnmatchcase(name, pattern) for pattern in own_files)]
     if own_files and foreign:
         raise DestinationError(
             f"{folder} holds other files than a result of this command, which would be lost",

@@ -250,8 +250,8 @@ def _json_object(text: str | bytes, source: str, error: type[ForceGPError], most
 
 def depth(value: object) -> int:
     """How many mappings and lists lie inside each other at most, found without recursion."""
-    level, found = [value], 0
+    level, levels = [value], 0
     while level := [part for part in level if isinstance(part, dict | list)]:
-        found += 1
+        levels += 1
         level = [inner for part in level for inner in (part.values() if isinstance(part, dict) else part)]
-    return found
+    return levels

@@ -64,15 +64,15 @@ def unit(quantity: str, kinds: Sequence[str] = ()) -> str:
         return ""
     power = POWERS.get(quantity)
     turning, sliding = ("N m", "N") if power is None else (f"rad{power}", f"m{power}")
-    shown = {"revolute": turning, "prismatic": sliding}
-    return ", ".join(text for kind, text in shown.items() if not kinds or kind in kinds)
+    units = {"revolute": turning, "prismatic": sliding}
+    return ", ".join(text for kind, text in units.items() if not kinds or kind in kinds)
 
 
 def axis_label(quantity: str, kinds: Sequence[str] = (), symbol: str | None = None) -> str:
     """Symbol and unit of a quantity, for an axis; `symbol` replaces that of the library."""
-    shown = symbol or (f"${SYMBOLS[quantity]}$" if quantity in SYMBOLS else quantity)
-    known = unit(quantity, kinds)
-    return f"{shown} [{known}]" if known else shown
+    label = symbol or (f"${SYMBOLS[quantity]}$" if quantity in SYMBOLS else quantity)
+    units = unit(quantity, kinds)
+    return f"{label} [{units}]" if units else label
 
 
 Array = NDArray[np.float64]
@@ -108,10 +108,10 @@ class Timeline:
                 one after another.
             ordered: whether the rows follow time within each segment.
         """
-        x, own = as_array(t), np.zeros(len(t)) if segment is None else as_array(segment)
-        order = np.arange(len(x)) if ordered else np.lexsort((x, own))
-        x, own = x[order], own[order]
-        steps, changes = np.diff(x), np.diff(own) != 0
+        x, segments = as_array(t), np.zeros(len(t)) if segment is None else as_array(segment)
+        order = np.arange(len(x)) if ordered else np.lexsort((x, segments))
+        x, segments = x[order], segments[order]
+        steps, changes = np.diff(x), np.diff(segments) != 0
         typical = float(np.median(steps[~changes])) if len(steps[~changes]) else 0.0
         joined = bool((steps[changes] <= 0).any())
         if joined:
@@ -226,15 +226,15 @@ def _axes(count: int, ax: Target) -> list[Axes]:
         _, made = plt.subplots(count, 1, sharex=True, squeeze=False, figsize=size, layout="constrained")
         made[0, 0].figure.align_ylabels()
         return list(made[:, 0])
-    given = [ax] if isinstance(ax, Axes) else list(np.asarray(ax, dtype=object).ravel())
-    if len(given) != count:
+    axes = [ax] if isinstance(ax, Axes) else list(np.asarray(ax, dtype=object).ravel())
+    if len(axes) != count:
         raise ParameterError(
             "the number of axes is not that of the panels",
             expected=f"{count} axes, one per panel",
-            got=len(given),
+            got=len(axes),
             hint="pass ax=None for a new figure, or choose joints",
         )
-    return given
+    return axes
 
 
 def _draw(axes: Axes, curve: Curve, time: Timeline) -> None:

@@ -34,8 +34,8 @@ def free_memory() -> int | None:
     Returns:
         `None` where the system does not say.
     """
-    known = [value for value in (_available(), _left_in_container()) if value is not None]
-    return min(known) if known else None
+    limits = [value for value in (_available(), _container_memory()) if value is not None]
+    return min(limits) if limits else None
 
 
 def announce_memory(
@@ -94,7 +94,7 @@ def _available() -> int | None:
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
 
 
-def _left_in_container() -> int | None:
+def _container_memory() -> int | None:
     """What the limit of the control group leaves (version 2, then 1)."""
     for most, used in (
         ("memory.max", "memory.current"),

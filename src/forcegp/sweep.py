@@ -83,12 +83,12 @@ def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
     split = split_by_stretches(data, 1, seed=fit.seed)
     model = configured(scene.model, system, name=fit.model, seed=fit.seed)
     fitted = model.fit(data[complement(split.test, len(data))])
-    found = evaluate(fitted, data[split.test], compare=False)
+    evaluation = evaluate(fitted, data[split.test], compare=False)
     score = {
         **asdict(fit),
-        "noisy_mae": found.noisy_mae,
-        "clean_mae": found.clean_mae,
-        "coverage_noisy": found.coverage_noisy,
+        "noisy_mae": evaluation.noisy_mae,
+        "clean_mae": evaluation.clean_mae,
+        "coverage_noisy": evaluation.coverage_noisy,
         "samples": fitted.result.samples,
         "seconds": fitted.seconds,
         "converged": fitted.converged,

@@ -40,16 +40,16 @@ def _short(target: Path) -> str:
     return hashlib.sha256(name).hexdigest() + ending
 
 
-def left_beside(target: Path) -> list[Path]:
+def leftovers_of(target: Path) -> list[Path]:
     """Everything beside a target that has a hidden name of it, the latest first."""
     form = re.compile(re.escape(NEW) + "[0-9a-f]{12}-" + re.escape(_short(target)))
     try:
         with os.scandir(target.parent) as entries:
-            found = [entry for entry in entries if form.fullmatch(entry.name)]
-        found.sort(key=lambda entry: entry.stat(follow_symlinks=False).st_mtime_ns, reverse=True)
+            matches = [entry for entry in entries if form.fullmatch(entry.name)]
+        matches.sort(key=lambda entry: entry.stat(follow_symlinks=False).st_mtime_ns, reverse=True)
     except OSError:
         return []
-    return [Path(entry.path) for entry in found]
+    return [Path(entry.path) for entry in matches]
 
 
 class Temporary:
@@ -86,7 +86,7 @@ class Temporary:
 
 def sweep(target: Path) -> None:
     """Remove what killed writers of a target left beside it."""
-    for path in left_beside(target) if fcntl is not None else []:
+    for path in leftovers_of(target) if fcntl is not None else []:
         locked, descriptor = _lock(path)
         if descriptor is not None:
             if locked:

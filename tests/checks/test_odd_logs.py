@@ -53,6 +53,7 @@ def unlabelled(log: Log, kept: int = 0) -> Log:
     return log.replace(contact={"wire": np.isin(np.arange(len(log)), closed[:kept])})
 
 
+@pytest.mark.slow  # three checks
 def test_a_rest_in_contact_hides_no_contact_that_was_missed(wire: Case) -> None:
     system, log = wire
     closed = np.flatnonzero(log.contact["wire"])
@@ -64,7 +65,7 @@ def test_a_rest_in_contact_hides_no_contact_that_was_missed(wire: Case) -> None:
     assert not {"contact-missed", "contact-early"} & kinds_of((system, rested(log, len(closed))))
 
 
-@pytest.mark.parametrize("kept", [0, 10])
+@pytest.mark.parametrize("kept", [0, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_contact_column_that_is_hardly_ever_true(wire: Case, kept: int) -> None:
     system, log = wire
     assert "contact-missed" in kinds_of((system, unlabelled(log, kept)))

@@ -20,6 +20,7 @@ from forcegp.errors import DataError, DestinationError, ForceGPError, MemoryLimi
 from forcegp.gp import likelihood
 from forcegp.resources import MemoryNeedWarning
 from reproduction.__main__ import app as study
+from slow import slow_except
 
 PLENTY = 1 << 60
 
@@ -115,7 +116,11 @@ def test_another_ending_than_parquet_is_refused_before_the_work(
 
 
 @pytest.mark.parametrize(
-    "command", ["simulate", "select", "predict", "evaluate", "rollout", "check", "guess"]
+    "command",
+    slow_except(
+        ["simulate", "select", "predict", "evaluate", "rollout", "check", "guess"],
+        *("simulate", "select", "predict", "guess"),
+    ),
 )
 def test_a_result_whose_place_fails_later_is_kept(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -197,6 +202,7 @@ def test_a_simulation_of_years_is_refused(tmp_path: Path) -> None:
         run("simulate", "-s", "kuka_plane", "--duration", 1e9, "-o", tmp_path / "run.parquet")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="peak memory is read from /proc")
 def test_the_bound_on_the_equations_of_motion_is_one() -> None:
     """Their peak, in a process of its own, is below the bound and not far below it."""

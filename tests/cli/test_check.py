@@ -52,22 +52,6 @@ def log() -> Log:
     return free_log(forcegp.load_robot("double_pendulum"), seconds=10.0)
 
 
-def test_a_log_in_order_may_go_on(folder: Path, log: Log) -> None:
-    done = run(folder, log)
-    assert done.exit_code == 0, done.output
-    assert done.stdout.splitlines()[-1] == "verdict: go on"
-
-
-def test_a_fault_stops_with_rows_and_remedy(folder: Path, log: Log) -> None:
-    tau = -log.tau
-    tau[1200, 0] = np.nan
-    done = run(folder, log.replace(tau=tau))
-    assert done.exit_code == 1
-    assert done.stdout.splitlines()[-1] == "verdict: stop; repair 2 errors before fitting a model"
-    assert "not-finite" in done.stdout and "1200" in done.stdout and "torque-sign" in done.stdout
-    assert KINDS["torque-sign"].remedy.split()[0] in done.stdout
-
-
 def test_json_holds_every_finding(folder: Path, log: Log) -> None:
     done = run(folder, log.replace(t=1e3 * log.t), "--json")
     result = json.loads(done.stdout)
@@ -78,14 +62,21 @@ def test_json_holds_every_finding(folder: Path, log: Log) -> None:
     assert first["evidence"]["seconds_per_unit"] == pytest.approx(1e-3, rel=0.02)
 
 
-def test_the_page_holds_all_and_fetches_nothing(folder: Path, log: Log) -> None:
-    tau, t = log.tau.copy(), log.t.copy()
-    tau[900, 1] += 30.0
+def test_faults_stop_with_rows_and_remedy_and_the_page_holds_all_and_fetches_nothing(
+    folder: Path, log: Log
+) -> None:
+    tau, t = -log.tau, log.t.copy()
+    tau[900, 1] -= 30.0
+    tau[1200, 0] = np.nan
     t[1500:] += 0.2
     page = folder / "check.html"
-    run(folder, log.replace(tau=-tau, t=t), "--out", str(page))
+    done = run(folder, log.replace(tau=tau, t=t), "--out", str(page))
+    assert done.exit_code == 1
+    assert "verdict: stop; repair 2 errors before fitting a model" in done.stdout.splitlines()
+    assert "not-finite" in done.stdout and "1200" in done.stdout and "torque-sign" in done.stdout
+    assert KINDS["torque-sign"].remedy.split()[0] in done.stdout
     text = page.read_text()
-    for kind in ("torque-sign", "spike", "time-gap"):
+    for kind in ("not-finite", "torque-sign", "spike", "time-gap"):
         assert kind in text and KINDS[kind].remedy.split("/")[0] in text
     assert "verdict: stop" in text and text.count("data:image/svg+xml") >= 4
     assert "http://" not in text.replace("http://www.w3.org", "") and "<script" not in text
@@ -114,7 +105,7 @@ def test_the_function_takes_a_data_set(log: Log) -> None:
     assert report.usable and report.count("error") == 0
 
 
-def test_a_robot_without_contacts_needs_no_scene(folder: Path, log: Log) -> None:
+def test_a_log_in_order_may_go_on_and_a_robot_without_contacts_needs_no_scene(folder: Path, log: Log) -> None:
     write(log, folder / "run.parquet")
     data = ["-d", str(folder / "run.parquet")]
     done = CliRunner().invoke(app, ["check", "--robot", "double_pendulum", *data])

@@ -15,6 +15,7 @@ from forcegp import dynamics
 from forcegp.cli import app
 from forcegp.data import Dataset
 from log_files import WRITERS, Motion
+from slow import slow_except
 
 FREQUENCY, AMPLITUDE = np.array([[2.0, 3.0], [4.1, 1.3]]), np.array([[0.8, 0.9], [0.3, 0.5]])
 NOISE = 0.02
@@ -65,8 +66,7 @@ def run(*arguments: object) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", slow_except(FORMATS, "foreign csv", "mcap"))
 def test_a_log_becomes_a_model(kind: str, tmp_path: Path) -> None:
     """The guessed mapping is right as it stands, so that confirming it is all that is left to the user."""
     m = driven_motion()

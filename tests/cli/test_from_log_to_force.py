@@ -20,7 +20,9 @@ pytest.importorskip("mujoco")
 
 MODEL = """
 [model]
-name = "sgp-real"
+name = "sgp"
+priors = "friction"
+inertia = "auto"
 sensor_noise_std = 0.5
 [model.learning]
 max_evaluations = 40
@@ -34,6 +36,7 @@ def run(*arguments: object) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_the_force_of_a_wiping_robot_by_commands_alone(tmp_path: Path) -> None:
     scene = load_scene("ur5_wiping")
     system = scene.system()

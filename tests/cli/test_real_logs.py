@@ -12,6 +12,7 @@ from forcegp.cli import app
 from forcegp.data import Dataset
 from log_files import REAL, real_logs
 from robots import example_data
+from slow import slow_except
 
 UR = example_data() / "ur_description/urdf"
 IIWA = REAL / "kuka_iiwa14"
@@ -40,8 +41,7 @@ def run(*arguments: object) -> str:
 
 
 @real_logs
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("name", slow_except(LOGS, "pendulum 143339"))
 def test_a_published_log_is_imported_and_stops_at_no_check(name: str, tmp_path: Path) -> None:
     log, robot, mapping = LOGS[name]
     out = tmp_path / "log.parquet"

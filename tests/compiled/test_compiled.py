@@ -95,6 +95,7 @@ def test_derivatives(quantity: str) -> None:
     torch.testing.assert_close(vmap(compiled)(*fixed), compiled(*fixed))
 
 
+@pytest.mark.slow
 def test_gradients_in_large_batches_are_the_eager_ones() -> None:
     robot = random_robot(4)
     states = [x.requires_grad_() for x in states_of(robot, "forward_dynamics", SEVERAL)]

@@ -57,6 +57,7 @@ def valid_columns(rows: int = 60) -> pa.Table:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="peak memory is read from /proc")
 def test_a_list_column_is_left_out_without_being_unpacked(tmp_path: Path) -> None:
     """50 million zeros in some kilobytes."""

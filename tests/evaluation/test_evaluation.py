@@ -15,6 +15,7 @@ from torch import Tensor
 import forcegp
 from forcegp import evaluate
 from forcegp.errors import DataError
+from forcegp.forces.priors.sets import default_priors
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import Prediction, Predictor
 from random_data import NOISE_STD, random_data, table_system
@@ -152,6 +153,7 @@ def test_a_structured_gp_with_learned_noise_is_held_against_that() -> None:
     model = forcegp.StructuredGP(
         system,
         mean="analytical",
+        force_priors=default_priors(system, "analytical"),
         noise=forcegp.Noise(learn=True, acceleration=0.3),
     ).fit(data[:30], options=LearningOptions(max_evaluations=12))
     found = evaluate(model, data[40:60])

@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 import forcegp
 from forcegp.cli import app, main
 from forcegp.data import Dataset
+from forcegp.forces.priors.sets import default_priors
 from forcegp.storage import checkpoint
 from reproduction import profiles
 from reproduction.__main__ import app as study
@@ -125,7 +126,7 @@ def prepare(folder: Path) -> None:
     execute("simulate", folder, folder)
     run, system = Dataset.read(folder / "run.parquet"), forcegp.load_scene(folder / "scene.toml").system()
     run[::6].write(folder / "train.parquet")
-    model = forcegp.StructuredGP(system, mean="analytical", noise=0.1).fit(
+    model = forcegp.StructuredGP(system, "analytical", default_priors(system, "analytical"), 0.1).fit(
         run[::12], options=forcegp.LearningOptions(max_evaluations=2)
     )
     model.save(folder / "model")

@@ -19,6 +19,7 @@ from pathlib import Path
 import pytest
 
 from faults.commands import COMMANDS, Command, child, numbers, prepare, stages
+from slow import slow_except
 
 KILLS = 50 if os.environ.get("FORCEGP_ATTACK") else 3
 PRELOADED = [
@@ -52,7 +53,14 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(params=COMMANDS.values(), ids=lambda command: command.name)
+FAST = ("simulate", "import", "fit")
+"""The others take as long as all of these together."""
+
+
+@pytest.fixture(
+    params=slow_except(COMMANDS.values(), *FAST, name=lambda command: command.name),
+    ids=lambda command: command.name,
+)
 def command(request: pytest.FixtureRequest) -> Command:
     return request.param
 

@@ -11,8 +11,8 @@ import forcegp
 from forcegp.data.fields import DataHeader
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
-from forcegp.forces.priors.default import REMAINING
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.sets import REMAINING
 from forcegp.gp.kernels import Linear, SquaredExponential
 from forcegp.models.structured_fit import StructuredFit
 

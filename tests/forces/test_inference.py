@@ -7,6 +7,7 @@ import torch
 
 import forcegp
 from forcegp.forces.observations import COLUMNS, Observation
+from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import QUANTITIES, affine_map, states
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.models.structured_fit import StructuredFit
@@ -191,7 +192,8 @@ def test_redundant_and_nearly_redundant_contacts(angle: float) -> None:
     again = forcegp.SurfaceContact("ball", first.frame, first.point, forcegp.Plane((angle, 0.2, 1), 0.055))
     system = forcegp.ConstrainedSystem(two_contacts().robot, [first, again], forcegp.Baumgarte())
     data = logged(system, 6)
-    model = forcegp.StructuredGP(system, "analytical", noise=0.1).fit(data, learn=[])
+    priors = default_priors(system, "analytical")
+    model = forcegp.StructuredGP(system, "analytical", priors, noise=0.1).fit(data, learn=[])
     expected = -float(Textbook(model).negative_log_likelihood())
     # Dropping a row leaves an error of the order of the angle.
     assert model.log_marginal_likelihood == pytest.approx(expected, rel=1e-5)

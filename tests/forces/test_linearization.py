@@ -8,7 +8,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp.errors import ModelError
-from forcegp.forces.priors.default import measured_priors
+from forcegp.forces.priors.sets import friction_priors
 from forcegp.models.base import FittedModel
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 
@@ -44,7 +44,7 @@ def test_jacobians_are_central_differences(kind: str) -> None:
     if kind == "analytical":
         fit = forcegp.AnalyticalModel(system).nominal()
     elif kind == "measured":
-        priors = measured_priors(system)
+        priors = friction_priors(system)
         fit = forcegp.StructuredGP(system, "analytical", priors, 0.1).fit(data, learn=[])
     else:
         inference = "sparse" if kind == "sparse" else "exact"

@@ -90,13 +90,7 @@ def test_defaults_of_a_measured_log_learn_friction_and_noise(file: forcegp.Robot
     assert bool((inside > 0.9).all()) and bool((inside < 0.99).all())
 
 
-def test_a_simulated_log_keeps_the_smooth_prior(file: forcegp.RobotModel) -> None:
-    data = log(file, 40, 0)
-    simulated = data.replace(header=data.header.model_copy(update={"seed": 3}))
-    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(simulated, learn=[])
-    assert [prior.name for prior in model.force_priors] == ["joint"]
-
-
+@pytest.mark.slow
 def test_inertial_parameters_of_the_file_are_put_right(
     file: forcegp.RobotModel, truth: forcegp.RobotModel, tmp_path: Path
 ) -> None:
@@ -110,7 +104,8 @@ def test_inertial_parameters_of_the_file_are_put_right(
     both.save(tmp_path / "model")
     again = forcegp.load_model(tmp_path / "model")
     a, b = (m.predict(test.q[:5], test.qd[:5], test.tau[:5]) for m in (both, again))
-    assert torch.equal(a.mean, b.mean)
+    # Means given the inertia that the robot contains are computed after loading, to rounding.
+    torch.testing.assert_close(a.mean, b.mean, rtol=1e-11, atol=0.0)
 
 
 def test_inertial_errors_act_through_the_regressor(

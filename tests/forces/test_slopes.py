@@ -94,7 +94,7 @@ def error_of(model: StructuredFit, seed: int) -> float:
     return float((model.predict(test.q, test.qd, test.tau).mean - truth).abs().mean())
 
 
-@pytest.mark.parametrize("mean", ["analytical", "zero"])
+@pytest.mark.parametrize("mean", ["analytical", pytest.param("zero", marks=pytest.mark.slow)])
 def test_learned_slopes_are_better(mean: str, monkeypatch: pytest.MonkeyPatch) -> None:
     learned = [fitted(seed, mean) for seed in SEEDS]
     assert all(model.training.slopes is not None for model in learned)

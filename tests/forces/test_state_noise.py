@@ -74,6 +74,7 @@ def test_no_state_noise_is_the_projected_likelihood() -> None:
     assert zero.log_marginal_likelihood == pytest.approx(without.log_marginal_likelihood, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_noisy_states_are_learned_from(tmp_path: Path) -> None:
     system, generator = two_contacts(), torch.Generator().manual_seed(2)
     clean, test = logged(system, 80), logged(system, 40, seed=5)

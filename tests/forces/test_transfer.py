@@ -12,6 +12,7 @@ import torch
 import forcegp
 from forcegp.constraints.surface import Surface
 from forcegp.data import farthest_points, standardized
+from forcegp.forces.priors.sets import default_priors
 from forcegp.gp.features import FLOOR, Standardization
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.scene.load import load_scene
@@ -49,7 +50,7 @@ def fitted(kind: str) -> StructuredFit:
     priors = {
         "sliding": [forcegp.SlidingFrictionPrior("table")],
         "any force": [forcegp.ContactForcePrior("table")],
-        "defaults": None,
+        "defaults": default_priors(on("learned"), "analytical"),
     }
     return forcegp.StructuredGP(on("learned"), "analytical", priors[kind], noise=0.1).fit(few, options=SHORT)
 

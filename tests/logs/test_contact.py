@@ -9,7 +9,7 @@ import torch
 import forcegp
 from forcegp.errors import DataError, MappingError
 from forcegp.logs import contact, parse_mapping
-from forcegp.logs.mapping import ContactSection
+from forcegp.logs.mapping import ContactStateSection
 from forcegp.logs.signals import ImportReport, Signals
 
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
@@ -107,7 +107,7 @@ def test_the_distance_shows_the_intervals(
 def test_one_state_only_is_not_split_in_two() -> None:
     noise = np.random.default_rng(0).standard_normal(2000)
     with pytest.raises(DataError, match=r"does not show when contact 'table'(?s:.*)always, never"):
-        contact.force_levels(noise, "table", ContactSection(source="wrench"))
+        contact.force_levels(noise, "table", ContactStateSection(source="wrench"))
 
 
 def test_short_intervals_take_the_state_around_them() -> None:

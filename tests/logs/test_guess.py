@@ -103,6 +103,7 @@ def test_logs_whose_columns_say_nothing(tmp_path: Path) -> None:
 
 
 @real_logs
+@pytest.mark.slow  # 12,639 rows of seven joints
 def test_the_sign_of_a_real_arms_torque() -> None:
     robot = forcegp.load_robot(REAL / "kuka_iiwa14" / "iiwa14.urdf")
     system = forcegp.ConstrainedSystem(robot)

@@ -173,6 +173,7 @@ def test_a_bare_ros2_file() -> None:
 
 
 @real_logs
+@pytest.mark.slow  # restarting clocks of written files: test_clock.py
 @pytest.mark.parametrize(("folder", "rows", "segments"), [("motion_a", 36143, 10), ("motion_b", 12639, 4)])
 def test_a_folder_of_text_files_with_restarting_clocks(folder: str, rows: int, segments: int) -> None:
     robot = forcegp.load_robot(REAL / "kuka_iiwa14" / "iiwa14.urdf")

@@ -50,7 +50,7 @@ def made(tmp_path: Path):
 
 def test_a_table_without_keys_is_the_default_model(made) -> None:
     found = made("")
-    assert found.name == "sgp-mean" and found.options is None
+    assert found.name == "sgp" and found.options is None
     ours, plain = found.model.specification, StructuredGP(SYSTEM, "analytical").specification
     assert (ours.mean, ours.priors, ours.noise, ours.automatic) == (
         plain.mean, plain.priors, plain.noise, plain.automatic,

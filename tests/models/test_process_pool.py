@@ -39,6 +39,7 @@ def predicted(model: StructuredFit, quantity: str) -> torch.Tensor:
     return model.predict(DATA.q, DATA.qd, DATA.tau, quantity).mean.clone()
 
 
+@pytest.mark.slow
 def test_a_worker_predicts_the_same_bits_and_raises_the_same_error(pool: ProcessPoolExecutor) -> None:
     model = forcegp.StructuredGP(table_system(), noise=0.1).fit(DATA, options=FEW)
     here = predicted(model, "qdd")

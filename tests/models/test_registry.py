@@ -24,7 +24,7 @@ def test_every_name_makes_its_model() -> None:
         "sgp-mean-se": forcegp.StructuredGP,
         "sgp-contact": forcegp.StructuredGP,
         "sgp-contact-se": forcegp.StructuredGP,
-        "sgp-real": forcegp.StructuredGP,
+        "sgp": forcegp.StructuredGP,
     }
     for entry in MODELS.values():
         assert entry.description and "\n" not in entry.description and len(entry.description) < 80

@@ -17,6 +17,7 @@ from forcegp.forces.observations import Observation
 from forcegp.forces.priors.base import OperatorForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import QUANTITIES
 from forcegp.forces.start import negative_log_prior
 from forcegp.gp.exact import ExactPosterior
@@ -488,6 +489,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
         forcegp.StructuredGP(two_contacts()).fit(logged(two_contacts(), 5), checkpoint=path)
 
 
+@pytest.mark.slow
 def test_warm_start_ends_as_well_and_restarts_no_worse() -> None:
     data = logged(two_contacts(), 24)
     cold, warm, many = (
@@ -501,7 +503,8 @@ def test_warm_start_ends_as_well_and_restarts_no_worse() -> None:
 
 def test_a_fit_begins_at_the_hyperparameters_of_another() -> None:
     data = logged(two_contacts(), 24)
-    model = forcegp.StructuredGP(two_contacts(), "analytical")
+    priors = default_priors(two_contacts(), "analytical")
+    model = forcegp.StructuredGP(two_contacts(), "analytical", priors)
     small = model.fit(data[:12])
     seen: list[float] = []
     model.fit(data, after=small, progress=lambda e, m, value: seen.append(value))

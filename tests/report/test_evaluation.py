@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from forcegp import AnalyticalModel, evaluate
+from forcegp.models.fit_result import Compared
 from forcegp.report.evaluation import error_tables, score_table, write_evaluation
 from forcegp.report.window import opening, predicted_window
 from random_data import random_data, table_system
@@ -69,3 +70,13 @@ def test_logs_that_count_seconds_from_1970_keep_their_digits() -> None:
     shown = predicted_window(model, opening(later, 0.2), model.kind)
     assert shown.t[0] == 0.0 and shown.seconds == pytest.approx(window.seconds, abs=1e-6)
     assert all(b > a for a, b in pairwise(shown.t))
+
+
+def test_the_comparison_of_force_priors_is_on_the_page(tmp_path: Path) -> None:
+    compared = (
+        Compared("friction", -8.1, 0.88, 0.2, note="dropped after the first half"),
+        Compared("friction, inertia identified", -7.2, 0.0, 0.0, chosen=True),
+    )
+    text = write_evaluation(tmp_path, "m", "d", found, window, comparison=compared).read_text("utf-8")
+    assert re.search(r"friction, inertia identified(.|\n)*-7\.2(.|\n)*chosen", text)
+    assert "nats per sample" in text and "nats per sample" not in page(tmp_path / "named")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from forcegp.report.html import Finding, number
+from forcegp.report.html import Statement, number
 from forcegp.report.rollout_data import with_bands
 from forcegp.report.rollouts import rollout_table
 from report_samples import band, figures, identification, model_path, multiplier, results, rollouts, score
@@ -17,7 +17,7 @@ from reproduction.trajectories import bands, tip_error
 PAPER = paper_numbers()
 
 
-def reading(topic: str, scores: Results | None = None, **changes: object) -> Finding:
+def reading(topic: str, scores: Results | None = None, **changes: object) -> Statement:
     """The finding on a topic."""
     found = findings(scores or results(), PAPER, figures(**changes))
     return next(f for f in found if f.topic.startswith(topic))

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from forcegp.data import Dataset
-from forcegp.errors import DataError, UnknownNameError
+from forcegp.errors import DataError
 from forcegp.models.load import load_model
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.report.rollout_data import RolloutData, together
@@ -17,7 +17,7 @@ from forcegp.report.rollouts import animation_source
 from forcegp.report.window import WindowData
 from reproduction.covariance import CovarianceData
 from reproduction.multiplier import MultiplierData
-from reproduction.profiles import Profile, profile_of
+from reproduction.profiles import Profile
 from reproduction.results import Results
 from reproduction.scores import RESIDUAL
 from reproduction.stages import DATA
@@ -173,9 +173,3 @@ def test_results_and_page_have_the_trajectories(made: Reproduction) -> None:
     text = made.page.read_text(encoding="utf-8")
     assert "Trajectories predicted in open loop" in text and "Tip error of trajectories" in text
     assert "<canvas" in text and f"script-src '{animation_source()}'" in text
-
-
-def test_profiles_are_found_by_name() -> None:
-    assert profile_of("paper").seeds >= 3
-    with pytest.raises(UnknownNameError, match="did you mean 'quick'"):
-        profile_of("quik")

@@ -19,6 +19,9 @@ from reproduction.stages import Stage, StageError, available_processors, code_di
 
 T = TypeVar("T")
 RAN = "ran.txt"
+ASLEEP = 300.0
+ENDED = 60.0
+"""Seconds that processes get to end on a busy machine, well under those that a stage sleeps."""
 
 
 def note(folder: Path, *inputs: Path, text: str = "result", fails: bool = False) -> None:
@@ -33,7 +36,7 @@ def note(folder: Path, *inputs: Path, text: str = "result", fails: bool = False)
 
 def sleep(folder: Path) -> None:
     (folder / f"pid-{os.getpid()}").touch()
-    time.sleep(300.0)
+    time.sleep(ASLEEP)
 
 
 def interrupt(folder: Path, _: Path) -> None:
@@ -151,10 +154,12 @@ def study(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], list[int]]]
     """A process that runs two stages that sleep, and its two workers."""
     script = tmp_path / "study.py"
     script.write_text(
-        "import pathlib, sys\n"
+        "import pathlib, signal, sys\n"
         "from test_stages import sleep\n"
         "from reproduction.stages import Stage, run_stages\n"
         "if __name__ == '__main__':\n"
+        # Background jobs of a shell start with SIGINT ignored, and so do their children.
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "    root = pathlib.Path(sys.argv[1])\n"
         "    try:\n"
         "        run_stages([Stage(root, name, sleep, {}) for name in 'ab'], 2)\n"
@@ -177,7 +182,7 @@ def study(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], list[int]]]
 def test_an_interrupt_ends_a_study_and_its_workers(study: tuple[subprocess.Popen[bytes], list[int]]) -> None:
     parent, workers = study
     parent.send_signal(signal.SIGINT)
-    assert parent.wait(10.0) == 130
+    assert parent.wait(ENDED) == 130
     assert not any(map(_exists, workers))
 
 
@@ -186,7 +191,9 @@ def test_workers_end_when_their_parent_is_killed(study: tuple[subprocess.Popen[b
     parent, workers = study
     parent.kill()
     parent.wait()
-    assert _within(20.0, lambda: None if any(map(_exists, workers)) else True), "a worker outlived its parent"
+    assert _within(ENDED, lambda: None if any(map(_exists, workers)) else True), (
+        "a worker outlived its parent"
+    )
 
 
 def _within(seconds: float, look: Callable[[], T | None]) -> T | None:

@@ -11,6 +11,7 @@ import torch
 
 import forcegp
 from forcegp.data import Split
+from forcegp.errors import UnknownNameError
 from forcegp.view.motion import Motion
 from logs import random_log
 from reproduction import study
@@ -18,6 +19,12 @@ from reproduction.fits import LARGE, models_of
 from reproduction.profiles import PROFILES, profile_of
 from reproduction.study import plan_of, viewed
 from reproduction.task import Task
+
+
+def test_profiles_are_found_by_name() -> None:
+    assert profile_of("paper").seeds >= 3
+    with pytest.raises(UnknownNameError, match="did you mean 'quick'"):
+        profile_of("quik")
 
 
 def test_structured_models_alone_see_the_whole_log() -> None:

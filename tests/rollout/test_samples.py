@@ -11,6 +11,7 @@ from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError
 from forcegp.forces.posterior import draw_samples
+from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import states
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import AnalyticalFit, AnalyticalModel
@@ -43,7 +44,8 @@ def log() -> Dataset:
 
 @cache
 def fitted(mean: str = "analytical") -> StructuredFit:
-    model = StructuredGP(arm(Baumgarte()), mean=mean, noise=0.1)
+    system = arm(Baumgarte())
+    model = StructuredGP(system, mean, default_priors(system, mean), noise=0.1)
     model = model.fit(log()[torch.arange(0, 288, 7)], options=LearningOptions(max_evaluations=15))
     return model
 

@@ -20,6 +20,7 @@ from forcegp.storage import model_file as module
 from forcegp.storage.model_file import HEADER, check_model_destination, model_path
 from model_files import header_of, rewritten
 from random_data import random_data, table_system
+from slow import slow_except
 
 SYSTEM = table_system()
 DATA = random_data(SYSTEM, 8)
@@ -77,7 +78,7 @@ def changes(value: torch.Tensor) -> dict[str, torch.Tensor]:
     return found
 
 
-@pytest.mark.parametrize("name", ["nn", "gp", "sgp-mean"])
+@pytest.mark.parametrize("name", slow_except(["nn", "gp", "sgp-mean"], "nn"))
 def test_a_changed_tensor_is_refused_or_predicts_finite_numbers(
     name: str, saved: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -59,9 +59,9 @@ def test_a_surface_in_python_is_given_again() -> None:
     packed = through_text(system)
     with pytest.raises(ModelError, match=r"'hill' is a ImplicitSurface defined in Python.*\n.*load_model"):
         unpack_system(*packed, "here")
-    assert unpack_system(*packed, "here", given=system).contacts == system.contacts
+    assert unpack_system(*packed, "here", fallback=system).contacts == system.contacts
     with pytest.raises(ModelError, match="unknown contact 'hill'"):
-        unpack_system(*packed, "here", given=system_with())
+        unpack_system(*packed, "here", fallback=system_with())
 
 
 def change(record: dict, place: str, value: object) -> None:

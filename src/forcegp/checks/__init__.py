@@ -114,10 +114,10 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
             try:
-                found, log = run(system, log)
+                faults, log = run(system, log)
             except NotJudgedError as reason:
-                skipped[name], found = str(reason), []
-        findings += found
+                skipped[name], faults = str(reason), []
+        findings += faults
         if not log.usable.any():
             text = "no row of the log is usable"
             findings.append(Finding("log-short", text, log.all_rows, weight="error"))

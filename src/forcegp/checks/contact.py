@@ -85,14 +85,14 @@ def tip_path(system: ConstrainedSystem, contact: SurfaceContact, log: Log) -> Pa
 
 def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
     """Contact labels against the distance of the tip from the surface, contact by contact."""
-    found = []
+    findings = []
     for contact in system.contacts:
         if contact.name not in log.contact:
             text = f"the scene has a contact {contact.name!r}, and the log does not say when it is closed"
-            found.append(Finding("contact-unlabelled", text, log.all_rows, contact=contact.name))
+            findings.append(Finding("contact-unlabelled", text, log.all_rows, contact=contact.name))
         elif isinstance(contact, SurfaceContact):
-            found += _check_surface(contact, tip_path(system, contact, log), log)
-    return found, log
+            findings += _check_surface(contact, tip_path(system, contact, log), log)
+    return findings, log
 
 
 def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Finding]:
@@ -100,9 +100,9 @@ def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Findin
     closed = log.contact[contact.name] & usable
     if closed.sum() < LEAST_ROWS:
         return _missed(contact, path, usable & ~closed & (path.approach <= CREEP), path.c, TOUCH, log)
-    found, distance = _placement(contact, path, closed, log)
+    findings, distance = _placement(contact, path, closed, log)
     rough = ROUGH * float(robust_std(distance[closed]))
-    return [*found, *_labels(contact, path, closed, usable, distance, rough, log)]
+    return [*findings, *_labels(contact, path, closed, usable, distance, rough, log)]
 
 
 def _placement(
@@ -116,15 +116,15 @@ def _placement(
     if abs(np.median(path.c[closed])) > FAR:
         text = f"in contact {name!r} the tip is {1e3 * np.median(path.c[closed]):+.3g} mm from the surface"
         return [Finding("contact-far", text, rows, contact=name, evidence=evidence)], distance
-    found = []
+    findings = []
     if np.linalg.norm(tilt) > TILT:
         text = f"the surface of {name!r} is tilted by {evidence['tilt_deg']:.3g}° against the tip's path"
         evidence |= {f"slope_{axis}": float(value) for axis, value in zip("xyz", tilt, strict=True)}
-        found.append(Finding("surface-tilted", text, rows, contact=name, evidence=evidence))
+        findings.append(Finding("surface-tilted", text, rows, contact=name, evidence=evidence))
     if abs(offset) > OFFSET:
         text = f"the surface of {name!r} lies {1e3 * offset:+.3g} mm along its normal from the scene's"
-        found.append(Finding("surface-offset", text, rows, contact=name, evidence={"offset_m": offset}))
-    return found, distance if found else path.c
+        findings.append(Finding("surface-offset", text, rows, contact=name, evidence={"offset_m": offset}))
+    return findings, distance if findings else path.c
 
 
 def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
@@ -166,14 +166,34 @@ def _labels(
     rough: float,
     log: Log,
 ) -> list[Finding]:
-    """Rows labelled closed off the surface, by their place in the interval, and open ones that slide.
+    """Rows labelled closed off the surface, by their place in the interval, and open ones that slide."""
+    touch, moving = max(TOUCH, rough), closed & (np.linalg.norm(path.v, axis=1) > CREEP)
+    slow = max(CREEP, ROUGH * float(robust_std(path.approach[moving])) if moving.any() else 0.0)
+    texts = {
+        "contact-early": "labelled closed before the tip touches",
+        "contact-late": "labelled closed after the tip has left",
+        "contact-far": "labelled closed while the tip is off the surface",
+    }
+    findings = []
+    for kind, spans in _runs_off(path.approach, closed, c, touch, slow, log).items():
+        if spans:
+            rows: Intervals = tuple(spans)
+            most = max(float(np.abs(c[a:b]).max()) for a, b in rows)
+            where = f"by up to {1e3 * most:.3g} mm, in {describe(rows)}"
+            text = f"contact {contact.name!r} is {texts[kind]}, {where}"
+            findings.append(Finding(kind, text, rows, contact=contact.name, evidence={"distance_m": most}))
+    slides = usable & ~closed & (path.approach <= slow)
+    return [*findings, *_missed(contact, path, slides, c, touch, log)]
+
+
+def _runs_off(
+    approach: Array, closed: np.ndarray, c: Array, touch: float, slow: float, log: Log
+) -> dict[str, list[tuple[int, int]]]:
+    """Runs of rows labelled closed off the surface, by kind of finding.
 
     A run is found where the tip is farther off than surfaces and arms give way. It reaches to the row
     at which the tip moves along the normal no faster than in the rest of the contact.
     """
-    touch = max(TOUCH, rough)
-    approach, moving = path.approach, closed & (np.linalg.norm(path.v, axis=1) > CREEP)
-    slow = max(CREEP, ROUGH * float(robust_std(approach[moving])) if moving.any() else 0.0)
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     off = closed & (np.abs(c) > touch)
@@ -193,20 +213,7 @@ def _labels(
                 if kind == "contact-early" and not far and landing <= STOPS * slow:
                     continue
                 runs["contact-far" if inside else kind].append((start + a, start + b))
-    texts = {
-        "contact-early": "labelled closed before the tip touches",
-        "contact-late": "labelled closed after the tip has left",
-        "contact-far": "labelled closed while the tip is off the surface",
-    }
-    found = []
-    for kind, spans in runs.items():
-        if spans:
-            rows: Intervals = tuple(spans)
-            most = max(float(np.abs(c[a:b]).max()) for a, b in rows)
-            where = f"by up to {1e3 * most:.3g} mm, in {describe(rows)}"
-            text = f"contact {contact.name!r} is {texts[kind]}, {where}"
-            found.append(Finding(kind, text, rows, contact=contact.name, evidence={"distance_m": most}))
-    return [*found, *_missed(contact, path, usable & ~closed & settled, c, touch, log)]
+    return runs
 
 
 def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
@@ -254,18 +261,18 @@ NARROW = 0.05
 
 def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
     """Normal force, friction and directions of sliding of each contact, where the arm can tell the force."""
-    found = []
+    findings = []
     for contact in system.contacts:
         if isinstance(contact, SurfaceContact) and contact.name in log.contact:
             path = tip_path(system, contact, log)
             rows = np.flatnonzero(log.contact[contact.name] & log.usable)
             rows = evenly(rows, FORCE_ROWS)
             if len(rows) >= LEAST_ROWS:
-                found += _directions(contact, path, log)
+                findings += _directions(contact, path, log)
                 force = _force(replace(system, contacts=[contact]), log, rows, path)
                 pulls = _pulls(contact, path, force, rows, log)
-                found += pulls or (_friction(contact, path, force, rows, log) if log.nq > 3 else [])
-    return found, log
+                findings += pulls or (_friction(contact, path, force, rows, log) if log.nq > 3 else [])
+    return findings, log
 
 
 def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) -> Array:
@@ -273,13 +280,13 @@ def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) ->
 
     With three torques or fewer, which any force would explain, it is the best one along the normal, r = Aᵀ λ.
     """
-    left = residual(system, log, rows)
+    remainder = residual(system, log, rows)
     if log.nq <= 3:
-        A = left.J[:, 0]
+        A = remainder.J[:, 0]
         size = np.maximum((A * A).sum(axis=1), 1e-12)
-        return ((A * left.r).sum(axis=1) / size)[:, None] * path.normal[rows]
-    gram = left.J @ left.J.transpose(0, 2, 1)
-    return np.linalg.solve(gram + 1e-9 * np.eye(3), (left.J @ left.r[..., None]))[..., 0]
+        return ((A * remainder.r).sum(axis=1) / size)[:, None] * path.normal[rows]
+    gram = remainder.J @ remainder.J.transpose(0, 2, 1)
+    return np.linalg.solve(gram + 1e-9 * np.eye(3), (remainder.J @ remainder.r[..., None]))[..., 0]
 
 
 def _pulls(contact: SurfaceContact, path: Path, force: Array, rows: np.ndarray, log: Log) -> list[Finding]:

@@ -55,16 +55,16 @@ def still_joints(log: Log) -> np.ndarray:
 
 def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     """Joints that do not move, or hardly ever change direction."""
-    still, found = still_joints(log), []
+    still, findings = still_joints(log), []
     if still.any():
         joints = log.named(still)
         verb, whose = ("moves", "its") if len(joints) == 1 else ("move", "their")
         unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
         least = f"{', '.join(joints)} {verb} by less than {STILL} {unit}"
         text = f"{least}: {whose} friction and inertia are not seen"
-        found.append(Finding("joint-still", text, log.all_rows, joints))
+        findings.append(Finding("joint-still", text, log.all_rows, joints))
     if not log.header.ordered:
-        return found, log
+        return findings, log
     turns = np.zeros(log.nq, int)
     fast = HYSTERESIS * np.percentile(np.abs(log.qd[log.usable]), 99, axis=0)
     for s in log.stretches:
@@ -78,8 +78,8 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
         why = "friction looks like an offset"
         verb = "changes" if len(joints) == 1 else "change"
         text = f"{', '.join(joints)} {verb} direction fewer than {REVERSALS} times: {why}"
-        found.append(Finding("few-reversals", text, log.all_rows, joints))
-    return found, log
+        findings.append(Finding("few-reversals", text, log.all_rows, joints))
+    return findings, log
 
 
 def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -181,10 +181,11 @@ class Fault:
     concerned: int
 
 
-def check_visibility(system: ConstrainedSystem, told: Explanation) -> list[Finding]:
+def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
     """A note on the faults that would stay unseen in this log."""
     sizes = {
-        (fault.kind, fault.joint): visible_size(told, fault) for fault in _faults(system, told.log, told.rows)
+        (fault.kind, fault.joint): visible_size(explanation, fault)
+        for fault in _faults(system, explanation.log, explanation.rows)
     }
     hidden = {key: size for key, size in sizes.items() if size > WORTH[key[0]]}
     if not hidden:
@@ -201,23 +202,23 @@ def check_visibility(system: ConstrainedSystem, told: Explanation) -> list[Findi
     text = f"this log does not show {'; '.join(texts[:5])}{more}"
     joints = tuple(dict.fromkeys(joint for _, joint in hidden if joint))
     evidence = {f"{kind} {joint}".strip(): size for (kind, joint), size in sizes.items()}
-    return [Finding("faults-hidden", text, told.log.all_rows, joints, evidence=evidence)]
+    return [Finding("faults-hidden", text, explanation.log.all_rows, joints, evidence=evidence)]
 
 
-def visible_size(told: Explanation, fault: Fault) -> float:
+def visible_size(explanation: Explanation, fault: Fault) -> float:
     """Size from which on the torque shows a fault of either sign, or `LARGEST`."""
-    problem = told.problem
-    rest = held_out(problem, told.columns, told.prior)
-    added = held_out(replace(problem, r=fault.column), told.columns, told.prior)
+    problem = explanation.problem
+    rest = held_out(problem, explanation.columns, explanation.prior)
+    added = held_out(replace(problem, r=fault.column), explanation.columns, explanation.prior)
     block = blocks_of(len(rest))
-    own, cross, other = (
+    square, cross, added_square = (
         np.stack([product[block == k].mean(axis=0) for k in range(BLOCKS)])
         for product in (rest**2, rest * added, added**2)
     )
 
     def seen(size: float) -> bool:
-        worse = own + 2.0 * size * cross + size**2 * other
-        return significant(np.sqrt(own), np.sqrt(np.maximum(worse, 0.0)), fault.concerned)
+        worse = square + 2.0 * size * cross + size**2 * added_square
+        return significant(np.sqrt(square), np.sqrt(np.maximum(worse, 0.0)), fault.concerned)
 
     unseen = [size for size in SIZES if not (seen(size) and seen(-size))]
     return float(SIZES[max(unseen, default=0.0) < SIZES].min(initial=LARGEST))

@@ -109,9 +109,9 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
         if chosen is None:
             break
         hypothesis, fit = chosen.tried
-        found = finding_of(system, log, hypothesis, fit, chosen.alike)
+        finding = finding_of(system, log, hypothesis, fit, chosen.alike)
         others = [finding_of(system, log, *pair) for pair in chosen.alternatives]
-        findings.append(with_alternatives(found, others))
+        findings.append(with_alternatives(finding, others))
         taken.add((hypothesis.name, hypothesis.joints))
         if hypothesis.name not in ROBOT:
             theta = fit.theta
@@ -135,14 +135,14 @@ def _refined(
     log: Log,
     rows: np.ndarray,
     problem: TorqueProblem,
-    found: Hypothesis,
+    hypothesis: Hypothesis,
     theta: Array,
 ) -> Array:
     """An encoder offset after two more Gauss-Newton steps, as its effect on the torque is not linear."""
     for _ in range(2):
-        moved = corrected(log, found, theta)
-        again = encoder_hypothesis(system, moved, rows, found.joints[0])
-        theta = theta + cross_validate(with_log(problem, system, moved, rows), again.columns).theta
+        moved = corrected(log, hypothesis, theta)
+        refined = encoder_hypothesis(system, moved, rows, hypothesis.joints[0])
+        theta = theta + cross_validate(with_log(problem, system, moved, rows), refined.columns).theta
     return theta
 
 
@@ -234,10 +234,10 @@ def _currents(
     """Gains of all joints that the log determines, tried where most torques are scaled wrongly."""
     fit = _fit(problem, current_hypothesis(log, rows, problem, tuple(range(log.nq))), kept, prior)
     gains = 1.0 + fit.theta[: log.nq]
-    known = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[: log.nq])
+    determined = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[: log.nq])
     # A current has the sign of its torque, so gains of both signs have another cause.
-    if 2 * len(known) > log.nq and (gains[known] > 0.0).all():
-        hypothesis = current_hypothesis(log, rows, problem, tuple(int(j) for j in known))
+    if 2 * len(determined) > log.nq and (gains[determined] > 0.0).all():
+        hypothesis = current_hypothesis(log, rows, problem, tuple(int(j) for j in determined))
         yield hypothesis, _fit(problem, hypothesis, kept, prior)
 
 
@@ -313,8 +313,8 @@ def alternatives_of(
         if _says_the_same(chosen[0], hypothesis):
             continue
         gain, error = gain_of(fit.score, null.score)
-        loss, apart = gain_of(chosen[1].score, fit.score)
-        if gain > ALONE * error and abs(loss) <= apart and _possible(system, hypothesis, fit):
+        loss, tie = gain_of(chosen[1].score, fit.score)
+        if gain > ALONE * error and abs(loss) <= tie and _possible(system, hypothesis, fit):
             yield hypothesis, fit
 
 
@@ -330,20 +330,20 @@ def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
     it."""
     if hypothesis.name != "masses":
         return True
-    given = system.robot.mass.numpy()
-    found = given + fit.theta[: 10 * system.robot.nq : 10]
-    return bool(np.where(given > 0.0, found > 0.0, found >= -SMALL_MASS * given.sum()).all())
+    masses = system.robot.mass.numpy()
+    fitted = masses + fit.theta[: 10 * system.robot.nq : 10]
+    return bool(np.where(masses > 0.0, fitted > 0.0, fitted >= -SMALL_MASS * masses.sum()).all())
 
 
 def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
     """The finding with its alternatives, if there are any, and a test that tells them apart."""
-    found: list[Finding] = []
+    alternatives: list[Finding] = []
     for other in others:
-        alike = (f for f in (finding, *found) if f.kind == other.kind)
+        alike = (f for f in (finding, *alternatives) if f.kind == other.kind)
         if not any({*f.joints} & {*other.joints} or not other.joints for f in alike):
-            found.append(other)
-    if not found:
+            alternatives.append(other)
+    if not alternatives:
         return finding
-    message = "; or ".join(one.message for one in (finding, *found))
-    test = next(TESTS[kind] for kind in TESTS if kind in {finding.kind, *(f.kind for f in found)})
-    return replace(finding, message=message, alternatives=tuple(found), told_apart_by=test)
+    message = "; or ".join(one.message for one in (finding, *alternatives))
+    test = next(TESTS[kind] for kind in TESTS if kind in {finding.kind, *(f.kind for f in alternatives)})
+    return replace(finding, message=message, alternatives=tuple(alternatives), told_apart_by=test)

@@ -163,8 +163,8 @@ class Finding:
 
         A finding with alternatives has the lightest of their severities.
         """
-        own: Severity = self.weight or KINDS[self.kind].severity
-        every = {own, *(other.severity for other in self.alternatives)}
+        weight: Severity = self.weight or KINDS[self.kind].severity
+        every = {weight, *(other.severity for other in self.alternatives)}
         return next(severity for severity in reversed(SEVERITIES) if severity in every)
 
     @property

@@ -51,23 +51,23 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Residual:
     return Residual(np.concatenate(r), np.concatenate(J))
 
 
-def known_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
+def labelled_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
     """The contacts whose state the log knows."""
     return [c for c in system.contacts if c.name in log.contact]
 
 
 def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
     """Whether enough torques are left once any force at the contacts is taken out, not the normal alone."""
-    return 3 * len(known_contacts(system, log)) < log.nq
+    return 3 * len(labelled_contacts(system, log)) < log.nq
 
 
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
     """Rows of J of all contacts, those of the surface normal alone where all of J would leave no torque."""
-    known, whole = known_contacts(system, log), takes_friction_out(system, log)
-    if not known or not len(rows):
+    contacts, whole = labelled_contacts(system, log), takes_friction_out(system, log)
+    if not contacts or not len(rows):
         return np.zeros((len(rows), 0, log.nq))
     parts = []
-    for c in known:
+    for c in contacts:
         if whole and isinstance(c, SurfaceContact):
             J = kinematics.point_jacobian(system.robot, q, c.frame, c.point).numpy()
         else:
@@ -124,7 +124,7 @@ class TorqueFit:
         error: `(blocks, nq)` root mean square of the held-out residual, over `scale`.
         theta: `(p,)` parameters of the hypothesis, from all blocks.
         spread: `(p,)` their standard deviation, by the jackknife over blocks.
-        known: parameters of the nuisance columns.
+        nuisance: parameters of the nuisance columns.
         relative: `(nq,)` held-out error of the typical block over the size of the torque.
         shares: `(blocks, nq)` the same block by block.
         score: `(blocks,)` Σ_j log(error_j / size_j), with a floor where errors do not matter.
@@ -133,7 +133,7 @@ class TorqueFit:
     error: Array
     theta: Array
     spread: Array
-    known: Array
+    nuisance: Array
     relative: Array
     shares: Array
     score: Array

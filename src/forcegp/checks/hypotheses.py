@@ -17,7 +17,7 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import (
     TorqueFit,
     TorqueProblem,
-    known_contacts,
+    labelled_contacts,
     residual,
     takes_friction_out,
     tensors,
@@ -71,10 +71,10 @@ def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
     """The torques of some rows, to be explained by joint friction and an offset per joint."""
-    left, nuisance = residual(system, log, rows), friction_columns(system, log, rows)
+    remainder, nuisance = residual(system, log, rows), friction_columns(system, log, rows)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
-    return TorqueProblem(left.r, left.J, nuisance, size, size if scale is None else scale)
+    return TorqueProblem(remainder.r, remainder.J, nuisance, size, size if scale is None else scale)
 
 
 def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
@@ -93,7 +93,7 @@ def sharper_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarr
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """Viscous and dry friction of each contact of which only the normal force is taken out, `(n, nq, p)`."""
-    touching = [c for c in known_contacts(system, log) if isinstance(c, SurfaceContact)]
+    touching = [c for c in labelled_contacts(system, log) if isinstance(c, SurfaceContact)]
     if takes_friction_out(system, log):
         touching = []
     empty = np.zeros((len(rows), log.nq, 0))
@@ -372,23 +372,23 @@ def _encoder(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: T
 
 def _gravity(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
     assumed = system.robot.gravity.numpy()
-    found = assumed + fit.theta[:3]
-    given = float(np.linalg.norm(assumed))
-    angle, size = _turn(assumed, found)
-    evidence = {"angle_deg": angle, **{f"g{axis}": value for axis, value in zip("xyz", found, strict=True)}}
-    vector = ", ".join(f"{value:.3g}" for value in found)
-    if given > 0.0 and size < WEIGHTLESS:
+    fitted = assumed + fit.theta[:3]
+    strength = float(np.linalg.norm(assumed))
+    angle, size = _turn(assumed, fitted)
+    evidence = {"angle_deg": angle, **{f"g{axis}": value for axis, value in zip("xyz", fitted, strict=True)}}
+    vector = ", ".join(f"{value:.3g}" for value in fitted)
+    if strength > 0.0 and size < WEIGHTLESS:
         text = "the torque contains no gravity: gravity compensation was subtracted"
         return Finding("torque-without-gravity", text, log.all_rows, log.joint_names, evidence=evidence)
-    tilted = given > 0.0 and angle <= TILT
+    tilted = strength > 0.0 and angle <= TILT
     text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"
     return Finding("base-tilted" if tilted else "gravity-direction", text, log.all_rows, evidence=evidence)
 
 
-def _turn(assumed: Array, found: Array) -> tuple[float, float]:
+def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:
     """Angle between two vectors in degrees, and the length of the second over that of the first."""
-    lengths = float(np.linalg.norm(assumed)), float(np.linalg.norm(found))
-    cosine = found @ assumed / max(lengths[0] * lengths[1], 1e-12)
+    lengths = float(np.linalg.norm(assumed)), float(np.linalg.norm(fitted))
+    cosine = fitted @ assumed / max(lengths[0] * lengths[1], 1e-12)
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), lengths[1] / max(lengths[0], 1e-12)
 
 

@@ -95,12 +95,13 @@ def match(log: Log, value: str, rate: str) -> Match | None:
         return None
     whole = np.concatenate(changes), np.concatenate(integrals)
     change, integral = _without_jumps(*whole)
-    cross, own, other = (
+    cross, integral_square, change_square = (
         (a * b).sum(axis=0) for a, b in ((change, integral), (integral, integral), (change, change))
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        low, high, correlation = cross / own, other / cross, cross / np.sqrt(own * other)
-    speed = np.sqrt(other)
+        low, high = cross / integral_square, change_square / cross
+        correlation = cross / np.sqrt(integral_square * change_square)
+    speed = np.sqrt(change_square)
     moving = speed > 1e-3 * speed.max()
     low, high, correlation = np.nan_to_num((low, high, correlation))
     return Match(change, integral, whole, low, high, correlation, moving)
@@ -110,8 +111,8 @@ def _without_jumps(change: Array, integral: Array) -> tuple[Array, Array]:
     """Zero in the windows of each joint that an impact crosses, `JUMPS` of them at most."""
     scale = np.sqrt((change**2).sum(axis=0) / np.maximum((integral**2).sum(axis=0), 1e-300))
     misfit = change - scale * integral
-    apart = np.abs(misfit) > 8.0 * robust_std(misfit) + 1e-12
-    jumps = apart & (np.abs(misfit) > np.quantile(np.abs(misfit), 1.0 - JUMPS, axis=0))
+    outlier = np.abs(misfit) > 8.0 * robust_std(misfit) + 1e-12
+    jumps = outlier & (np.abs(misfit) > np.quantile(np.abs(misfit), 1.0 - JUMPS, axis=0))
     return np.where(jumps, 0.0, change), np.where(jumps, 0.0, integral)
 
 
@@ -139,8 +140,8 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
     evidence = {"seconds_per_unit": factor, "period": log.dt}
     if near:
         text = f"time advances by {log.dt:.4g} per row, and the motion says {factor * log.dt:.4g} s"
-        found = Finding("time-unit", text, log.all_rows, evidence=evidence)
-        return [found], log.replace(t=log.t * near[0])
+        finding = Finding("time-unit", text, log.all_rows, evidence=evidence)
+        return [finding], log.replace(t=log.t * near[0])
     text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
     return [Finding("time-scale", text, log.all_rows, evidence=evidence)], log.replace(t=log.t * factor)
 
@@ -182,37 +183,37 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
     if permutation is not None:
         names = [log.joint_names[j] for j in np.flatnonzero(permutation != np.arange(log.nq))]
         text = f"the velocities of {', '.join(names)} belong to each other's positions"
-        found = Finding("velocity-order", text, log.all_rows, tuple(names))
-        return [found], log.replace(qd=log.qd[:, permutation], qdd=_follow(log, permutation))
-    found, factor = _velocity_findings(log, level, wrong)
-    return found, log.replace(qd=log.qd * factor)
+        finding = Finding("velocity-order", text, log.all_rows, tuple(names))
+        return [finding], log.replace(qd=log.qd[:, permutation], qdd=_follow(log, permutation))
+    findings, factor = _velocity_findings(log, level, wrong)
+    return findings, log.replace(qd=log.qd * factor)
 
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
     """One finding per cause, and the factors that undo it."""
     causes = {"velocity-sign": -1.0, "degrees": 1.0 / DEGREE, "degrees ": DEGREE}
-    found, factor, left = [], np.ones(log.nq), wrong.copy()
+    findings, factor, unexplained = [], np.ones(log.nq), wrong.copy()
     for name, slope in causes.items():
         kind = name.strip()
-        hit = left & level.right(slope) & (np.abs(level.correlation) >= RELATED)
+        hit = unexplained & level.right(slope) & (np.abs(level.correlation) >= RELATED)
         if not hit.any():
             continue
         joints = log.named(hit)
         evidence = {"slope": float(np.median(level.low[hit]))}
         what = {-1.0: "runs against", 1.0 / DEGREE: "is 1/57 of", DEGREE: "is 57 times"}[slope]
         text = f"qd of {', '.join(joints)} {what} the rate of change of q"
-        found.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
-        factor[hit], left = slope, left & ~hit
-    if left.any():
-        joints = log.named(left)
-        j = int(np.flatnonzero(left)[0])
+        findings.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
+        factor[hit], unexplained = slope, unexplained & ~hit
+    if unexplained.any():
+        joints = log.named(unexplained)
+        j = int(np.flatnonzero(unexplained)[0])
         text = (
             f"qd of {', '.join(joints)} is not the rate of change of q: slope {level.low[j]:.3g}, "
             f"correlation {level.correlation[j]:.3g}"
         )
         evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
-        found.append(Finding("velocity-mismatch", text, log.all_rows, joints, evidence=evidence))
-    return found, factor
+        findings.append(Finding("velocity-mismatch", text, log.all_rows, joints, evidence=evidence))
+    return findings, factor
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
@@ -237,9 +238,9 @@ def _permutation(level: Match) -> np.ndarray | None:
     moved = (order != np.arange(len(order))) & level.moving
     if not moved.any():
         return None
-    fits, own = alike[np.arange(len(order)), order][moved], np.diag(alike)[moved]
+    fits, unchanged = alike[np.arange(len(order)), order][moved], np.diag(alike)[moved]
     # Joints that move together are alike in any order; the right one leaves far less unexplained.
-    better = (1.0 - own**2) > CLEARLY * (1.0 - fits**2)
+    better = (1.0 - unchanged**2) > CLEARLY * (1.0 - fits**2)
     return order if fits.min() >= EXCHANGED and better.all() else None
 
 
@@ -271,11 +272,11 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
 def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
     """`(nq,)` viscous friction that the robot file lacks, 0 where the torques do not show it [N m s/rad]."""
     rows = log.rows(FRICTION_ROWS)
-    found = np.zeros(log.nq)
-    told = residual(system, log, rows)
+    damping = np.zeros(log.nq)
+    remainder = residual(system, log, rows)
     for j in range(log.nq):
-        free = np.linalg.norm(told.J[:, :, j], axis=1) < LEVER
-        qd, r = log.qd[rows, j][free], told.r[free, j]
+        free = np.linalg.norm(remainder.J[:, :, j], axis=1) < LEVER
+        qd, r = log.qd[rows, j][free], remainder.r[free, j]
         if len(r) < 20:
             continue
         X = -np.stack([qd, np.sign(qd), np.ones_like(qd)], axis=1)
@@ -283,8 +284,8 @@ def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
         variance = ((r - X @ w) ** 2).sum() / (len(r) - 3) * np.linalg.pinv(X.T @ X)[0, 0]
         # Neighbouring rows err alike, so only clear cases count.
         if w[0] > CLEARLY * np.sqrt(AUTOCORRELATED * variance):
-            found[j] = w[0]
-    return found
+            damping[j] = w[0]
+    return damping
 
 
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -308,11 +309,11 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
         f"correlation {level.correlation[j]:.3g}"
     )
     evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
-    found = Finding("acceleration-mismatch", text, log.all_rows, joints, evidence=evidence)
+    finding = Finding("acceleration-mismatch", text, log.all_rows, joints, evidence=evidence)
     qdd = log.qdd.copy()
     for s in log.stretches:
         qdd[s, wrong] = np.gradient(log.qd[s][:, wrong], log.t[s], axis=0)
-    return [found], log.replace(qdd=qdd, derived=log.derived | {"qdd"})
+    return [finding], log.replace(qdd=qdd, derived=log.derived | {"qdd"})
 
 
 DEPARTURE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
@@ -369,15 +370,15 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
     return (_stated(log, top, stated, evidence) if stated is not None else []), log
 
 
-def _stated(log: Log, found: Array, stated: float, evidence: dict[str, float]) -> list[Finding]:
-    kinds = {"noise-understated": found > NOISE_FACTOR * stated}
+def _stated(log: Log, noise: Array, stated: float, evidence: dict[str, float]) -> list[Finding]:
+    kinds = {"noise-understated": noise > NOISE_FACTOR * stated}
     if not log.header.filtered:  # the highest frequencies show little of what a filter lets through
-        kinds["noise-overstated"] = found < stated / NOISE_FACTOR
+        kinds["noise-overstated"] = noise < stated / NOISE_FACTOR
     result = []
     for kind, wrong in kinds.items():
         if wrong.any():
             joints = log.named(wrong)
-            worst = found[wrong].max() if kind == "noise-understated" else found[wrong].min()
+            worst = noise[wrong].max() if kind == "noise-understated" else noise[wrong].min()
             place = f"{worst:.3g} rad/s² at {', '.join(joints)}"
             text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
             result.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))

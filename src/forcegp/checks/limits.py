@@ -86,7 +86,7 @@ def _angles(log: Log, turning: np.ndarray) -> list[str]:
 def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
     """Positions, velocities and torques beyond the limits of the robot file."""
     kinds = {"q": "position-limit", "qd": "velocity-limit", "tau": "torque-limit"}
-    found = []
+    findings = []
     for name, (low, high) in _limits(system).items():
         value = getattr(log, name)
         slack = SLACK * np.where(np.isfinite(high - low), high - low, 0.0)
@@ -96,10 +96,10 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
             rows = intervals(beyond.any(axis=1))
             joints = log.named(beyond.any(axis=0))
             text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in {describe(rows)}"
-            found.append(
+            findings.append(
                 Finding(kinds[name], text, rows, joints, evidence={"rows": beyond.any(axis=1).sum()})
             )
-    return found, log
+    return findings, log
 
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:

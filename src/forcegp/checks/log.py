@@ -86,13 +86,13 @@ def spikes(x: Array) -> tuple[Array, Array]:
     Returns:
         Both departures `(n, d)`, zero in the three outermost rows.
     """
-    own, around = np.zeros_like(x), np.zeros_like(x)
+    departure, around = np.zeros_like(x), np.zeros_like(x)
     a, b, c, middle, d, e, f = (x[k : len(x) - 6 + k] for k in range(7))
-    own[3:-3] = middle - (-b + 4.0 * c + 4.0 * d - e) / 6.0
+    departure[3:-3] = middle - (-b + 4.0 * c + 4.0 * d - e) / 6.0
     left = a + sum(w * v for w, v in zip(OUTER, (b, c, d, e), strict=True))
     right = f + sum(w * v for w, v in zip(OUTER, (e, d, c, b), strict=True))
     around[3:-3] = np.maximum(np.abs(left), np.abs(right)) / SPREAD
-    return own, around
+    return departure, around
 
 
 def position_unit(robot: RobotModel, j: int | np.integer) -> str:
@@ -262,12 +262,12 @@ def read_log(path: str | Path) -> Log:
 def derive(log: Log, absent: list[str]) -> Log:
     """The log with absent derivatives computed on each unbroken stretch; NaN where there is none."""
     logged = [name for name in JOINT_VECTORS if name not in absent]
-    known = log.replace(**{name: np.zeros_like(log.q) for name in absent})
+    filled = log.replace(**{name: np.zeros_like(log.q) for name in absent})
     values = {name: np.full_like(log.q, np.nan) for name in absent}
     window = 2 * max(3, round(SMOOTHING / log.dt / 2.0)) + 1 if np.isfinite(log.dt) else 7
     method = SavitzkyGolay(window=window, order=3)
-    for rows in known.stretches:
-        even = known.dt * np.arange(rows.stop - rows.start)
+    for rows in filled.stretches:
+        even = filled.dt * np.arange(rows.stop - rows.start)
         if len(even) < window:
             continue
         for name in absent:

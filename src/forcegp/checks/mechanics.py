@@ -58,22 +58,24 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     smooth = smoothed(log)
     if not _enough(smooth):
         raise NotJudgedError(f"fewer than {LEAST_ROWS} rows that lie {max(LAGS)} from the ends of a stretch")
-    told = explain(system, smooth)
-    disturbed, rows = _disturbances(system, told) if log.header.ordered else ([], np.zeros(len(log), bool))
+    explanation = explain(system, smooth)
+    disturbed, rows = [], np.zeros(len(log), bool)
+    if log.header.ordered:
+        disturbed, rows = _disturbances(system, explanation)
     if disturbed and _enough(smooth.mask(rows)):
         # What happened in these rows must pass neither for friction nor for a mass.
-        told = explain(system, smooth.mask(rows))
-    found = [
+        explanation = explain(system, smooth.mask(rows))
+    findings = [
         *passive,
-        *_confounded(told),
-        *_friction(system.robot, _with_other_friction(system, told)),
-        *_offsets(system.robot, told),
-        *_unexplained(told),
-        *check_visibility(system, told),
+        *_confounded(explanation),
+        *_friction(system.robot, _with_other_friction(system, explanation)),
+        *_offsets(system.robot, explanation),
+        *_unexplained(explanation),
+        *check_visibility(system, explanation),
     ]
-    for repair in told.repairs:
+    for repair in explanation.repairs:
         log = repair(log)
-    return [*found, *disturbed], log
+    return [*findings, *disturbed], log
 
 
 def _enough(log: Log) -> bool:
@@ -107,35 +109,38 @@ class _Part:
         return self.gain > MATERIAL and self.gain > SIGNIFICANT * self.error
 
 
-def _part(told: Explanation, j: int, columns: list[int]) -> _Part:
+def _part(explanation: Explanation, j: int, columns: list[int]) -> _Part:
     """Compare the error of joint j with and without some columns of the nuisance."""
-    keep = np.setdiff1d(np.arange(told.problem.nuisance.shape[-1]), columns)
-    less = replace(told.problem, nuisance=told.problem.nuisance[..., keep])
-    without = cross_validate(less, told.columns, told.prior)
-    floor = FLOOR * told.problem.size[j] / told.problem.scale[j]
-    gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (told.fit, without)))
+    problem = explanation.problem
+    keep = np.setdiff1d(np.arange(problem.nuisance.shape[-1]), columns)
+    less = replace(problem, nuisance=problem.nuisance[..., keep])
+    without = cross_validate(less, explanation.columns, explanation.prior)
+    floor = FLOOR * problem.size[j] / problem.scale[j]
+    gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (explanation.fit, without)))
     return _Part(gain, error)
 
 
-def _with_other_friction(system: ConstrainedSystem, told: Explanation) -> Explanation:
+def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) -> Explanation:
     """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
     columns = np.concatenate(
         [
-            contact_friction_columns(system, told.log, told.rows),
-            sharper_friction_columns(system, told.log, told.rows),
+            contact_friction_columns(system, explanation.log, explanation.rows),
+            sharper_friction_columns(system, explanation.log, explanation.rows),
         ],
         axis=-1,
     )
     if not columns.shape[-1]:
-        return told
-    problem = replace(told.problem, nuisance=np.concatenate([told.problem.nuisance, columns], axis=-1))
-    return replace(told, problem=problem, fit=cross_validate(problem, told.columns, told.prior))
+        return explanation
+    nuisance = np.concatenate([explanation.problem.nuisance, columns], axis=-1)
+    problem = replace(explanation.problem, nuisance=nuisance)
+    fit = cross_validate(problem, explanation.columns, explanation.prior)
+    return replace(explanation, problem=problem, fit=fit)
 
 
-def _confounded(told: Explanation) -> list[Finding]:
+def _confounded(explanation: Explanation) -> list[Finding]:
     """The faults found; gains are no error beside masses that do not fit, which are their yardstick."""
-    if "masses" not in told.robot:
-        return told.findings
+    if "masses" not in explanation.robot:
+        return explanation.findings
     return [
         replace(
             finding,
@@ -144,22 +149,23 @@ def _confounded(told: Explanation) -> list[Finding]:
         )
         if finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds
         else finding
-        for finding in told.findings
+        for finding in explanation.findings
     ]
 
 
-def _friction(robot: RobotModel, told: Explanation) -> list[Finding]:
-    log, nq = told.log, told.log.nq
-    viscous, coulomb = -told.fit.known[:nq], -told.fit.known[nq : 2 * nq]
-    rows = log.qd[told.rows]
+def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
+    log, nq = explanation.log, explanation.log.nq
+    viscous, coulomb = -explanation.fit.nuisance[:nq], -explanation.fit.nuisance[nq : 2 * nq]
+    rows = log.qd[explanation.rows]
     power = (viscous * rows**2 + coulomb * np.abs(rows)).mean(axis=0)
     # What drives a joint at some speed, declared friction included, is an error of the model, not friction.
     speeds = np.percentile(np.abs(rows), SPEEDS, axis=0)
     damping, declared = robot.damping.numpy(), robot.friction.numpy()
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
-    there = np.array([_part(told, j, [j, nq + j]).there for j in range(nq)]) & resists & ~still_joints(log)
-    found = []
-    for hit, word in ((there & (power > 0.0), "more"), (there & (power <= 0.0), "less")):
+    significant = np.array([_part(explanation, j, [j, nq + j]).there for j in range(nq)])
+    significant &= resists & ~still_joints(log)
+    findings = []
+    for hit, word in ((significant & (power > 0.0), "more"), (significant & (power <= 0.0), "less")):
         if not hit.any():
             continue
         index = np.flatnonzero(hit)
@@ -172,14 +178,14 @@ def _friction(robot: RobotModel, told: Explanation) -> list[Finding]:
         text = f"joints show {word} friction than the robot file declares (viscous, Coulomb): {listed}"
         evidence = {f"viscous {log.joint_names[j]}": viscous[j] for j in index}
         evidence |= {f"coulomb {log.joint_names[j]}": coulomb[j] for j in index}
-        found.append(Finding("friction-undeclared", text, log.all_rows, joints, evidence=evidence))
-    return found
+        findings.append(Finding("friction-undeclared", text, log.all_rows, joints, evidence=evidence))
+    return findings
 
 
-def _offsets(robot: RobotModel, told: Explanation) -> list[Finding]:
-    log, nq = told.log, told.log.nq
-    offset = -told.fit.known[2 * nq : 3 * nq]
-    index = [j for j in range(nq) if _part(told, j, [2 * nq + j]).there]
+def _offsets(robot: RobotModel, explanation: Explanation) -> list[Finding]:
+    log, nq = explanation.log, explanation.log.nq
+    offset = -explanation.fit.nuisance[2 * nq : 3 * nq]
+    index = [j for j in range(nq) if _part(explanation, j, [2 * nq + j]).there]
     if not index:
         return []
     joints = tuple(log.joint_names[j] for j in index)
@@ -189,26 +195,26 @@ def _offsets(robot: RobotModel, told: Explanation) -> list[Finding]:
     return [Finding("torque-offset", text, log.all_rows, joints, evidence=evidence)]
 
 
-def _unexplained(told: Explanation) -> list[Finding]:
-    error = np.median(told.fit.error, axis=0) * told.problem.scale
-    share = float(np.sqrt((error**2).sum() / (told.problem.size**2).sum()))
+def _unexplained(explanation: Explanation) -> list[Finding]:
+    error = np.median(explanation.fit.error, axis=0) * explanation.problem.scale
+    share = float(np.sqrt((error**2).sum() / (explanation.problem.size**2).sum()))
     if share <= UNEXPLAINED:
         return []
     text = f"robot file, friction and offsets leave {100 * share:.0f} % of the torque unexplained"
-    return [Finding("torque-unexplained", text, told.log.all_rows, evidence={"share": share})]
+    return [Finding("torque-unexplained", text, explanation.log.all_rows, evidence={"share": share})]
 
 
-def _disturbances(system: ConstrainedSystem, told: Explanation) -> tuple[list[Finding], np.ndarray]:
+def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
     """Times at which far more torque is unexplained than usual, and the rows around them."""
-    log, rows = told.log, told.log.rows(TRACE_ROWS)
-    trace = residual_trace(system, told, rows)
-    scale = np.maximum(told.problem.scale, FLOOR * told.problem.size)
+    log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
+    trace = residual_trace(system, explanation, rows)
+    scale = np.maximum(explanation.problem.scale, FLOOR * explanation.problem.size)
     stride = np.median(np.diff(rows)) * log.dt
     width = max(1, round(DISTURBANCE_SECONDS / stride))
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
-    friction = _dry_friction(system.robot, told, rows, width)
-    visible = any_row(np.abs(trace) > VISIBLE * told.problem.size + friction)
+    friction = _dry_friction(system.robot, explanation, rows, width)
+    visible = any_row(np.abs(trace) > VISIBLE * explanation.problem.size + friction)
     bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)
@@ -257,23 +263,25 @@ def _upper_spread(level: Array) -> float:
     return float(min(robust_std(level), upper - middle))
 
 
-def _dry_friction(robot: RobotModel, told: Explanation, rows: np.ndarray, width: int) -> Array:
+def _dry_friction(robot: RobotModel, explanation: Explanation, rows: np.ndarray, width: int) -> Array:
     """Largest dry friction torque `(n, nq)` of joints that rest or reverse within the window, else zero."""
     from scipy.ndimage import minimum_filter1d
 
-    size = np.maximum(robot.friction.numpy() - told.fit.known[told.log.nq : 2 * told.log.nq], 0.0)
-    slowest = minimum_filter1d(np.abs(told.log.qd[rows]), 2 * width + 1, axis=0)
+    log = explanation.log
+    size = np.maximum(robot.friction.numpy() - explanation.fit.nuisance[log.nq : 2 * log.nq], 0.0)
+    slowest = minimum_filter1d(np.abs(log.qd[rows]), 2 * width + 1, axis=0)
     return size * (slowest < robot.friction_velocity.numpy())
 
 
-def residual_trace(system: ConstrainedSystem, told: Explanation, rows: np.ndarray) -> Array:
+def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:
     """Torque that remains at some rows, contact forces taken out, `(n, nq)` [N m, N]."""
-    parts, known = [], robust_parameters(told.problem, told.columns, told.prior)
+    log, scale = explanation.log, explanation.problem.scale
+    parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
-        left = residual(system, told.log, index)
-        columns = [robot_columns(system, told.log, index, name)[0] for name in told.robot]
-        columns = np.concatenate([*columns, friction_columns(system, told.log, index)], axis=-1)
-        r = left.r - columns @ known
-        P, scale = projector(left.J, told.problem.scale), told.problem.scale
+        remainder = residual(system, log, index)
+        columns = [robot_columns(system, log, index, name)[0] for name in explanation.robot]
+        columns = np.concatenate([*columns, friction_columns(system, log, index)], axis=-1)
+        r = remainder.r - columns @ coefficients
+        P = projector(remainder.J, scale)
         parts.append((P @ (r / scale)[..., None])[..., 0] * scale)
     return np.concatenate(parts)

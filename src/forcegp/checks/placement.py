@@ -41,11 +41,11 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
         if abs(np.median(path.c[rows])) <= FAR:
             continue
         closed = log.contact[contact.name] & log.usable
-        left = robust_std((path.c - fit_surface(contact, path, closed)[2])[closed])
+        scatter = robust_std((path.c - fit_surface(contact, path, closed)[2])[closed])
         rows = evenly(rows, ROWS)
-        found = _explanation(system, contact, log, rows, min(OFFSET, BETTER * float(left)))
-        if found is not None:
-            return found
+        outcome = _explanation(system, contact, log, rows, min(OFFSET, BETTER * float(scatter)))
+        if outcome is not None:
+            return outcome
     return [], log
 
 

@@ -28,16 +28,16 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
     """Time stamps that repeat or run backward within a segment."""
     if not log.header.ordered:
         return [], log
-    found = []
+    findings = []
     for kind, mask in (("time-repeated", log.steps == 0.0), ("time-backward", log.steps < 0.0)):
         if mask.any():
             rows = _after(mask)
             word = "repeats" if kind == "time-repeated" else "runs backward"
-            found.append(
+            findings.append(
                 Finding(kind, f"time {word} in {describe(rows)}", rows, evidence={"steps": mask.sum()})
             )
     wrong = np.concatenate([[False], log.steps <= 0.0])
-    return found, log.mask(wrong) if found else log
+    return findings, log.mask(wrong) if findings else log
 
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -154,7 +154,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
     """A channel that keeps one value while its joint moves by more than its own resolution explains."""
     if not log.header.ordered or not np.isfinite(log.dt):
         return [], log
-    least, found, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
+    least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
     for name, value in logged(log).items():
         for j, joint in enumerate(log.joint_names):
             x = value[:, j]
@@ -173,10 +173,10 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
             if runs:
                 spans = tuple(runs)
                 text = f"{name}.{joint} keeps one value while the joint moves, in {describe(spans)}"
-                found.append(Finding("channel-stuck", text, spans, (joint,)))
+                findings.append(Finding("channel-stuck", text, spans, (joint,)))
                 for a, b in runs:
                     bad[a:b] = True
-    return found, log.mask(bad) if found else log
+    return findings, log.mask(bad) if findings else log
 
 
 def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
@@ -197,22 +197,22 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
     for name, value in vectors.items():
-        own, around, scale = departures[name]
+        departure, around, scale = departures[name]
         reach = np.ptp(np.percentile(value[log.usable], (0.5, 99.5), axis=0), axis=0)
         least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
         # Next to a contact switch values jump by nature.
         outlier = (
             ~_switches(log)[:, None]
-            & (np.abs(own) > np.maximum(SPIKE * scale, least))
-            & (np.abs(own) > SPIKE_ALONE * around)
-            & _one_value(own, scale)
+            & (np.abs(departure) > np.maximum(SPIKE * scale, least))
+            & (np.abs(departure) > SPIKE_ALONE * around)
+            & _one_value(departure, scale)
             & ~_shocks(log, departures, name)
         )
         if name == "qdd" and "tau" in vectors:
-            outlier &= ~_driven(system, log, own, outlier)
+            outlier &= ~_driven(system, log, departure, outlier)
         # The neighbours of a spike are off as well, by less.
         for j in np.flatnonzero(outlier.any(axis=0)):
-            peak = outlier[:, j] & (np.abs(own[:, j]) >= _neighbour_peak(np.abs(own[:, j])))
+            peak = outlier[:, j] & (np.abs(departure[:, j]) >= _neighbour_peak(np.abs(departure[:, j])))
             bad |= peak
             hit += [f"{name}.{log.joint_names[j]}"] * bool(peak.any())
     if not bad.any():
@@ -224,14 +224,14 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
     """Departures of the values of a vector and of their neighbours `(n, nq)`, and their scale `(nq,)`."""
-    own, around = np.zeros_like(value), np.zeros_like(value)
+    departure, around = np.zeros_like(value), np.zeros_like(value)
     for s in log.stretches:
-        own[s], around[s] = spikes(value[s])
-    inner = own[log.usable]
+        departure[s], around[s] = spikes(value[s])
+    inner = departure[log.usable]
     if len(inner) < FEWEST:
-        return own, around, np.full(value.shape[1], np.inf)
+        return departure, around, np.full(value.shape[1], np.inf)
     scale = robust_std(inner) + resolution(value[log.usable]) + 1e-12 * np.abs(value[log.usable]).max()
-    return own, around, scale
+    return departure, around, scale
 
 
 def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
@@ -240,21 +240,21 @@ def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: s
     A shock moves several joints, or shows in torque and acceleration; a sensor errs in one channel. No shock
     moves the position.
     """
-    own = departures[name][0]
+    departure = departures[name][0]
     if name == "q":
-        return np.zeros(own.shape, bool)
+        return np.zeros(departure.shape, bool)
     pair = ("tau", "qdd") if name in ("tau", "qdd") else (name,)
     size = {key: _size(log, key, *departures[key]) for key in pair if key in departures}
-    confirmed = np.zeros(own.shape, bool)
-    for j in range(own.shape[1]):
+    confirmed = np.zeros(departure.shape, bool)
+    for j in range(departure.shape[1]):
         others = [np.delete(part, j, axis=1) if key == name else part for key, part in size.items()]
-        most = np.concatenate([*others, np.zeros((len(own), 1))], axis=1).max(axis=1)
+        most = np.concatenate([*others, np.zeros((len(departure), 1))], axis=1).max(axis=1)
         # No shock exceeds the range of the whole motion.
         confirmed[:, j] = (most > SPIKE_SHARED * size[name][:, j]) & (size[name][:, j] < 1.0)
     return confirmed
 
 
-def _driven(system: ConstrainedSystem, log: Log, own: Array, outlier: np.ndarray) -> np.ndarray:
+def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.ndarray) -> np.ndarray:
     """`(n, nq)` bool, accelerations that a step of the joint's own torque makes: Δτ_j (M⁻¹)_jj."""
     step = np.pad(np.abs(np.diff(log.tau, axis=0)), ((1, 1), (0, 0)))
     step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
@@ -262,28 +262,28 @@ def _driven(system: ConstrainedSystem, log: Log, own: Array, outlier: np.ndarray
     if len(rows):
         M = dynamics.mass_matrix(system.robot, tensors(log, rows, "q")[0])
         inverse = torch.linalg.inv(M).diagonal(dim1=-2, dim2=-1).detach().numpy()
-        driven[rows] = step[rows] * inverse > DRIVEN * np.abs(own[rows])
+        driven[rows] = step[rows] * inverse > DRIVEN * np.abs(departure[rows])
     return driven
 
 
-def _size(log: Log, name: str, own: Array, around: Array, scale: Array) -> Array:
+def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) -> Array:
     """Largest departure within two rows over the range of the column; zero where it may be noise."""
     reach = np.ptp(np.percentile(getattr(log, name)[log.usable], (0.5, 99.5), axis=0), axis=0)
-    large = np.where(np.abs(own) > SPIKE * scale, np.abs(own) / np.maximum(reach, 1e-300), 0.0)
+    large = np.where(np.abs(departure) > SPIKE * scale, np.abs(departure) / np.maximum(reach, 1e-300), 0.0)
     padded = np.pad(large, ((2, 2), (0, 0)))
-    return np.max([padded[k : len(own) + k] for k in range(5)], axis=0)
+    return np.max([padded[k : len(departure) + k] for k in range(5)], axis=0)
 
 
-def _one_value(own: Array, scale: Array) -> np.ndarray:
+def _one_value(departure: Array, scale: Array) -> np.ndarray:
     """`(n, d)` bool, departures that those of the neighbours follow from, as they do for one wrong value.
 
     A value that is off by h departs by h, its neighbours by −4h/6 and h/6; a kink or a step has other shapes.
     """
-    padded = np.pad(own, ((2, 2), (0, 0)))
-    n, misfit = len(own), np.zeros_like(own)
+    padded = np.pad(departure, ((2, 2), (0, 0)))
+    n, misfit = len(departure), np.zeros_like(departure)
     for k, share in ((0, 1.0 / 6.0), (1, -4.0 / 6.0), (3, -4.0 / 6.0), (4, 1.0 / 6.0)):
-        misfit = np.maximum(misfit, np.abs(padded[k : n + k] - share * own))
-    return misfit <= SPIKE_SHAPE * np.abs(own) + SPIKE_NOISE * scale
+        misfit = np.maximum(misfit, np.abs(padded[k : n + k] - share * departure))
+    return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
 
 
 def _switches(log: Log) -> np.ndarray:

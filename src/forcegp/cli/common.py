@@ -88,9 +88,9 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(dict(result), default=str))
         return
-    shown = {name: value for name, value in result.items() if value is not None and value != ()}
-    width = max(len(name) for name in shown)
-    for name, value in shown.items():
+    fields = {name: value for name, value in result.items() if value is not None and value != ()}
+    width = max(len(name) for name in fields)
+    for name, value in fields.items():
         text = f"{value:.6g}" if isinstance(value, float) else _listed(value)
         typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
 

@@ -71,19 +71,19 @@ def evaluate(
     regression = _model(model, scene, config, train)
     robot = regression.system.robot
     test = data_of_robot(read_data(data), robot)
-    known = None if train is None else data_of_robot(read_data(train), robot)
+    training = None if train is None else data_of_robot(read_data(train), robot)
     with progress_bar("evaluating", len(test)) as progress:
-        found = run(regression, test, train=known, progress=progress)
+        evaluation = run(regression, test, train=training, progress=progress)
     warn_beyond(regression, test)
-    result: dict[str, object] = {"verdict": found.verdict or "too few samples", **found.summary()}
+    result: dict[str, object] = {"verdict": evaluation.verdict or "too few samples", **evaluation.summary()}
     if out is not None:
         names = str(model or config or scene), str(data), None if train is None else str(train)
-        result |= _written(out, found, regression, test, *names)
+        result |= _written(out, evaluation, regression, test, *names)
     show(result, as_json)
 
 
 def _written(
-    out: Path, found: Evaluation, fitted: Predictor, test: Dataset, model: str, data: str, train: str | None
+    out: Path, scores: Evaluation, fitted: Predictor, test: Dataset, model: str, data: str, train: str | None
 ) -> dict[str, object]:
     """Write the page and its data, and say where they are."""
     from forcegp.destination import write_or_keep
@@ -91,12 +91,13 @@ def _written(
     from forcegp.report.evaluation import PAGE, write_evaluation
     from forcegp.report.window import opening, predicted_window
 
+    comparison = getattr(getattr(fitted, "result", None), "comparison", ())
     window = predicted_window(fitted, opening(test, WINDOW_SECONDS), fitted.kind)
 
     def write(folder: Path) -> None:
         with written_folder(folder) as temporary:
-            write_json(temporary / "evaluation.json", found.to_dict())
-            write_evaluation(temporary, model, data, found, window, train)
+            write_json(temporary / "evaluation.json", scores.to_dict())
+            write_evaluation(temporary, model, data, scores, window, train, comparison)
 
     write_or_keep(write, out)
     return {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}

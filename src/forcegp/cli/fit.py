@@ -46,8 +46,8 @@ def fit(
         typer.Option(
             "--model",
             "-m",
-            help="analytical, nn, gp, sgp-zero, sgp-mean, sgp-contact or sgp-real; with the paper's kernel "
-            "sgp-zero-se, sgp-mean-se or sgp-contact-se. Default: the file's, else sgp-mean.",
+            help="analytical, nn, gp, sgp or sgp-zero; of the paper: sgp-mean, sgp-contact, and with its "
+            "kernel sgp-zero-se, sgp-mean-se or sgp-contact-se. Default: the file's, else sgp.",
         ),
     ] = None,
     config: Config = None,
@@ -72,7 +72,7 @@ def fit(
 
     [bold]Examples[/bold]
 
-    forcegp fit --scene kuka_plane --data train.parquet --model sgp-mean --out model
+    forcegp fit --scene kuka_plane --data train.parquet --model sgp --out model
 
     forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model --json
 
@@ -116,6 +116,7 @@ def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
     figures = {name: value for name, value in asdict(result).items() if name != "history"}
     if as_json:
         return figures
+    figures["comparison"] = "".join(f"\n  {each}" for each in result.comparison)
     return {name: value for name, value in figures.items() if name != "warnings" and value != ""}
 
 
@@ -182,9 +183,9 @@ def sweep(
 
     [bold]Examples[/bold]
 
-    forcegp sweep --scene kuka_plane --model sgp-zero --model sgp-mean --seeds 3 --out sweep/
+    forcegp sweep --scene kuka_plane --model sgp-zero --model sgp --seeds 3 --out sweep/
 
-    forcegp sweep -s kuka_plane -s ur5_wiping -m sgp-mean --address tcp://host:8786 --out /shared/sweep
+    forcegp sweep -s kuka_plane -s ur5_wiping -m sgp --address tcp://host:8786 --out /shared/sweep
     """
     from forcegp.destination import check_destination
     from forcegp.sweep import fits_of

@@ -68,8 +68,6 @@ def predict(
 
     forcegp predict -m model -d test.parquet --quantity multiplier -o force.parquet
     """
-    import torch
-
     from forcegp.destination import write_or_keep
     from forcegp.errors import ModelError
     from forcegp.models.load import load_model
@@ -79,22 +77,35 @@ def predict(
     test = data_of_robot(read_data(data), regression.system.robot)
     if sensor and quantity != "multiplier":
         raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
-    active = test.active(regression.system.contact_names)
-    found = []
+    mean, std = _predict_all(regression, test, quantity, noise, sensor)
+    warn_beyond(regression, test)
+    test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", mean)
+    if std is not None:
+        test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}_std", std)
+    write_or_keep(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
+    show(
+        {"quantity": quantity, "samples": len(test), "uncertainty": std is not None, "file": str(out)},
+        as_json,
+    )
+
+
+def _predict_all(
+    model: Predictor, test: Dataset, quantity: str, noise: bool, sensor: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Mean and standard deviation of a quantity at all states, chunk by chunk."""
+    import torch
+
+    active = test.active(model.system.contact_names)
+    means, stds = [], []
     with progress_bar(f"predicting {quantity}", len(test)) as progress:
         for first in range(0, len(test), CHUNK):
             rows = slice(first, first + CHUNK)
-            found.append(_predicted(regression, test[rows], quantity, active[rows], noise, sensor))
+            mean, std = _predicted(model, test[rows], quantity, active[rows], noise, sensor)
+            means.append(mean)
+            if std is not None:
+                stds.append(std)
             progress(min(first + CHUNK, len(test)))
-    warn_beyond(regression, test)
-    means = [mean for mean, _ in found]
-    stds = [std for _, std in found if std is not None]
-    test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", torch.cat(means))
-    if stds:
-        name = f"predicted_{quantity}_std"
-        test = _with_columns(test, regression.system, quantity, name, torch.cat(stds))
-    write_or_keep(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
-    show({"quantity": quantity, "samples": len(test), "uncertainty": bool(stds), "file": str(out)}, as_json)
+    return torch.cat(means), torch.cat(stds) if stds else None
 
 
 def _predicted(
@@ -110,15 +121,15 @@ def _predicted(
     from forcegp.models.structured_fit import StructuredFit
 
     if not (noise or sensor):
-        found = model.predict(part.q, part.qd, part.tau, quantity, active=active)
-        return found.mean, found.std
+        prediction = model.predict(part.q, part.qd, part.tau, quantity, active=active)
+        return prediction.mean, prediction.std
     if not isinstance(model, StructuredFit):
         raise ModelError("--noise and --sensor need a structured Gaussian process", got=model.kind)
     if sensor:
         mean, std = force_from_sensor(model, part)
         return mean[:, None], std[:, None]
-    found = model.predict(part.q, part.qd, part.tau, quantity, active=active, noise=True)
-    return found.mean, found.std
+    prediction = model.predict(part.q, part.qd, part.tau, quantity, active=active, noise=True)
+    return prediction.mean, prediction.std
 
 
 def _with_columns(

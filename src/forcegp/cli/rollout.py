@@ -164,28 +164,28 @@ def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
     if start >= len(data) - 1:
         raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 2}", got=start)
     rest = data[start:]
-    own = rest[rest.segment == rest.segment[0]]
+    stretch = rest[rest.segment == rest.segment[0]]
     if duration is not None:
-        own = own[own.t <= own.t[0] + duration * (1.0 + 1e-9)]
-    steps = own.t.diff()
-    if len(own) < 2 or bool(((steps - steps.median()).abs() > UNIFORM_TOLERANCE * steps.median()).any()):
+        stretch = stretch[stretch.t <= stretch.t[0] + duration * (1.0 + 1e-9)]
+    steps = stretch.t.diff()
+    if len(stretch) < 2 or bool(((steps - steps.median()).abs() > UNIFORM_TOLERANCE * steps.median()).any()):
         raise DataError(
             "a rollout needs two rows or more at an even sampling period",
             hint="start in a trajectory without gaps; rows that are left over from a selection have them",
         )
-    return own
+    return stretch
 
 
 def _spread(q: Tensor) -> Tensor:
     """Standard deviation `(T, nq)` over samples `(S, T, nq)` that have not diverged, while two are left."""
     import torch
 
-    left = q.isfinite().all(-1)
-    length = int((left.sum(0) >= 2).to(torch.int64).cumprod(0).sum())
-    q, left = q[:, :length], left[:, :length, None]
-    count = left.sum(0)
-    mean = torch.where(left, q, 0.0).sum(0) / count
-    square = torch.where(left, (q - mean).square(), 0.0).sum(0)
+    finite = q.isfinite().all(-1)
+    length = int((finite.sum(0) >= 2).to(torch.int64).cumprod(0).sum())
+    q, finite = q[:, :length], finite[:, :length, None]
+    count = finite.sum(0)
+    mean = torch.where(finite, q, 0.0).sum(0) / count
+    square = torch.where(finite, (q - mean).square(), 0.0).sum(0)
     return (square / (count - 1)).sqrt()
 
 

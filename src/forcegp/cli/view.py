@@ -134,11 +134,11 @@ def _stretch(log: Path, system: ConstrainedSystem, start: int, seconds: float) -
     if start >= len(data):
         raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 1}", got=start)
     rest = data[start:]
-    own = rest[rest.segment == rest.segment[0]]
-    steps = own.t.diff()
+    stretch = rest[rest.segment == rest.segment[0]]
+    steps = stretch.t.diff()
     gaps = (steps > 1.5 * steps.median()).nonzero() if len(steps) > 0 else steps  # left by `forcegp select`
-    own = own[: int(gaps[0]) + 1] if len(gaps) > 0 else own
-    return own[own.t <= own.t[0] + seconds]
+    stretch = stretch[: int(gaps[0]) + 1] if len(gaps) > 0 else stretch
+    return stretch[stretch.t <= stretch.t[0] + seconds]
 
 
 def _with_paths(motion: Motion, model: FittedModel, data: Dataset, samples: int, horizon: float) -> Motion:

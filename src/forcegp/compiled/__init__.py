@@ -82,12 +82,12 @@ class CompiledDynamics:
     def run(self, *states: Tensor) -> Tensor:
         """Call the kernel on states of one shape, outside of autograd."""
         batch = states[0].shape[:-1]
-        given = {
+        values = {
             name: x.reshape((math.prod(batch), self.robot.nq)).contiguous()
             for name, x in zip(self._arguments, states, strict=True)
         }
         turned = {"sin": torch.sin, "cos": torch.cos}
-        arrays = [turned[name](given["q"]) if name in turned else given[name] for name in self._arrays]
+        arrays = [turned[name](values["q"]) if name in turned else values[name] for name in self._arrays]
         out = torch.empty((*batch, *self._shape), dtype=self.robot.dtype, device=self.robot.device)
         if out.numel():
             self._kernel(arrays, out.view((-1, *self._shape)))
@@ -114,10 +114,11 @@ class _Kernel(torch.autograd.Function):
     @staticmethod
     def jvp(ctx, _, *tangents):  # pyright: ignore[reportIncompatibleMethodOverride]
         states = ctx.saved_tensors
-        given = tuple(torch.zeros_like(x) if t is None else t for x, t in zip(states, tangents, strict=True))
+        pairs = zip(states, tangents, strict=True)
+        directions = tuple(torch.zeros_like(x) if t is None else t for x, t in pairs)
         # PyTorch does not nest forward mode, so J t is the derivative of Jᵀ u with respect to u.
         value, pull = torch.func.vjp(ctx.compiled.eager, *states)[:2]
-        return torch.func.vjp(pull, torch.zeros_like(value))[1](given)[0].contiguous()
+        return torch.func.vjp(pull, torch.zeros_like(value))[1](directions)[0].contiguous()
 
     @staticmethod
     def vmap(info, in_dims, compiled, *states):  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -57,21 +57,21 @@ class CompiledMechanics:
 
     def __call__(self, q: Vector, qd: Vector) -> list[Vector]:
         """The mechanics at a state `(nq,)`, `(nq,)`."""
-        given = {"q": q, "qd": qd, "sin": np.sin(q), "cos": np.cos(q)}
+        values = {"q": q, "qd": qd, "sin": np.sin(q), "cos": np.cos(q)}
         out = torch.empty(1, self._places[-1][0].stop, dtype=self._dtype)
-        self._kernel([torch.from_numpy(np.ascontiguousarray(given[name])) for name in self._arrays], out)
+        self._kernel([torch.from_numpy(np.ascontiguousarray(values[name])) for name in self._arrays], out)
         flat = out.numpy()[0]
         return [flat[place].reshape(shape) for place, shape in self._places]
 
     def batch(self, q: Tensor, qd: Tensor) -> list[Tensor]:
         """The same at states `(*batch, nq)`, `(*batch, nq)`, outside of autograd."""
         shape, q, qd = q.shape[:-1], q.reshape(-1, q.shape[-1]), qd.reshape(-1, qd.shape[-1])
-        given = {"q": lambda: q, "qd": lambda: qd, "sin": lambda: torch.sin(q), "cos": lambda: torch.cos(q)}
+        values = {"q": lambda: q, "qd": lambda: qd, "sin": lambda: torch.sin(q), "cos": lambda: torch.cos(q)}
         out = torch.empty(len(q), self._places[-1][0].stop, dtype=self._dtype)
         if len(q):
-            self._kernel([given[name]().contiguous() for name in self._arrays], out)
+            self._kernel([values[name]().contiguous() for name in self._arrays], out)
         blocks = out.split([place.stop - place.start for place, _ in self._places], dim=1)
-        return [x.reshape(*shape, *own) for x, (_, own) in zip(blocks, self._places, strict=True)]
+        return [x.reshape(*shape, *size) for x, (_, size) in zip(blocks, self._places, strict=True)]
 
 
 def _forces(links: Links) -> list[np.ndarray]:

@@ -67,8 +67,8 @@ class CompiledSystem(ConstrainedSystem):
             poses = kinematics.link_poses(self.robot, q)
             return poses, kinematics.link_motion(self.robot, poses, qd)
 
-        known = M, Q_C, Q_G, dynamics.damping_force(self.robot, qd)
-        return self._assembled(q, qd, active, known, terms, links)
+        robot_terms = M, Q_C, Q_G, dynamics.damping_force(self.robot, qd)
+        return self._assembled(q, qd, active, robot_terms, terms, links)
 
 
 def compiled_system(system: ConstrainedSystem) -> ConstrainedSystem:

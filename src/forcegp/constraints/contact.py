@@ -178,12 +178,13 @@ class SurfaceContact(Constraint):
     def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
         (tip,) = points
         surface = self.center_surface
+        # c(p), A = ∇cᵀ J_p, b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ) (eq. 3)
         c, normal = surface.value(tip.position), surface.gradient(tip.position)
         A = vecdot(normal[..., None], tip.jacobian, dim=-2)[..., None, :]
         b = -(vecdot(normal, tip.bias) + surface.curvature(tip.position, tip.velocity))
         touching = ContactPoint(tip.position, tip.velocity, tip.jacobian, normal)
         if self.radius:
-            # The material point that touches lies below the centre of the ball.
+            # The touching material point p − r n has the velocity ṗ + ω × (−r n) and J_E = J_p + r [n]ₓ J_ω.
             arm = -self.radius * normal
             touching = ContactPoint(
                 tip.position + arm,
@@ -228,5 +229,6 @@ class PointConnection(Constraint):
         if self.other_frame is None:
             place = torch.as_tensor(self.other_point, dtype=p.dtype, device=p.device)
             return ConstraintTerms(p - place, J, -bias)
+        # c = p_1 − p_2, A = J_1 − J_2, b = J̇_2 q̇ − J̇_1 q̇
         other = points[1]
         return ConstraintTerms(p - other.position, J - other.jacobian, other.bias - bias)

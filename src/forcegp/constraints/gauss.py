@@ -113,6 +113,7 @@ class Equations:
         if W.shape[-2] == 0:
             return W.mT
         if W.shape[-2] == 1:
+            # w⁺ = w/|w|²
             square = W.square().sum(-1, keepdim=True)
             # An inactive row is zero, and stays so.
             return (W / square.masked_fill(square == 0.0, 1.0)).mT
@@ -148,7 +149,7 @@ class Equations:
 
     @cached_property
     def H(self) -> JointMatrix:
-        """H = M⁻¹P = T M⁻¹, symmetric, from force to constrained acceleration."""
+        """H = M⁻¹P = T M⁻¹ = M⁻¹ − L A M⁻¹, symmetric, from force to constrained acceleration."""
         return self.M_inv - self.L @ self.M_inv_At.mT
 
     @property
@@ -160,6 +161,10 @@ class Equations:
         """q̈′ = M⁻¹ Q, the acceleration without contact (eq. 1)."""
         return torch.cholesky_solve(Q[..., None], self.M_cholesky)[..., 0]
 
+    def _gap(self, free: JointVector) -> ConstraintVector:
+        """b − A q̈′, the constrained acceleration that free motion lacks, `(*batch, m)`."""
+        return self.b - (self.A @ free[..., None])[..., 0]
+
     def acceleration(self, Q_bar: JointVector) -> JointVector:
         """q̈ = L b + H Q̄ (eq. 4), as the correction q̈′ + L(b − A q̈′) of the free acceleration.
 
@@ -167,20 +172,17 @@ class Equations:
             Q_bar: `(*batch, nq)` all impressed generalized forces Q + Q_z [N m, N].
         """
         free = self.free_acceleration(Q_bar)
-        return free + (self.L @ (self.b - (self.A @ free[..., None])[..., 0])[..., None])[..., 0]
+        return free + (self.L @ self._gap(free)[..., None])[..., 0]
 
     def motion_under(self, Q_bar: JointVector) -> tuple[JointVector, ConstraintVector]:
         """q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, as a step of a rollout needs them."""
         free = self.free_acceleration(Q_bar)
-        multiplier = (self.constraint_inertia @ (self.b - (self.A @ free[..., None])[..., 0])[..., None])[
-            ..., 0
-        ]
+        multiplier = (self.constraint_inertia @ self._gap(free)[..., None])[..., 0]
         return free + (self.M_inv_At @ multiplier[..., None])[..., 0], multiplier
 
     def multiplier(self, Q_bar: JointVector) -> ConstraintVector:
         """λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) (eq. 16, with all impressed forces), `(*batch, m)`."""
-        residual = self.b - (self.A @ self.free_acceleration(Q_bar)[..., None])[..., 0]
-        return (self.constraint_inertia @ residual[..., None])[..., 0]
+        return (self.constraint_inertia @ self._gap(self.free_acceleration(Q_bar))[..., None])[..., 0]
 
     def constraint_force(self, Q_bar: JointVector) -> JointVector:
         """Q_I = Aᵀ λ (eq. 17), `(*batch, nq)` [N m, N]."""
@@ -231,18 +233,18 @@ def linearize(
         inverse = inverse_dynamics_derivatives(robot, q, qd, qdd)
     (g_q, g_qd), (h_q, _), damping = _residuals(robot, rows, q, qd, qdd, multiplier)
     with torch.no_grad():
+        # r_f = ∂(Aᵀ)λ + ∂Q_D − ∂ID, r_c = ∂b − ∂A q̈
         residual = {
             "dq": (h_q - inverse.dq, g_q),
             "dqd": (torch.diag_embed(damping) - inverse.dqd, g_qd),
         }
-        M_inv_A = eom.M_inv_At.mT
-        found = {name: eom.H @ r_f + eom.L @ r_c for name, (r_f, r_c) in residual.items()}
-        carried = {
-            name: eom.constraint_inertia @ (r_c - M_inv_A @ r_f) for name, (r_f, r_c) in residual.items()
-        }
+        # ∂q̈ = H r_f + L r_c, ∂λ = (A M⁻¹ Aᵀ)⁺ (r_c − A M⁻¹ r_f)
+        A_M_inv, inertia = eom.M_inv_At.mT, eom.constraint_inertia
+        dqdd = {name: eom.H @ r_f + eom.L @ r_c for name, (r_f, r_c) in residual.items()}
+        dmultiplier = {name: inertia @ (r_c - A_M_inv @ r_f) for name, (r_f, r_c) in residual.items()}
         return Linearization(
-            qdd, found["dq"], found["dqd"], eom.H,
-            multiplier, carried["dq"], carried["dqd"], -eom.L.mT,
+            qdd, dqdd["dq"], dqdd["dqd"], eom.H,
+            multiplier, dmultiplier["dq"], dmultiplier["dqd"], -eom.L.mT,
         )  # fmt: skip
 
 
@@ -257,6 +259,7 @@ def _residuals(
     """Jacobians of b − A q̈ and of Aᵀλ by q and q̇, and the diagonal of ∂Q_D/∂q̇, at fixed q̈ and λ."""
     with torch.enable_grad():
         q, qd = q.detach().clone().requires_grad_(), qd.detach().clone().requires_grad_()
+        # b − A q̈, Aᵀλ and Q_D
         A, b = rows(q, qd)
         along = b - (A @ qdd[..., None])[..., 0]
         force = (A.mT @ multiplier[..., None])[..., 0]

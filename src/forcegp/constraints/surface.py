@@ -163,6 +163,7 @@ class Sphere(Surface):
         return torch.nn.functional.normalize(p - _vector(self.center, p), dim=-1)
 
     def curvature(self, p: Vector3, v: Vector3) -> Scalars:
+        # vᵀ∇²c v = (|v|² − (rᵀv/|r|)²)/|r|, r = p − center
         r = p - _vector(self.center, p)
         distance = torch.linalg.vector_norm(r, dim=-1)
         along = (r * v).sum(-1) / distance
@@ -212,6 +213,7 @@ class Cylinder(Surface):
         return torch.nn.functional.normalize(self._across(p - _vector(self.center, p)), dim=-1)
 
     def curvature(self, p: Vector3, v: Vector3) -> Scalars:
+        # as for a sphere, with r and v across the axis
         r, across = self._across(p - _vector(self.center, p)), self._across(v)
         distance = torch.linalg.vector_norm(r, dim=-1)
         along = (r * across).sum(-1) / distance
@@ -247,6 +249,7 @@ class ImplicitSurface(Surface):
 
     def curvature(self, p: Vector3, v: Vector3) -> Scalars:
         def along(point: Tensor, direction: Tensor) -> Tensor:
+            # vᵀ ∇²c v, with ∇²c v as the derivative of ∇c along v
             change = torch.func.jvp(torch.func.grad(self.function), (point,), (direction,))[1]
             return (change * direction).sum()
 

@@ -214,15 +214,15 @@ class ConstrainedSystem:
         if q.shape != qd.shape:
             raise ShapeError("q and qd are not one batch", expected=tuple(q.shape), got=tuple(qd.shape))
         poses, motion, terms = self._terms(q, qd)
-        known = dynamics.known_terms(robot, poses, motion, qd)
-        return self._assembled(q, qd, active, known, terms, lambda: (poses, motion))
+        robot_terms = dynamics.known_terms(robot, poses, motion, qd)
+        return self._assembled(q, qd, active, robot_terms, terms, lambda: (poses, motion))
 
     def _assembled(
         self,
         q: Tensor,
         qd: Tensor,
         active: Tensor | None,
-        known: tuple[Tensor, Tensor, Tensor, Tensor],
+        robot_terms: tuple[Tensor, Tensor, Tensor, Tensor],
         terms: Sequence[ConstraintTerms],
         links: Callable[[], tuple[LinkPoses, LinkMotion]],
     ) -> Equations:
@@ -230,7 +230,7 @@ class ConstrainedSystem:
         c, cd, A, b = self._rows(q, qd, terms, active)
         touching = zip(self.contact_names, (term.point for term in terms), strict=True)
         points = {name: point for name, point in touching if point is not None}
-        M, Q_C, Q_G, Q_D = known
+        M, Q_C, Q_G, Q_D = robot_terms
         return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, links)
 
     def linearize(
@@ -307,8 +307,10 @@ class ConstrainedSystem:
             c = torch.cat([empty, *(term.c for term in terms)], dim=-1)
             b = torch.cat([empty, *(term.b for term in terms)], dim=-1)
             A = torch.cat([none, *(term.A for term in terms)], dim=-2)
+        # ċ = A q̇ (eq. 27), b̃ = b − 2ωξ ċ − ω² c (eq. 30 with the signs corrected)
         cd = vecdot(A, qd[..., None, :])
         if self.baumgarte is not None:
             b = self.baumgarte.stabilized(b, c, cd)
+        # A = 0 and b = 0 for open contacts
         open_ = self.active_rows(active, q.shape[:-1]).logical_not()
         return c, cd, A.masked_fill(open_[..., None], 0.0), b.masked_fill(open_, 0.0)

@@ -131,13 +131,17 @@ def reached(system: ContactSystem, active: Array, c: Array, cd: Array) -> Array:
     return any_row(system, (c <= 0.0) & (cd < -APPROACH)) & can_open(system, active) & ~active
 
 
-def impact_velocity(system: ContactSystem, q: Array, qd: Array, active: Array) -> Array:
-    """Velocity `(*batch, nq)` after an inelastic impact without friction on the active contacts.
+def project_velocity(eom: Any, qd: Array) -> Array:
+    """Velocity `(*batch, nq)` after an inelastic impact without friction on the active constraints.
 
     M (q̇⁺ − q̇⁻) = Aᵀ Λ with A q̇⁺ = 0, so q̇⁺ = T q̇⁻ = q̇⁻ − L A q̇⁻.
     """
-    eom = system.equations(q, qd, active=active)
     return qd - (eom.L @ (eom.A @ qd[..., None]))[..., 0]
+
+
+def impact_velocity(system: ContactSystem, q: Array, qd: Array, active: Array) -> Array:
+    """Velocity `(*batch, nq)` after an inelastic impact without friction on the active contacts."""
+    return project_velocity(system.equations(q, qd, active=active), qd)
 
 
 def sliding_friction(system: ContactSystem, eom: Any, active: Array, viscous_friction: float) -> Array:
@@ -155,6 +159,7 @@ def sliding_friction(system: ContactSystem, eom: Any, active: Array, viscous_fri
     Q_z = 0.0 * eom.Q_C
     for i, contact in enumerate(system.contacts):
         if contact.name in eom.contact_points:
+            # F_z = −θ_v (I − n nᵀ) ṗ_E, Q_z += J_Eᵀ F_z
             at = eom.contact_points[contact.name]
             n, v = at.normal, at.velocity
             sliding = v - ((v * n).sum(-1) / (n * n).sum(-1))[..., None] * n
@@ -192,12 +197,15 @@ def contact_forces(
         viscous_friction: θ_v [N s/m].
     """
     closed, eom = landing.closed, landing.eom
+    # Q = Q_C + Q_G + Q_D + Q_u
     Q = eom.Q_K + Q_u
     while True:
+        # λ = (A M⁻¹ Aᵀ)⁺ (b − A M⁻¹ (Q + Q_z)) ≥ 0
         Q_z = sliding_friction(system, eom, closed, viscous_friction)
         multiplier = eom.multiplier(Q + Q_z)
         pulls = pulling(system, closed, multiplier)
         if not bool(pulls.any()):
+            # Q_I = Aᵀ λ (eq. 17)
             Q_I = (eom.A.T @ multiplier[:, None])[:, 0]
             return ContactForces(closed, eom.c, multiplier, Q, eom.Q_D, Q_I, Q_z)
         closed = closed & ~pulls

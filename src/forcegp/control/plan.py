@@ -139,15 +139,15 @@ def inverse_kinematics(
         q = q + _damped_step(J, error, leaning).clamp(-MAX_STEP, MAX_STEP)
         q = q.clamp(robot.lower, robot.upper)
     error, _, aligned = _pose_error(robot, q, index, x, position, rotation)
-    found = q[(error.abs().amax(-1) < POSE_TOLERANCE) & aligned]
-    if len(found) == 0:
+    reached = q[(error.abs().amax(-1) < POSE_TOLERANCE) & aligned]
+    if len(reached) == 0:
         raise NumericalError(
             f"no joint positions put {frame} of robot {robot.name!r} at the pose",
             expected=f"tool point at {[round(v, 4) for v in position.tolist()]} m, normal to the surface",
             got=f"{len(starts)} starts, of which none leads there",
             hint="move the rectangle into the workspace of the robot",
         )
-    return found[(found - near).abs().sum(-1).argmin()]
+    return reached[(reached - near).abs().sum(-1).argmin()]
 
 
 def _pose_error(
@@ -258,12 +258,13 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
     touching = [c for c in system.contacts if isinstance(c, SurfaceContact)]
     contact = touching[0] if touching else None
     frame, point = (contact.frame, contact.point) if contact else (config.frame, config.point)
-    own = [c for c in touching if c.frame == frame]
+    carried = [c for c in touching if c.frame == frame]
     frame = robot.frame_names[-1] if frame is None else frame
     center = kinematics.as_point(robot, config.center)
     chart = Chart.about(center, contact.center_surface if contact else None)
     reference = _draw_reference(chart, config, generator)
-    middle = torch.stack([kinematics.as_point(robot, x) for x in [c.point for c in own] or [point]]).mean(0)
+    points = [c.point for c in carried] or [point]
+    middle = torch.stack([kinematics.as_point(robot, x) for x in points]).mean(0)
     rotation = tool_rotation(chart.axes[2], _ahead(chart, config.tool_turn), _tool_axis(middle))
     draws = 2.0 * torch.rand(STARTS, robot.nq, dtype=torch.float64, generator=generator) - 1.0
     nearest = _middle_of_limits(robot)
@@ -279,7 +280,7 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
         postures[reference.segment],
         _draw_push(reference, config, generator),
     )
-    return Plan(tuple(c.name for c in own), frame, point, reference, targets, start)
+    return Plan(tuple(c.name for c in carried), frame, point, reference, targets, start)
 
 
 def _ahead(chart: Chart, turn: float) -> Tensor:

@@ -38,16 +38,16 @@ class Trapezoid(NamedTuple):
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Distance, speed and acceleration at time t since the start of the segment (held after its end)."""
         t = torch.minimum(t.clamp(min=0.0), self.travel_time)
-        left = self.travel_time - t
+        remaining = self.travel_time - t
         a, blend = self.acceleration, self.blend_time
-        starting, stopping = t < blend, left < blend
+        starting, stopping = t < blend, remaining < blend
 
         def pick(start: Tensor, stop: Tensor, between: Tensor) -> Tensor:
             return torch.where(starting, start, torch.where(stopping, stop, between))
 
         cruise = a * blend
-        distance = pick(0.5 * a * t**2, self.length - 0.5 * a * left**2, cruise * (t - 0.5 * blend))
-        speed = pick(a * t, a * left, cruise)
+        distance = pick(0.5 * a * t**2, self.length - 0.5 * a * remaining**2, cruise * (t - 0.5 * blend))
+        speed = pick(a * t, a * remaining, cruise)
         rate = pick(a, -a, torch.zeros_like(a))
         return distance, speed, rate
 

@@ -291,9 +291,9 @@ def concatenated(parts: Sequence[Fields]) -> dict[str, Any]:
     first = parts[0]
     segments, start = [], 0
     for part in parts:
-        _, own = torch.unique_consecutive(part.segment, return_inverse=True)
-        segments.append(own + start)
-        start += int(own.max()) + 1 if len(part) else 0
+        _, numbers = torch.unique_consecutive(part.segment, return_inverse=True)
+        segments.append(numbers + start)
+        start += int(numbers.max()) + 1 if len(part) else 0
     return {
         **{name: torch.cat([getattr(p, name) for p in parts]) for name in ("t", *JOINT_VECTORS)},
         "joint_names": first.joint_names,

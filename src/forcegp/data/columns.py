@@ -48,18 +48,18 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
     if len(joints) > JOINTS:
         raise DataError(f"{source}: too many joints", expected=f"at most {JOINTS}", got=len(joints))
     contacts = header.contact_names or tuple(name[8:] for name in raw if name.startswith("contact."))
-    left = dict(raw)
-    fields: Arrays = {"t": _take(source, left, "t").astype(float), "joint_names": joints}
-    absent = {name for name in ("qd", "qdd") if not any(f"{name}.{joint}" in left for joint in joints)}
+    unread = dict(raw)
+    fields: Arrays = {"t": _take(source, unread, "t").astype(float), "joint_names": joints}
+    absent = {name for name in ("qd", "qdd") if not any(f"{name}.{joint}" in unread for joint in joints)}
     for name in JOINT_VECTORS:
         if not (method and name in absent):
-            fields[name] = _joint_vector(source, left, name, joints)
-    fields["contact"] = {name: _contact(source, left, f"contact.{name}") for name in contacts}
-    fields["segment"] = _segment(source, left, len(fields["t"]))
-    fields["extras"], fields["contact_extras"] = _extras(source, left, joints, contacts)
-    if left:
+            fields[name] = _joint_vector(source, unread, name, joints)
+    fields["contact"] = {name: _contact(source, unread, f"contact.{name}") for name in contacts}
+    fields["segment"] = _segment(source, unread, len(fields["t"]))
+    fields["extras"], fields["contact_extras"] = _extras(source, unread, joints, contacts)
+    if unread:
         warnings.warn(
-            f"{source}: columns of unknown meaning are left out: {', '.join(left)}",
+            f"{source}: columns of unknown meaning are left out: {', '.join(unread)}",
             IgnoredColumnsWarning,
             stacklevel=4,
         )
@@ -85,33 +85,33 @@ def as_tensors(fields: Arrays, dtype: torch.dtype, device: torch.device) -> Arra
 
 
 def _listing(names: Sequence[str] | Columns) -> str:
-    shown = list(names)
-    return ", ".join(shown[:12]) + (f", … ({len(shown)} columns)" if len(shown) > 12 else "")
+    listed = list(names)
+    return ", ".join(listed[:12]) + (f", … ({len(listed)} columns)" if len(listed) > 12 else "")
 
 
-def _take(source: str, left: Columns, name: str, remedy: str | None = None) -> NDArray[np.generic]:
-    if name in left:
-        return left.pop(name)
-    kin = [other for other in left if other.split(".", 1)[0] == name.split(".", 1)[0]]
-    near = near_names(name, kin or left, cutoff=0.75)
+def _take(source: str, unread: Columns, name: str, remedy: str | None = None) -> NDArray[np.generic]:
+    if name in unread:
+        return unread.pop(name)
+    kin = [other for other in unread if other.split(".", 1)[0] == name.split(".", 1)[0]]
+    near = near_names(name, kin or unread, cutoff=0.75)
     raise DataError(
         f"{source}: column {name!r} is missing",
         expected=name,
-        got=_listing(left),
+        got=_listing(unread),
         hint=remedy or (f"is {near[0]!r} the column that is meant?" if near else None),
     )
 
 
-def _joint_vector(source: str, left: Columns, name: str, joints: Sequence[str]) -> NDArray[np.float64]:
+def _joint_vector(source: str, unread: Columns, name: str, joints: Sequence[str]) -> NDArray[np.float64]:
     remedy = None
-    if name in ("qd", "qdd") and not any(f"{name}.{joint}" in left for joint in joints):
+    if name in ("qd", "qdd") and not any(f"{name}.{joint}" in unread for joint in joints):
         remedy = f"compute {name} from the log with differentiate=SavitzkyGolay(...), or --differentiate"
-    parts = [_take(source, left, f"{name}.{joint}", remedy) for joint in joints]
+    parts = [_take(source, unread, f"{name}.{joint}", remedy) for joint in joints]
     return np.stack(parts, axis=-1).astype(float)
 
 
-def _contact(source: str, left: Columns, name: str) -> NDArray[np.bool_]:
-    values = _take(source, left, name)
+def _contact(source: str, unread: Columns, name: str) -> NDArray[np.bool_]:
+    values = _take(source, unread, name)
     wrong = np.flatnonzero((values != 0) & (values != 1))
     if len(wrong):
         raise DataError(
@@ -122,8 +122,8 @@ def _contact(source: str, left: Columns, name: str) -> NDArray[np.bool_]:
     return values.astype(bool)
 
 
-def _segment(source: str, left: Columns, n: int) -> NDArray[np.int64]:
-    values = left.pop("segment", np.zeros(n, np.int64))
+def _segment(source: str, unread: Columns, n: int) -> NDArray[np.int64]:
+    values = unread.pop("segment", np.zeros(n, np.int64))
     numbers = np.asarray(values, float)
     wrong = np.flatnonzero(~(np.abs(numbers) <= SEGMENT_NUMBER) | (numbers != np.floor(numbers)))
     if len(wrong):
@@ -136,21 +136,21 @@ def _segment(source: str, left: Columns, n: int) -> NDArray[np.int64]:
 
 
 def _extras(
-    source: str, left: Columns, joints: Sequence[str], contacts: Sequence[str]
+    source: str, unread: Columns, joints: Sequence[str], contacts: Sequence[str]
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, dict[str, NDArray[np.float64]]]]:
     """Joint vectors and contact quantities among the columns that are left; takes them out."""
     extras: dict[str, NDArray[np.float64]] = {}
     contact_extras: dict[str, dict[str, NDArray[np.float64]]] = {}
-    names = dict.fromkeys(column.split(".", 1)[0] for column in left if "." in column)
+    names = dict.fromkeys(column.split(".", 1)[0] for column in unread if "." in column)
     for name in names:
-        if any(f"{name}.{joint}" in left for joint in joints):
-            extras[name] = _joint_vector(source, left, name, joints)
+        if any(f"{name}.{joint}" in unread for joint in joints):
+            extras[name] = _joint_vector(source, unread, name, joints)
         for contact in contacts:
             column = f"{name}.{contact}"
-            if column in left:
-                contact_extras.setdefault(name, {})[contact] = left.pop(column).astype(float)
-            elif any(f"{column}.{axis}" in left for axis in AXES):
-                parts = [_take(source, left, f"{column}.{axis}") for axis in AXES]
+            if column in unread:
+                contact_extras.setdefault(name, {})[contact] = unread.pop(column).astype(float)
+            elif any(f"{column}.{axis}" in unread for axis in AXES):
+                parts = [_take(source, unread, f"{column}.{axis}") for axis in AXES]
                 contact_extras.setdefault(name, {})[contact] = np.stack(parts, axis=-1).astype(float)
     return extras, contact_extras
 

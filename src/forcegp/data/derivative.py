@@ -82,16 +82,16 @@ def differentiate(
     norms = [np.linalg.norm(savgol_coeffs(window, order, deriv=degree, pos=place)) for place in range(window)]
     for rows in _runs(segment):
         dt = _time_step(t, rows, window)
-        own = x[rows]
-        result[rows] = savgol_filter(own, window, order, deriv=degree, delta=dt, axis=0, mode="interp")
-        places = np.full(len(own), half)
+        samples = x[rows]
+        result[rows] = savgol_filter(samples, window, order, deriv=degree, delta=dt, axis=0, mode="interp")
+        places = np.full(len(samples), half)
         places[:half], places[-half:] = np.arange(half), np.arange(half + 1, window)
         gain[rows, 0] = np.take(norms, places) / dt**degree
-        smooth = np.asarray(savgol_filter(own, window, order, axis=0))
-        residuals.append((own - smooth)[half:-half])
-    own_weight = savgol_coeffs(window, order)[half]
+        smooth = np.asarray(savgol_filter(samples, window, order, axis=0))
+        residuals.append((samples - smooth)[half:-half])
+    centre_weight = savgol_coeffs(window, order)[half]
     spread = MAD_TO_STD * np.median(np.abs(np.concatenate(residuals)), axis=0)
-    return result, gain * (spread / np.sqrt(1.0 - own_weight))
+    return result, gain * (spread / np.sqrt(1.0 - centre_weight))
 
 
 def _runs(segment: NDArray[np.int64]) -> list[slice]:

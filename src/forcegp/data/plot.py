@@ -33,8 +33,8 @@ def plot(
     elif quantity in (*JOINT_VECTORS, *data.extras):
         panels = _by_joint(data, quantity, chosen(joints, data.joint_names, "joint of the data set"))
     else:
-        known = (*JOINT_VECTORS, *data.extras, *data.contact_extras)
-        raise UnknownNameError("quantity of the data set", quantity, known)
+        names = (*JOINT_VECTORS, *data.extras, *data.contact_extras)
+        raise UnknownNameError("quantity of the data set", quantity, names)
     time = Timeline.of(data.t, data.segment, data.header.ordered)
     return draw_panels(panels, time, tuple(data.contact.values()), ax)
 

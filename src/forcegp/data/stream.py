@@ -91,15 +91,15 @@ def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece
         tables = _tables(parquet, usable, size)
         following = next(tables, None)
         while following is not None:
-            own, following = _columns(file, following), next(tables, None)
-            seen.number(own, header.ordered)
+            columns, following = _columns(file, following), next(tables, None)
+            seen.number(columns, header.ordered)
             after = {} if following is None else _columns(file, following.slice(0, window))
             if window and after:
                 seen.peek(after)
-            whole, context = _with_context(before, own, after if window else {})
-            rows = len(own["segment"])
-            yield Piece(whole, header, first, context, rows, int(own["segment"][-1]))
-            before = {name: values[max(0, rows - window) :] for name, values in own.items()} if window else {}
+            whole, context = _with_context(before, columns, after if window else {})
+            rows = len(columns["segment"])
+            yield Piece(whole, header, first, context, rows, int(columns["segment"][-1]))
+            before = {name: x[max(0, rows - window) :] for name, x in columns.items()} if window else {}
             first += rows
 
 
@@ -123,16 +123,16 @@ def _columns(file: Path, table: pa.Table) -> Columns:
     return columns | {"segment": columns.get("segment", np.zeros(table.num_rows, np.int64))}
 
 
-def _with_context(before: Columns, own: Columns, after: Columns) -> tuple[Columns, int]:
+def _with_context(before: Columns, columns: Columns, after: Columns) -> tuple[Columns, int]:
     """A piece with the rows around it that belong to its first and last trajectory."""
     if before:
-        same = before["segment"] == own["segment"][0]
+        same = before["segment"] == columns["segment"][0]
         before = {name: values[same] for name, values in before.items()}
     if after:
-        same = after["segment"] == own["segment"][-1]
+        same = after["segment"] == columns["segment"][-1]
         after = {name: values[same] for name, values in after.items()}
-    parts = [part for part in (before, own, after) if part]
-    return {name: np.concatenate([part[name] for part in parts]) for name in own}, (
+    parts = [part for part in (before, columns, after) if part]
+    return {name: np.concatenate([part[name] for part in parts]) for name in columns}, (
         len(before["segment"]) if before else 0
     )
 
@@ -144,7 +144,7 @@ class _Trajectories:
         self.source, self.last_number = source, number
         self.raw: float | None = None
         self.time = -np.inf
-        self.known: set[float] = set()
+        self.segments: set[float] = set()
 
     def number(self, columns: Columns, ordered: bool) -> None:
         """Replace the segments of the next rows by numbers that go on from those before."""
@@ -159,15 +159,15 @@ class _Trajectories:
         starts = np.append(self.raw is not None and raw[0] != self.raw, raw[1:] != raw[:-1])
         fresh = {float(raw[0])} if self.raw is None else set()
         fresh |= set(raw[starts].astype(float).tolist())
-        again = fresh & self.known
-        if ordered and (again or len(fresh) < int(starts.sum()) + (self.raw is None)):
-            which = next(iter(again), None)
+        repeated = fresh & self.segments
+        if ordered and (repeated or len(fresh) < int(starts.sum()) + (self.raw is None)):
+            which = next(iter(repeated), None)
             raise DataError(
                 f"{self.source}: the rows of a segment are not together",
                 got=None if which is None else f"segment {which:g} again",
                 hint="sort the log by 'segment' and 't'",
             )
-        self.known |= fresh
+        self.segments |= fresh
         columns["segment"] = self._counted(starts)
         self.raw, self.last_number = float(raw[-1]), int(columns["segment"][-1])
         self.time = -np.inf if t is None else float(t[-1])
@@ -232,8 +232,8 @@ class StreamedDataset:
     @cached_property
     def files(self) -> tuple[Path, ...]:
         """The files as paths."""
-        given = (self.paths,) if isinstance(self.paths, str | Path) else self.paths
-        return tuple(map(Path, given))
+        paths = (self.paths,) if isinstance(self.paths, str | Path) else self.paths
+        return tuple(map(Path, paths))
 
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:
@@ -275,14 +275,14 @@ class StreamedDataset:
             for piece in pieces_of(path, PIECE_ROWS, window, number):
                 number = piece.last_segment
                 count += 1
-                own = count > start and (count - 1) % share[1] == share[0]
-                if own or first is None:
+                in_share = count > start and (count - 1) % share[1] == share[0]
+                if in_share or first is None:
                     data = self._dataset(path, piece)
                     first = data[:1] if first is None else first
                     _check_alike(path, first, data)
-                    if own:
+                    if in_share:
                         yield data
-                if count > start and not own:
+                if count > start and not in_share:
                     yield first[:0]
             number += 1
 
@@ -326,18 +326,18 @@ def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = Non
         DataError: there are no pieces.
     """
     kept: list[tuple[Tensor, Dataset]] = []
-    step, seen = 1, 0
+    step, total = 1, 0
     for piece in pieces:
         rows = torch.arange(len(piece), device=piece.device) if keep is None else keep(piece)
-        place = seen + torch.arange(len(rows), device=piece.device)
-        own = place % step == 0
-        kept.append((place[own], piece[rows[own]]))
-        seen += len(rows)
+        place = total + torch.arange(len(rows), device=piece.device)
+        chosen = place % step == 0
+        kept.append((place[chosen], piece[rows[chosen]]))
+        total += len(rows)
         while sum(len(place) for place, _ in kept) >= 2 * count:
             step *= 2
             kept = [(place[place % step == 0], data[place % step == 0]) for place, data in kept]
         kept = [part for i, part in enumerate(kept) if len(part[0]) or i == 0]
-    return _joined([data for _, data in kept]), seen
+    return _joined([data for _, data in kept]), total
 
 
 def _joined(parts: list[Dataset]) -> Dataset:

@@ -150,11 +150,11 @@ def _check_count(file: Path, columns: int) -> None:
 
 def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
     """Check that no list or struct lies inside a column of numbers: a name also selects what is inside it."""
-    known = set(usable)
+    names = set(usable)
     for path in paths:
-        parts = path.split(".") if path not in known else []
+        parts = path.split(".") if path not in names else []
         for n in range(1, len(parts)):
-            if ".".join(parts[:n]) in known:
+            if ".".join(parts[:n]) in names:
                 outer = ".".join(parts[:n])
                 raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
 
@@ -225,12 +225,12 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
         for field in schema
         if kinds.is_floating(field.type) or kinds.is_integer(field.type) or kinds.is_boolean(field.type)
     ]
-    known = set(numeric)
-    left_out = [name for name in names if name not in known]
+    numeric_names = set(numeric)
+    ignored = [name for name in names if name not in numeric_names]
     # A text column that should be numbers is reported by name once it is missed; the rest is harmless.
-    if left_out:
+    if ignored:
         warnings.warn(
-            f"{file}: columns that hold no numbers are left out: {', '.join(left_out)}",
+            f"{file}: columns that hold no numbers are left out: {', '.join(ignored)}",
             IgnoredColumnsWarning,
             stacklevel=5,
         )

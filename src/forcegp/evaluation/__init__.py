@@ -218,11 +218,11 @@ def _predictors(
 
     error = predicted.mean - data.qdd
     torque = as_torque(system, data.q, error)
-    found = [score("model", error, torque, None if spread is None else spread.nlpd)]
+    scores = [score("model", error, torque, None if spread is None else spread.nlpd)]
     for name, (error, torque, std) in _trivial(system, data, train).items():
         certain = bool((std == 0.0).any())
-        found.append(score(name, error, torque, None if certain else nlpd(error, std)))
-    return tuple(found)
+        scores.append(score(name, error, torque, None if certain else nlpd(error, std)))
+    return tuple(scores)
 
 
 def _trivial(
@@ -231,12 +231,12 @@ def _trivial(
     """Errors, errors as torques and standard deviations, `(n, nq)`, never on their own training data."""
     half = len(data) // 2
     parts = [(train, data)] if train is not None else [(data[half:], data[:half]), (data[:half], data[half:])]
-    found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
-    for known, new in parts:
-        if len(known) < FEWEST_TRAINING:
+    errors: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
+    for training, new in parts:
+        if len(training) < FEWEST_TRAINING:
             return {}
-        for baseline in baselines(system, known):
+        for baseline in baselines(system, training):
             error = baseline.predict(new) - new.qdd
             torque = as_torque(baseline.system, new.q, error)
-            found.setdefault(baseline.name, []).append((error, torque, baseline.std.expand_as(error)))
-    return {name: tuple(map(torch.cat, zip(*rows, strict=True))) for name, rows in found.items()}  # pyright: ignore[reportReturnType]
+            errors.setdefault(baseline.name, []).append((error, torque, baseline.std.expand_as(error)))
+    return {name: tuple(map(torch.cat, zip(*rows, strict=True))) for name, rows in errors.items()}  # pyright: ignore[reportReturnType]

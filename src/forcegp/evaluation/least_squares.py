@@ -86,11 +86,11 @@ def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
         weight = noise.clamp(min=1e-9) ** -2
         gram = torch.einsum("j,jkl->kl", weight, G) + torch.eye(len(prior), dtype=prior.dtype)
         theta, x = _minimise(robot, gram, weight @ g, prior[:split], theta, x[split:])
-        left = y2 - 2.0 * g @ x + torch.einsum("k,jkl,l->j", x, G, x)
-        noise = (left.clamp(min=0.0) / len(train)).sqrt()
+        square_error = y2 - 2.0 * g @ x + torch.einsum("k,jkl,l->j", x, G, x)
+        noise = (square_error.clamp(min=0.0) / len(train)).sqrt()
     mass, com, inertia = from_pseudo_inertia(from_log_cholesky(theta))
-    found = robot.replace(mass=mass, com=com, inertia=inertia)
-    return LeastSquares(system.with_robot(found), x[split:] * prior[split:])
+    identified = robot.replace(mass=mass, com=com, inertia=inertia)
+    return LeastSquares(system.with_robot(identified), x[split:] * prior[split:])
 
 
 def _friction_columns(robot: RobotModel, qd: Tensor) -> Tensor:
@@ -241,8 +241,8 @@ def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
         "least squares": (identified.system, identified.predict),
     }
     return [
-        Baseline(name, own, predict, ((predict(train) - train.qdd) ** 2).mean(0).sqrt())
-        for name, (own, predict) in predictors.items()
+        Baseline(name, mechanics, predict, ((predict(train) - train.qdd) ** 2).mean(0).sqrt())
+        for name, (mechanics, predict) in predictors.items()
     ]
 
 

@@ -215,7 +215,7 @@ def verdicts(scores: Sequence[PredictorScores], joint_names: Sequence[str]) -> t
         joint_names: one per error.
     """
     model, *others = scores
-    found = []
+    result = []
     for other in others:
         ratios = {
             unit: _ratios(getattr(model, unit), getattr(other, unit)) for unit in ("torque", "acceleration")
@@ -226,8 +226,8 @@ def verdicts(scores: Sequence[PredictorScores], joint_names: Sequence[str]) -> t
         ]  # fmt: skip
         worse = ["every joint"] if len(worse) == len(joint_names) else worse
         means = {unit: math.exp(sum(map(math.log, r)) / len(r)) for unit, r in ratios.items()}
-        found.append(Verdict(other.name, **means, worse=tuple(worse)))
-    return tuple(found)
+        result.append(Verdict(other.name, **means, worse=tuple(worse)))
+    return tuple(result)
 
 
 def _ratios(ours: JointErrors, theirs: JointErrors) -> list[float]:
@@ -235,10 +235,10 @@ def _ratios(ours: JointErrors, theirs: JointErrors) -> list[float]:
     return [max(a or 0.0, TINY) / max(b or 0.0, TINY) for a, b in pairs]
 
 
-def sentence(found: Sequence[Verdict]) -> str:
+def sentence(comparisons: Sequence[Verdict]) -> str:
     """The verdict in one sentence, or "" where there was nothing to compare with."""
-    better = _listed([_noun(v.against) for v in found if v.better])
-    worse = _listed([_noun(v.against) for v in found if not v.better])
+    better = _listed([_noun(v.against) for v in comparisons if v.better])
+    worse = _listed([_noun(v.against) for v in comparisons if not v.better])
     parts = [f"is better than {better}"] if better else []
     parts += [f"is not better than {worse}"] if worse else []
     return f"The model {', but '.join(parts)}." if parts else ""

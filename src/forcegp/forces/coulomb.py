@@ -117,20 +117,22 @@ class CoulombErrorPrior(ForcePrior):
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         if self.contact not in system.contact_names:
             return at.q.new_zeros(*at.q.shape, LEARNED)
-        own = next(f for f in self.friction if f.contact == self.contact)
+        law = next(f for f in self.friction if f.contact == self.contact)
         v, u = (
             at.eom.contact_points[self.contact].sliding[1],
-            against_sliding(at, self.contact, own.smoothing),
+            against_sliding(at, self.contact, law.smoothing),
         )
+        # μ λ̂, with λ̂ under Q_C + Q_G + Q_D + Q_u and all friction
         Q_bar = with_coulomb(system, at, at.eom.Q_K + at.tau, self.friction)
-        load = own.coefficient * at.eom.multiplier(Q_bar)[:, _row(system, self.contact)]
-        # ∂s/∂log ε = −s ε²/(|v|² + ε²)
-        fading = own.smoothing**2 / (v.square().sum(-1) + own.smoothing**2)
+        load = law.coefficient * at.eom.multiplier(Q_bar)[:, _row(system, self.contact)]
+        # ∂(μ u)/∂log μ = μ u, ∂s/∂log ε = −s ε²/(|v|² + ε²)
+        fading = law.smoothing**2 / (v.square().sum(-1) + law.smoothing**2)
         return torch.stack([load, -load * fading], dim=-1)[:, None, :] * u[..., None]
 
 
 def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tensor:
     """u = −J_Eᵀ s(v), the generalized force of a unit friction force, `(n, nq)`."""
+    # s = v/√(|v|² + ε²)
     J, v = at.eom.contact_points[contact].sliding
     return -(J.mT @ (v / (v.square().sum(-1, keepdim=True) + smoothing**2).sqrt())[..., None])[..., 0]
 
@@ -149,6 +151,7 @@ def coupled(
     gain = _gain(system, at, friction)
     if gain is None:
         return z
+    # G = B_z U (I + LᵀU)⁻¹; B_Q − G Lᵀ, B_z − G Lᵀ, o + G (A M⁻¹ Aᵀ)⁺ b
     G = z.B_z @ gain
     back = G @ at.eom.L.mT
     offset = (G @ (at.eom.constraint_inertia @ at.eom.b[..., None]))[..., 0]
@@ -162,6 +165,7 @@ def with_coulomb(
     gain = _gain(system, at, friction)
     if gain is None:
         return Q_bar
+    # λ₀ = (A M⁻¹ Aᵀ)⁺ (b − A M⁻¹ Q̄′), Q̄ = Q̄′ + U (I + LᵀU)⁻¹ λ₀
     return Q_bar + (gain @ at.eom.multiplier(Q_bar)[..., None])[..., 0]
 
 
@@ -188,6 +192,7 @@ def below_jamming(
         key, row = coulomb_keys(prior.contact)[0], _row(system, prior.contact)
         if key in changed:
             gains = [_drag(m.at(system), prior.contact, row) for m in measurements]
+            # 1 + μ Lᵀu > 0, so μ < −1/Lᵀu wherever Lᵀu < 0
             worst = float(torch.cat(gains).min())
             low, high = changed[key]
             if worst < 0.0:
@@ -210,13 +215,15 @@ def _gain(system: ConstrainedSystem, at: States, friction: Sequence[CoulombFrict
     present = {f.contact: f for f in friction if f.contact in system.contact_names}
     if not present:
         return None
+    # U = (μ u of each contact, 0 without friction)
     columns = []
     for contact in system.contacts:
-        own = present.get(contact.name)
-        if own is None:
+        law = present.get(contact.name)
+        if law is None:
             columns.append(at.q.new_zeros(*at.q.shape, contact.rows))
         else:
-            columns.append((own.coefficient * against_sliding(at, contact.name, own.smoothing))[..., None])
+            columns.append((law.coefficient * against_sliding(at, contact.name, law.smoothing))[..., None])
+    # G (I + LᵀU) = U
     U = torch.cat(columns, dim=-1)
     eye = torch.eye(U.shape[-1], dtype=U.dtype, device=U.device)
     return torch.linalg.solve(eye + at.eom.L.mT @ U, U, left=False)

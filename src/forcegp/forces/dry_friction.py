@@ -76,9 +76,9 @@ def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFricti
     others = [p for p, prior in enumerate(priors) if not prior.sticks]
 
     def sliding(direction: float, faster: float = 0.0) -> Tensor:
-        there = dataclasses.replace(at, slip=torch.full_like(at.qd, direction), qd=at.qd + faster)
-        known = mean(system, there)
-        return known if unknown is None else known + unknown.unknown_force(system, there, sticking)
+        moved = dataclasses.replace(at, slip=torch.full_like(at.qd, direction), qd=at.qd + faster)
+        force = mean(system, moved)
+        return force if unknown is None else force + unknown.unknown_force(system, moved, sticking)
 
     # Only friction is read at another speed: all else that depends on it stands in the equations of motion.
     forward, backward = sliding(1.0), sliding(-1.0)

@@ -41,12 +41,13 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)
     hidden = [prior.target == CONSTRAINT for prior in posterior.priors]
-    operators = (torch.zeros_like(W) if own else W for own, W in zip(hidden, rows.operators, strict=True))
+    operators = (torch.zeros_like(W) if hide else W for hide, W in zip(hidden, rows.operators, strict=True))
     covariance = posterior.latent.covariance(dataclasses.replace(rows, operators=tuple(operators)))
+    # Cov(Q_i, Q_z,i)/√(Var Q_i Var Q_z,i)
     nq = system.robot.nq
     cross = covariance[:, :nq, nq:].diagonal(dim1=-2, dim2=-1)
-    own = covariance.diagonal(dim1=-2, dim2=-1)
-    scale = (own[:, :nq] * own[:, nq:]).sqrt()
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    scale = (variance[:, :nq] * variance[:, nq:]).sqrt()
     return torch.where(scale > 0.0, cross / scale.where(scale > 0.0, 1.0), 0.0).clamp(-1.0, 1.0)
 
 
@@ -79,9 +80,9 @@ def doubts_of(posterior: ForcePosterior, system: ConstrainedSystem, training: Tr
     for m in (m for m in closed if len(m.q)):
         at = m.at(system)
         mean, covariance = posterior.read(system, at, affine_map(system, at, "multiplier"))
-        own = system.active_rows(m.active, m.active.shape[:-1])
-        means.append(mean[own])
-        variances.append(covariance.diagonal(dim1=-2, dim2=-1)[own])
+        loaded = system.active_rows(m.active, m.active.shape[:-1])
+        means.append(mean[loaded])
+        variances.append(covariance.diagonal(dim1=-2, dim2=-1)[loaded])
         if {JOINT, CONTACT} <= targets:
             correlations.append(force_correlation(posterior, system, at))
     correlation = float(torch.cat(correlations).mean()) if correlations else None

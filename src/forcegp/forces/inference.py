@@ -1,7 +1,6 @@
-"""Conditioning forces on data: exactly, or sparsely through the features and inducing points of their
-priors.
+"""Conditioning forces on data: exactly, or sparsely through the features and inducing points of their priors.
 
-Sparse conditioning piece by piece: the sums over samples, and the posterior that they give.
+Sparse conditioning goes piece by piece: it sums over samples, and the sums determine the posterior.
 """
 
 from __future__ import annotations
@@ -39,14 +38,12 @@ class Totals:
 
     Attributes:
         sums: over the whitened rows.
-        central: the same where forces that the robot contains are known to be zero; `None` without any.
         constant: part of the negative log likelihood that no latent force changes `()`.
         samples: number of samples `()`.
         pieces: how many pieces.
     """
 
     sums: Sums
-    central: Sums | None
     constant: Tensor
     samples: Tensor
     pieces: int
@@ -55,14 +52,12 @@ class Totals:
     def zero(cls, problem: Problem, basis: LatentBasis) -> Totals:
         """Of no samples."""
         like = next(iter(basis.params.values()))
-        central = Sums.zero(basis, like) if problem.pinned else None
-        return cls(Sums.zero(basis, like), central, like.new_zeros(()), like.new_zeros(()), 0)
+        return cls(Sums.zero(basis, like), like.new_zeros(()), like.new_zeros(()), 0)
 
     def over_processes(self) -> Totals:
         """The totals of all processes of `torch.distributed` added, the same in each of them."""
-        central = None if self.central is None else reduce_sums(self.central)
         constant, samples = add_over_processes(torch.stack([self.constant, self.samples])).unbind()
-        return Totals(reduce_sums(self.sums), central, constant, samples, self.pieces)
+        return Totals(reduce_sums(self.sums), constant, samples, self.pieces)
 
 
 def basis_of(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> LatentBasis:
@@ -98,14 +93,10 @@ def total_over(
     """
     total = begin or Totals.zero(problem, basis)
     for piece in pieces:
-        own = dataclasses.replace(problem, training=piece)
-        rows, central = own.rows(hyperparameters), total.central
-        if central is not None:
-            known = own.silenced(own.of_means().rows(hyperparameters).blocks)
-            central = central + accumulate(basis, known)
+        piece_problem = dataclasses.replace(problem, training=piece)
+        rows = piece_problem.rows(hyperparameters)
         total = Totals(
             total.sums + accumulate(basis, rows.blocks),
-            central,
             total.constant + rows.constant,
             total.samples + piece.samples,
             total.pieces + 1,
@@ -122,12 +113,12 @@ def posterior_of(
     Raises:
         NumericalError: the sums are not finite, or the noise is rounding beside the prior.
     """
+    # A = I + Σ V S Vᵀ, w ~ N(A⁻¹v, A⁻¹)
     latent = SparsePosterior.of(basis, total.sums)
     latent.require_resolved()
-    central = None if total.central is None else SparsePosterior.of(basis, total.central)
     scales, coulomb = problem.training.scales, problem.coulomb(hyperparameters)
     priors = problem.priors_at(hyperparameters)
-    return ForcePosterior(priors, scales, problem.mean, latent, central, coulomb)
+    return ForcePosterior(priors, scales, problem.mean, latent, problem.pins(), coulomb)
 
 
 METHODS = ("auto", "exact", "sparse")
@@ -239,12 +230,10 @@ def forces_and_constant(
     scales, params = problem.training.scales, kernel_parameters(hyperparameters)
     rows = problem.rows(hyperparameters)
     require_exact_fits(rows.blocks, learning=False)
-    latent, central = ExactPosterior.of(problem.priors, params, rows.blocks), None
-    if problem.pinned:
-        known = problem.silenced(problem.of_means().rows(hyperparameters).blocks)
-        central = ExactPosterior.of(problem.priors, params, known)
+    # f | y ~ N(k Wᵀ Σ⁻¹ y, k − k Wᵀ Σ⁻¹ W k), Σ = W k Wᵀ + I (eqs. 22 to 24)
+    latent = ExactPosterior.of(problem.priors, params, rows.blocks)
     coulomb, priors = problem.coulomb(hyperparameters), problem.priors_at(hyperparameters)
-    posterior = ForcePosterior(priors, scales, problem.mean, latent, central, coulomb)
+    posterior = ForcePosterior(priors, scales, problem.mean, latent, problem.pins(), coulomb)
     return posterior, rows.constant
 
 
@@ -265,16 +254,16 @@ def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[s
     """
     if not isinstance(posterior.latent, SparsePosterior):
         return {"inference": "exact"}, ()
-    found = posterior.latent.diagnostics
+    diagnostics = posterior.latent.diagnostics
     warnings = (
-        f"more inducing points would help: {found.size} basis functions miss a variance of "
-        f"{found.missed:.3g} in units of the noise, where noise leaves {found.learned:.3g}; raise "
-        "inducing_points",
+        f"more inducing points would help: {diagnostics.size} basis functions miss a variance of "
+        f"{diagnostics.missed:.3g} in units of the noise, where noise leaves {diagnostics.learned:.3g}; "
+        "raise inducing_points",
     )
     return {
         "inference": "sparse",
-        "basis_functions": found.size,
-        "determined": found.learned,
-        "missed": found.missed,
-        "more_points_would_help": found.more_points_would_help,
-    }, warnings if found.more_points_would_help else ()
+        "basis_functions": diagnostics.size,
+        "determined": diagnostics.learned,
+        "missed": diagnostics.missed,
+        "more_points_would_help": diagnostics.more_points_would_help,
+    }, warnings if diagnostics.more_points_would_help else ()

@@ -127,11 +127,12 @@ class Sums:
 
     def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
         """H and h of H δ = h, with friction at its best; of Σ_j |ε_j|²/s_j² without instruments."""
+        # Friction eliminated, by Schur complement: H_j = G_δδ − G_δf (G_ff + D)⁻¹ G_fδ, H = Σ_j H_j/s_j²
         p = self.unknowns
-        known = torch.cat([self.gram[:, p:, :p], self.right[:, p:, None]], dim=-1)
-        left = torch.cat([self.gram[:, :p, :p], self.right[:, :p, None]], dim=-1)
-        left = left - self.gram[:, :p, p:] @ torch.linalg.solve(self._stiff(), known)
-        H, h = left[..., :-1], left[..., -1]
+        friction = torch.cat([self.gram[:, p:, :p], self.right[:, p:, None]], dim=-1)
+        reduced = torch.cat([self.gram[:, :p, :p], self.right[:, :p, None]], dim=-1)
+        reduced = reduced - self.gram[:, :p, p:] @ torch.linalg.solve(self._stiff(), friction)
+        H, h = reduced[..., :-1], reduced[..., -1]
         weight = noise**-2
         return torch.einsum("j,jpq->pq", weight, H), weight @ h
 
@@ -196,9 +197,9 @@ def bristles(m: Measurement) -> Tensor:
         b[lag:] = b[lag:] + a[lag:] * b[:-lag].clone()
         a[lag:] = a[lag:] * a[:-lag].clone()
         lag *= 2
-    found = torch.empty_like(b)
-    found[order] = b
-    return found
+    z = torch.empty_like(b)
+    z[order] = b
+    return z
 
 
 def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
@@ -207,12 +208,12 @@ def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
     By less where velocities would change too much meanwhile, but never by less than the span of a filter that
     the log states [s]: noise within it is correlated, and instruments have that noise too.
     """
-    found = torch.full((len(m.t),), -1, device=m.t.device)
+    later = torch.full((len(m.t),), -1, device=m.t.device)
     order = _in_time(m)
     t, qd, segment = m.t[order], m.qd[order], m.segment[order]
     steps = t.diff()[segment[1:] == segment[:-1]]
     if not len(steps) or float(steps.median()) <= 0.0:
-        return found
+        return later
     step, scale = float(steps.median()), qd.square().mean(0).clamp(min=1e-300)
     least = max(1, math.ceil(filter_span / step - 1e-6))
     for lag in range(least, max(least, round(APART / step)) + 1):
@@ -221,9 +222,9 @@ def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
         spanned = lag == least > 1
         if int(near.sum()) < LEAST or (not spanned and float(coherence.median()) < COHERENT):
             break
-        found.fill_(-1)
-        found[order[:-lag][near]] = order[lag:][near]
-    return found
+        later.fill_(-1)
+        later[order[:-lag][near]] = order[lag:][near]
+    return later
 
 
 def _rows(
@@ -253,9 +254,9 @@ def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
     """
     weighted = moving[..., None] * Phi
     w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
-    left = (residual - (Phi * w).sum(-1)).square()
+    square = (residual - (Phi * w).sum(-1)).square()
     at_rest, sliding = (
-        (part * left).sum(0) / part.sum(0).clamp(min=1) for part in ((~moving).double(), moving.double())
+        (part * square).sum(0) / part.sum(0).clamp(min=1) for part in ((~moving).double(), moving.double())
     )
     sticks = (at_rest > SCATTER * sliding) & (moving.double().mean(0) >= MOVES)
     return moving | ~sticks
@@ -289,13 +290,14 @@ def _equations(rows: Rows, columns: Tensor, paired: bool = False) -> tuple[Tenso
 
 def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> Sums:
     """Σ ZᵀX, Σ Zᵀr and Σ s r; X holds a column of ones, which is zero for what does not count."""
-    found = []
+    groups = []
     for g in range(int(rows.group.max()) + 1):
-        own = rows.group == g
-        z, x = Z[own].transpose(0, 1), X[own].transpose(0, 1)
-        count = (X[own] != 0.0).any(-1).sum(0).to(r.dtype).clamp(min=1.0)
-        found.append((z.mT @ x, (z.mT @ r[own].mT[..., None])[..., 0], (s[own] * r[own]).sum(0), count))
-    gram, right, square, count = (torch.stack(parts) for parts in zip(*found, strict=True))
+        inside = rows.group == g
+        z, x = Z[inside].transpose(0, 1), X[inside].transpose(0, 1)
+        count = (X[inside] != 0.0).any(-1).sum(0).to(r.dtype).clamp(min=1.0)
+        right = (z.mT @ r[inside].mT[..., None])[..., 0]
+        groups.append((z.mT @ x, right, (s[inside] * r[inside]).sum(0), count))
+    gram, right, square, count = (torch.stack(parts) for parts in zip(*groups, strict=True))
     return Sums(gram, right, square, count, X.shape[-1] - rows.friction.shape[-1])
 
 
@@ -318,11 +320,11 @@ def acceleration_errors(rows: Rows, by_stretch: Sums, columns: Tensor, delta: Te
         delta: unknowns.
         M: mass matrix with them.
     """
-    left, errors = rows.residual - columns @ delta, []
+    residual, errors = rows.residual - columns @ delta, []
     for g in range(len(by_stretch.gram)):
-        own = rows.group == g
-        force = left[own] - (rows.friction[own] * by_stretch.without(g).friction(delta)).sum(-1)
-        missed = torch.linalg.solve(M[own], (rows.slides[own] * force)[..., None])[..., 0]
+        inside = rows.group == g
+        force = residual[inside] - (rows.friction[inside] * by_stretch.without(g).friction(delta)).sum(-1)
+        missed = torch.linalg.solve(M[inside], (rows.slides[inside] * force)[..., None])[..., 0]
         errors.append(missed.square().mean(0))
     return torch.stack(errors)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,7 +20,6 @@ from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.kernels import sub
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.gp.structured_covariance import Block
 
 Tensors = dict[str, Tensor]
 OWN = tuple(name + "." for name in RESERVED)
@@ -61,9 +60,8 @@ class Problem:
         power: κ, which the likelihood is raised to; below 1 where samples are correlated.
         correlation: how long the noise of each torque is correlated, `(nq,)` [s]; `None` where that is not
             known.
-        offsets: prior means of latent forces, by prior.
-        pinned: priors whose force has mean zero from here on, since the robot contains it; the others are
-            conditioned on that, and only the uncertainty of the pinned ones remains.
+        pinned: by prior, value `(components,)` of a latent force that the robot contains: its prior mean is
+            minus this value, its posterior mean zero, and the others are conditioned on that.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
         state_std: standard deviation of the noise of q and q̇, `(2 nq,)`, or `None` for none.
     """
@@ -76,9 +74,8 @@ class Problem:
     torque_std: Tensor | None = None
     power: float = 1.0
     correlation: Tensor | None = None
-    offsets: Mapping[str, Tensor] = field(default_factory=dict)
     inducing: tuple[Features, ...] | None = None
-    pinned: tuple[str, ...] = ()
+    pinned: Mapping[str, Tensor] = field(default_factory=dict)
     state_std: Tensor | None = None
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
@@ -154,7 +151,7 @@ class Problem:
                     m,
                     self.noise_at(tensors, i),
                     force_noise,
-                    self.offsets,
+                    {name: -value for name, value in self.pinned.items()},
                     friction,
                     self.state_factor(system, i),
                     None if self.training.weights is None else self.training.weights[i],
@@ -163,21 +160,10 @@ class Problem:
             ]
         ).tempered(self.power)
 
-    def of_means(self) -> Problem:
-        """The problem that posterior means are read from, in which pinned forces are known to be zero."""
-        return dataclasses.replace(self, offsets={}, pinned=())
-
-    def silenced(self, blocks: Sequence[Block]) -> list[Block]:
-        """Rows that pinned forces do not act on."""
-        keep = [prior.name not in self.pinned for prior in self.priors]
-        return [
-            Block(
-                b.features,
-                tuple(W if k else torch.zeros_like(W) for W, k in zip(b.operators, keep, strict=True)),
-                b.target,
-            )
-            for b in blocks
-        ]
+    def pins(self) -> dict[int, Tensor]:
+        """The pinned values by number of the prior."""
+        names = [prior.name for prior in self.priors]
+        return {names.index(name): value for name, value in self.pinned.items()}
 
     @cached_property
     def fixed_rows(self) -> WhitenedRows:

@@ -133,23 +133,23 @@ class Training:
         """All samples but some rows of one measurement."""
         kept = [torch.ones(len(m.q), dtype=torch.bool, device=m.q.device) for m in self.measurements]
         kept[measurement][rows] = False
-        return self.of_rows([own.nonzero()[:, 0] for own in kept])
+        return self.of_rows([mask.nonzero()[:, 0] for mask in kept])
 
     def of_rows(self, rows: Sequence[Tensor]) -> Training:
         """Some rows of each measurement."""
         return dataclasses.replace(
             self,
             part_of=0,
-            measurements=tuple(m[own] for m, own in zip(self.measurements, rows, strict=True)),
+            measurements=tuple(m[index] for m, index in zip(self.measurements, rows, strict=True)),
             noise_std=tuple(
-                std[own] if std.ndim == 2 else std for std, own in zip(self.noise_std, rows, strict=True)
+                std[index] if std.ndim == 2 else std for std, index in zip(self.noise_std, rows, strict=True)
             ),
             weights=None
             if self.weights is None
-            else tuple(w[own] for w, own in zip(self.weights, rows, strict=True)),
+            else tuple(w[index] for w, index in zip(self.weights, rows, strict=True)),
             slopes=None
             if self.slopes is None
-            else tuple(None if G is None else G[own] for G, own in zip(self.slopes, rows, strict=True)),
+            else tuple(None if G is None else G[index] for G, index in zip(self.slopes, rows, strict=True)),
         )
 
     def joined(self, more: Training, noise_std: Sequence[Tensor]) -> Training:
@@ -197,21 +197,21 @@ def without_impacts(training: Training, system: ConstrainedSystem) -> tuple[Trai
         every = torch.ones(len(m.q), dtype=torch.bool, device=m.q.device)
         good = _persists(system, m, std) if m.quantity == "qdd" else every
         kept.append(good.nonzero()[:, 0])
-    left_out = sum(len(m.q) - len(rows) for m, rows in zip(training.measurements, kept, strict=True))
-    return (training.of_rows(kept), left_out) if left_out else (training, 0)
+    dropped = sum(len(m.q) - len(rows) for m, rows in zip(training.measurements, kept, strict=True))
+    return (training.of_rows(kept), dropped) if dropped else (training, 0)
 
 
 def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
     """Whether |A q̈ − b| of each sample is within the usual, `(n,)` bool; free motion always is."""
     eom = system.equations(m.q, m.qd, m.active)
-    apart = (eom.A @ m.values[..., None])[..., 0] - eom.b
+    violation = (eom.A @ m.values[..., None])[..., 0] - eom.b
     noise = (eom.A.square() @ std.expand_as(m.values)[..., None].square())[..., 0].sqrt()
     closed = noise > 0.0
-    ratio = torch.where(closed, apart.abs() / torch.where(closed, noise, 1.0), 0.0)
+    ratio = torch.where(closed, violation.abs() / torch.where(closed, noise, 1.0), 0.0)
     good = torch.ones(len(m.q), dtype=torch.bool, device=m.q.device)
     for row in range(ratio.shape[-1]):
-        own = closed[:, row]
-        if bool(own.any()):
-            scale = max(1.0, MAD_TO_STD * float(ratio[own, row].median()))
+        in_contact = closed[:, row]
+        if bool(in_contact.any()):
+            scale = max(1.0, MAD_TO_STD * float(ratio[in_contact, row].median()))
             good &= ratio[:, row] <= FAR * scale
     return good

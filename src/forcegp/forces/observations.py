@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -77,12 +78,6 @@ def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observati
             "there are no samples to learn from", expected="at least one observation", got="none"
         )
     return observations
-
-
-def is_simulated(observations: Sequence[Observation]) -> bool:
-    """Whether a simulator made the data: only simulators state a seed or know noise-free accelerations."""
-    logs = [observation.data for observation in observations]
-    return any(log.header.seed is not None or "qdd_clean" in log.extras for log in logs)
 
 
 def states_noise(observations: Sequence[Observation]) -> bool:
@@ -196,20 +191,32 @@ def training_of(
     """
     observations = observations_of(data)
     pairs = [measurement_of(o, system, noise_std) for o in observations]
+    training = Training(
+        measurements=tuple(m for m, _ in pairs),
+        noise_std=tuple(std for _, std in pairs),
+        scales=(),
+        period=_period(observations[0].data),
+        filter_span=max(o.data.header.filter_span or 0.0 for o in observations),
+    )
+    return scaled(training, system, priors, kept, standardize)
+
+
+def scaled(
+    training: Training,
+    system: ConstrainedSystem,
+    priors: Sequence[ForcePrior],
+    kept: Mapping[str, Standardization],
+    standardize: bool = True,
+) -> Training:
+    """Training data with the input scales of priors; the arguments are those of `training_of`."""
     new = [prior for prior in priors if prior.name not in kept]
-    at = [m.at(system) for m, _ in pairs] if new else []
+    at = [m.at(system) for m in training.measurements] if new else []
     scales = dict(kept)
     for prior, features in [(prior, [prior.features(system, a) for a in at]) for prior in new]:
         together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
         own = Standardization.of(together, prior.vectors, prior.centred)
         scales[prior.name] = own if standardize and prior.scaled else Standardization.none(together)
-    return Training(
-        measurements=tuple(m for m, _ in pairs),
-        noise_std=tuple(std for _, std in pairs),
-        scales=tuple(scales[prior.name] for prior in priors),
-        period=_period(observations[0].data),
-        filter_span=max(o.data.header.filter_span or 0.0 for o in observations),
-    )
+    return dataclasses.replace(training, scales=tuple(scales[prior.name] for prior in priors))
 
 
 def _period(data: Dataset) -> float:

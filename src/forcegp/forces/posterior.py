@@ -1,12 +1,13 @@
-"""The posterior over latent forces, and every other quantity read off it (eqs. 22 to 25).
+"""The posterior over latent forces, which determines every other quantity (eqs. 22 to 25), and samples of it.
 
-Force functions drawn from the posterior: each is a deterministic force field that can be integrated.
+Each force function drawn from the posterior is a deterministic force field that can be integrated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -33,8 +34,8 @@ class ForcePosterior:
         priors, scales: the force priors and the standardization of their inputs.
         mean: prior mean of Q.
         latent: the conditioned processes.
-        central: processes that means are read from, where some forces are pinned to zero; `latent` by
-            default.
+        pinned: by number of the prior, value `(components,)` of a constant latent force that the robot
+            contains: it has mean zero, and only its uncertainty remains.
         coulomb: friction of contacts that is proportional to the multiplier.
     """
 
@@ -42,14 +43,22 @@ class ForcePosterior:
     scales: tuple[Standardization, ...]
     mean: ForceMean
     latent: LatentPosterior
-    central: LatentPosterior | None = None
+    pinned: Mapping[int, Tensor] = field(default_factory=dict)
     coulomb: tuple[CoulombFriction, ...] = ()
 
     def shift(self, p: int, features: Features) -> Tensor | float:
         """What samples of the latent force of prior p must be moved by to have the mean that is predicted."""
-        if self.central is None:
+        if not self.pinned:
             return 0.0
-        return self.central.latent_mean(p, features) - self.latent.latent_mean(p, features)
+        return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
+
+    @cached_property
+    def means(self) -> LatentPosterior:
+        """The processes that means are read from: those given the forces that the robot contains."""
+        means = self.latent
+        for p, value in self.pinned.items():
+            means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
+        return means
 
     def features_of(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         """Standardized kernel inputs of prior p at states."""
@@ -62,7 +71,8 @@ class ForcePosterior:
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
         """Posterior mean of Σ E f over some priors, `(n, nq)`, without Coulomb friction of contacts."""
-        means = self.central or self.latent
+        # Σ_p E_p μ_p
+        means = self.means
         pairs = [(p, self.priors[p]) for p in priors if means.measured[p]]
         parts = [(p, prior.features(system, at), prior.operator(system, at)) for p, prior in pairs]
         force: Tensor | float = 0.0
@@ -78,18 +88,20 @@ class ForcePosterior:
             at: n states.
             z: the quantity, without Coulomb friction of contacts.
         """
+        # W = B E, target o + B m (eqs. 12 and 15)
         z = coupled(system, at, z, self.coulomb) if self.coulomb else z
         return prior_rows(self.priors, self.scales, self.mean, system, at, z)
 
     def read(self, system: ConstrainedSystem, at: States, z: AffineMap) -> tuple[Tensor, Tensor]:
         """Posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, without measurement noise."""
+        # o + B (m + Σ E μ), and W Cov(f) Wᵀ (eqs. 23 to 25)
         rows = self.rows(system, at, z)
-        return rows.target + (self.central or self.latent).mean(rows), self.latent.covariance(rows)
+        return rows.target + self.means.mean(rows), self.latent.covariance(rows)
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
         """Posterior mean o + B(m + Σ E f) of a quantity at states, `(n, d)`."""
         rows = self.rows(system, at, z)
-        return rows.target + (self.central or self.latent).mean(rows)
+        return rows.target + self.means.mean(rows)
 
 
 CHUNK_STATES = 256
@@ -126,6 +138,7 @@ class ForceSamples:
         Returns:
             Q and Q_z `(samples, n, nq)`, or `(n, nq)` where `sample` is given [N m, N].
         """
+        # Q = m + Σ E f over joint forces, Q_z = Σ E f over contact forces (eq. 18)
         Q = self.posterior.mean(system, at)
         Q = Q if sample is not None else Q.expand(self.count, *Q.shape)
         Q_z = torch.zeros_like(Q)
@@ -134,6 +147,7 @@ class ForceSamples:
             latent = self.functions.latent(p, features, sample) + self.posterior.shift(p, features)
             force = (prior.operator(system, at) @ latent[..., None])[..., 0]
             Q, Q_z = (Q, Q_z + force) if prior.target == CONTACT else (Q + force, Q_z)
+        # Q_z ← Q̄ − Q, with Coulomb friction in Q̄
         return Q, with_coulomb(system, at, Q + Q_z, self.posterior.coulomb) - Q
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
@@ -146,6 +160,7 @@ class ForceSamples:
         Returns:
             `(samples · k, nq)` [N m, N].
         """
+        # Q̄ = m + Σ E f
         priors = range(len(self.posterior.priors))
         Q_bar = self.posterior.mean(system, at) + self.unknown_force(system, at, priors)
         return with_coulomb(system, at, Q_bar, self.posterior.coulomb)
@@ -162,11 +177,11 @@ class ForceSamples:
                 [
                     self.functions.by_runs(
                         p,
-                        {n: x[own.start * runs : own.stop * runs] for n, x in features.items()},
-                        own,
+                        {n: x[chunk.start * runs : chunk.stop * runs] for n, x in features.items()},
+                        chunk,
                         runs,
                     )
-                    for own in chunks
+                    for chunk in chunks
                 ]
             )
             force = force + self.posterior.shift(p, features)
@@ -185,5 +200,5 @@ def draw_samples(
         generator: source of randomness, on the CPU.
         features: random features per component; by default as many as the kind of posterior needs.
     """
-    given = () if features is None else (features,)
-    return ForceSamples(posterior, posterior.latent.draw(count, generator, *given))
+    size = () if features is None else (features,)
+    return ForceSamples(posterior, posterior.latent.draw(count, generator, *size))

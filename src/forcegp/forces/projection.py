@@ -57,6 +57,7 @@ class WhitenedRows:
         """
         if power == 1.0:
             return self
+        # Noise Σ/κ: √κ W, √κ y
         root = math.sqrt(power)
         blocks = [
             Block(b.features, tuple(root * W for W in b.operators), root * b.target) for b in self.blocks
@@ -67,16 +68,18 @@ class WhitenedRows:
 class _NullSpaceBasis(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, A: Tensor, rank: int) -> Tensor:
-        left, values, Vh = torch.linalg.svd(A, full_matrices=True)
-        ctx.save_for_backward(left[..., :rank], values[..., :rank], Vh)
+        # A = X Λ Vᵀ; the last columns of V span the null space of A
+        X, values, Vh = torch.linalg.svd(A, full_matrices=True)
+        ctx.save_for_backward(X[..., :rank], values[..., :rank], Vh)
         return Vh[..., rank:, :].mT
 
     @staticmethod
     def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None]:
-        left, values, Vh = ctx.saved_tensors
+        X, values, Vh = ctx.saved_tensors
         rank = values.shape[-1]
-        # The rank is given, so the pseudo-inverse needs no tolerance of its own.
-        pinv = (Vh[..., :rank, :].mT / values[..., None, :]) @ left.mT
+        # A⁺ = V Λ⁻¹ Xᵀ, without a tolerance, as the rank is given
+        pinv = (Vh[..., :rank, :].mT / values[..., None, :]) @ X.mT
+        # dU = −A⁺ dA U, so ∂F/∂A = −A⁺ᵀ ∂F/∂U Uᵀ
         return -(pinv.mT @ grad[0]) @ Vh[..., rank:, :], None
 
 
@@ -120,7 +123,7 @@ def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
     if low == high:
         return [(low, slice(None))]
     groups = ((value, (rank == value).nonzero()[:, 0]) for value in range(low, high + 1))
-    return [(value, own) for value, own in groups if len(own)]
+    return [(value, index) for value, index in groups if len(index)]
 
 
 @dataclass(frozen=True)
@@ -138,12 +141,12 @@ class _Rows:
     widths: tuple[int, ...]
     rows: Tensor
 
-    def of(self, own: Tensor | slice, U: Tensor) -> _Rows:
+    def of(self, index: Tensor | slice, U: Tensor) -> _Rows:
         """Uᵀ times the rows of some samples, or of all of them where `own` is a slice."""
-        if isinstance(own, slice):
+        if isinstance(index, slice):
             return _Rows(self.features, self.widths, U.mT @ self.rows)
-        features = tuple({name: x[own] for name, x in f.items()} for f in self.features)
-        return _Rows(features, self.widths, U.mT @ self.rows[own])
+        features = tuple({name: x[index] for name, x in f.items()} for f in self.features)
+        return _Rows(features, self.widths, U.mT @ self.rows[index])
 
     def whitened(self, weight: Tensor | None) -> tuple[Block, Tensor]:
         """The rows divided by the factor of I + N Nᵀ, and the log determinant of the factors.
@@ -154,13 +157,15 @@ class _Rows:
         rows, N = self.rows.tensor_split([signal], dim=-1)
         log_determinant = rows.new_zeros(())
         if N.shape[-1]:
-            # QR of (1, N)ᵀ instead of Cholesky of 1 + N Nᵀ: noise of 0.05 N m at a wrist of 10⁻³ kg m² is
-            # 50 rad/s², and squares of such ratios lose all digits.
+            # I + N Nᵀ = C Cᵀ, by QR of (I, N)ᵀ instead of Cholesky: noise of 0.05 N m at a wrist of
+            # 10⁻³ kg m² is 50 rad/s², and squares of such ratios lose all digits.
             eye = torch.eye(N.shape[1], dtype=N.dtype, device=N.device).expand(len(N), -1, -1)
             C = torch.linalg.qr(torch.cat([eye, N.mT], dim=1)).R.mT
+            # C⁻¹ (W, y), ½ log|I + N Nᵀ| = Σ log |C_ii|
             rows = torch.linalg.solve_triangular(C, rows, upper=False)
             log_determinant = C.diagonal(dim1=-2, dim2=-1).abs().log().sum()
         if weight is not None:
+            # Noise Σ/w: √w (W, y)
             rows = weight.sqrt()[:, None, None] * rows
         *operators, residual = rows.split([*self.widths, 1], dim=-1)
         return Block(self.features, tuple(operators), residual[..., 0]), log_determinant
@@ -193,6 +198,7 @@ def whiten(
         state_factor: factor `(n, d, 2 nq)` of the covariance that noise of the state gives the values.
         weight: `(n,)` of each sample, which the variance of all its noise is divided by.
     """
+    # z = B_Q Q + B_z Q_z + o (eqs. 19 and 20)
     at = measurement.at(system)
     z = affine_map(system, at, measurement.quantity)
     if coulomb:
@@ -200,14 +206,17 @@ def whiten(
     # Noise of the state reaches the directions that the constraint fixes too, so their rows tell of it.
     has_fixed = measurement.quantity == "qdd" and system.m > 0 and state_factor is None
     std = noise_std.expand_as(measurement.values)
+    # W = B E and E[z] = o + B m, with the prior means of latent forces (eqs. 12 and 15)
     rows = prior_rows(priors, scales, mean, system, at, z)
     expected = rows.target
     for prior, W in zip(priors, rows.operators, strict=True):
         if offsets and prior.name in offsets:
             expected = expected + W @ offsets[prior.name]
+    # N = (G Σ_x^½, B_Q Σ_τ^½)
     noise = [] if state_factor is None else [state_factor]
     if force_noise is not None:
         noise.append(z.B_Q * force_noise(at).sqrt()[:, None, :])
+    # (W, y − E[z], N)/σ
     everything = _Rows(
         rows.features,
         tuple(W.shape[-1] for W in rows.operators),
@@ -223,11 +232,12 @@ def _without_fixed(
     everything: _Rows, eom: Equations, values: Tensor, std: Tensor, weight: Tensor | None
 ) -> WhitenedRows:
     """The rows of q̈ along the null space of A; the directions that A q̈ = b fixes go into the constant."""
+    # (A σ) U = 0, rows Uᵀ (W, y, N)
     A, b = eom.A, eom.b
     scaled, groups, blocks, log_determinants = A * std[:, None, :], _by_rank(eom.rank), [], []
-    for rank, own in groups:
-        U = null_space_basis(_independent(scaled[own], rank)[0], rank)
-        block, log_determinant = everything.of(own, U).whitened(None if weight is None else weight[own])
+    for rank, index in groups:
+        U = null_space_basis(_independent(scaled[index], rank)[0], rank)
+        block, log_determinant = everything.of(index, U).whitened(None if weight is None else weight[index])
         blocks.append(block)
         log_determinants.append(log_determinant)
 
@@ -235,7 +245,7 @@ def _without_fixed(
         # What this function keeps alive is small beside the equations of motion.
         violated = (A @ values[..., None])[..., 0] - b
         weights = torch.ones_like(violated[:, 0]) if weight is None else weight
-        fixed = [_fixed(scaled[own], rank, violated[own], weights[own]) for rank, own in groups]
+        fixed = [_fixed(scaled[index], rank, violated[index], weights[index]) for rank, index in groups]
         return sum([*log_determinants, *fixed], start=_log_scale(std, weight))
 
     return WhitenedRows(blocks, constant)
@@ -249,6 +259,7 @@ def _log_scale(std: Tensor, weight: Tensor | None) -> Tensor:
 
 def _fixed(A: Tensor, rank: int, violated: Tensor, weight: Tensor) -> Tensor:
     """Negative log likelihood of the directions that the constraint fixes `()`, where A q̈ − b is violated."""
+    # ½ w |(A σ)⁺ (A q̈ − b)|² + ½ rank A log 2π
     rows, C = _independent(A, rank)
     pinv = torch.linalg.pinv(rows) if C is None else torch.linalg.pinv(rows) @ C
     squares = ((pinv @ violated[..., None]) ** 2)[..., 0].sum(-1)

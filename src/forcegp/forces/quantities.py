@@ -3,10 +3,9 @@
 The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b (eqs. 19 to 25 with two corrections: the operator
 from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z).
 
-The acceleration and the multiplier that a force field gives, with their derivatives by state and torque.
-
-A system linearized at a fixed force (`constraints/gauss.py`) lacks how the force changes. With
-F = Q̄ − Q_C − Q_G − Q_D, the part of the impressed forces that the robot file does not know,
+`linearize_field` differentiates q̈ and λ under a force field by state and torque. A system linearized at a
+fixed force (`constraints/gauss.py`) lacks how the force changes. With F = Q̄ − Q_C − Q_G − Q_D, the part of
+the impressed forces that is not in the robot file,
 
     dq̈/dx = ∂q̈/∂x + H ∂F/∂x,   dλ/dx = ∂λ/∂x − Lᵀ ∂F/∂x   for x = q, q̇, τ.
 
@@ -79,9 +78,9 @@ class FlatStates(NamedTuple):
     active: Tensor
     batch: torch.Size
 
-    def rows(self, own: slice) -> FlatStates:
+    def rows(self, index: slice) -> FlatStates:
         """Some of the states."""
-        return FlatStates(self.q[own], self.qd[own], self.tau[own], self.active[own], self.batch)
+        return FlatStates(self.q[index], self.qd[index], self.tau[index], self.active[index], self.batch)
 
 
 def flat_states(
@@ -92,15 +91,15 @@ def flat_states(
     Raises:
         ShapeError: an argument does not fit the system, or is not finite.
     """
-    given = {"q": q, "qd": qd, "tau": tau}
-    system.robot.check_state(**given)
-    for name, x in given.items():
+    inputs = {"q": q, "qd": qd, "tau": tau}
+    system.robot.check_state(**inputs)
+    for name, x in inputs.items():
         if not bool(torch.isfinite(x).all()):
             raise ShapeError(f"{name} holds values that are not finite", expected="finite numbers")
     try:
-        batch = torch.broadcast_shapes(*(x.shape[:-1] for x in given.values()))
+        batch = torch.broadcast_shapes(*(x.shape[:-1] for x in inputs.values()))
     except RuntimeError as cause:
-        got = {name: tuple(x.shape) for name, x in given.items()}
+        got = {name: tuple(x.shape) for name, x in inputs.items()}
         raise ShapeError(
             "q, qd and tau do not broadcast", expected="shapes that broadcast to one batch", got=got
         ) from cause
@@ -109,7 +108,7 @@ def flat_states(
         active = torch.ones(contacts, dtype=torch.bool, device=q.device)
     system.active_rows(active, batch)
     rows = batch.numel()
-    q, qd, tau = (x.expand(*batch, x.shape[-1]).reshape(rows, x.shape[-1]) for x in given.values())
+    q, qd, tau = (x.expand(*batch, x.shape[-1]).reshape(rows, x.shape[-1]) for x in inputs.values())
     return FlatStates(q, qd, tau, active.expand(*batch, contacts).reshape(rows, contacts), batch)
 
 
@@ -145,33 +144,34 @@ def _identity(at: States) -> tuple[Tensor, Tensor, Tensor]:
     return eye, torch.zeros_like(eye), torch.zeros_like(at.q)
 
 
-def _left(C: Tensor, z: AffineMap) -> AffineMap:
+def _times(C: Tensor, z: AffineMap) -> AffineMap:
     """C z for matrices C `(n, c, d)`."""
+    # C z = C B_Q Q + C B_z Q_z + C o
     B = C @ z.B_Q
     return AffineMap(B, C @ z.B_z, B, (C @ z.o[..., None])[..., 0])
 
 
 def _acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
-    """q̈ = L b + H (Q + Q_z)."""
+    """q̈ = L b + H (Q + Q_z) (eqs. 4 and 15)."""
     H = at.eom.H
     return AffineMap(H, H, None, vecdot(at.eom.L, at.eom.b[..., None, :]))
 
 
 def _free_acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
-    """q̈′ = M⁻¹ Q."""
+    """q̈′ = M⁻¹ Q (eq. 1)."""
     _, zero, nothing = _identity(at)
     return AffineMap(at.eom.M_inv, zero, at.eom.M_inv, nothing)
 
 
 def _multiplier(system: ConstrainedSystem, at: States) -> AffineMap:
-    """λ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z)."""
+    """λ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z) (eqs. 16 and 19, with the two corrections)."""
     B = -at.eom.L.mT
     return AffineMap(B, B, B, (at.eom.constraint_inertia @ at.eom.b[..., None])[..., 0])
 
 
 def _constraint_force(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Q_I = Aᵀ λ."""
-    return _left(at.eom.A.mT, _multiplier(system, at))
+    """Q_I = Aᵀ λ (eq. 17)."""
+    return _times(at.eom.A.mT, _multiplier(system, at))
 
 
 def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
@@ -185,16 +185,17 @@ def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
             rows.append(first)
             columns.append(at.eom.contact_points[contact.name].normal)
         first += contact.rows
+    # F_I = N λ, with ∇c of each contact in its rows and column of N
     normals = at.q.new_zeros(len(at.q), 3 * len(rows), system.m)
     for i, (row, normal) in enumerate(zip(rows, columns, strict=True)):
         normals = normals.slice_scatter(
             normals[:, 3 * i : 3 * i + 3].select_scatter(normal, 2, row), 1, 3 * i, 3 * i + 3
         )
-    return _left(normals, multiplier)
+    return _times(normals, multiplier)
 
 
 def _total_force(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Q̄ = Q + Q_z."""
+    """Q̄ = Q + Q_z (eq. 18)."""
     eye, _, nothing = _identity(at)
     return AffineMap(eye, eye, eye, nothing)
 
@@ -298,6 +299,7 @@ def linearize_field(
     with torch.enable_grad():
         leaves = [x.detach().clone().requires_grad_() for x in (flat.q, flat.qd, flat.tau)]
         at = states(system, leaves[0], leaves[1], leaves[2], flat.active)
+        # F = Q̄ − Q_C − Q_G − Q_D, ∂F/∂(q, q̇, τ) row by row
         F = force(system, at) - at.eom.Q_K
         rows = [
             torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
@@ -305,8 +307,9 @@ def linearize_field(
         ]
     by_q, by_qd, by_tau = (torch.stack(parts, dim=-2) for parts in zip(*rows, strict=True))
     fixed = system.linearize(flat.q, flat.qd, F.detach(), flat.active)
+    # dq̈/dx = ∂q̈/∂x + H ∂F/∂x, dλ/dx = ∂λ/∂x − Lᵀ ∂F/∂x
     H, minus_Lt = fixed.dforce, fixed.multiplier_dforce
-    found = (
+    linearization = (
         fixed.qdd,
         fixed.dq + H @ by_q,
         fixed.dqd + H @ by_qd,
@@ -316,4 +319,4 @@ def linearize_field(
         fixed.multiplier_dqd + minus_Lt @ by_qd,
         minus_Lt @ by_tau,
     )
-    return ForceLinearization(*(x.reshape(*flat.batch, *x.shape[1:]) for x in found))
+    return ForceLinearization(*(x.reshape(*flat.batch, *x.shape[1:]) for x in linearization))

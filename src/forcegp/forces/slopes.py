@@ -1,7 +1,7 @@
 """Noise of the state propagated through the learned forces, alternating slopes and hyperparameters.
 
 The first fit propagates the noise of the state through the equations of motion of the robot file
-(`state_noise.py`), which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m.
+(`noise.py`), which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m.
 Following McHutchon and Rasmussen (*Gaussian process training with input noise*, 2011), take the slope of the
 posterior mean F̄ at each sample and learn again with
 
@@ -53,14 +53,14 @@ def with_learned_slopes(
         posterior, system = force_posterior(problem, values), problem.system_at(values)
         try:
             training = learned_slopes(problem.training, system, posterior)
-            again = dataclasses.replace(problem, training=training)
-            found = search.solve(again, progress, learned.tensors)
+            updated = dataclasses.replace(problem, training=training)
+            relearned = search.solve(updated, progress, learned.tensors)
         except (NumericalError, RuntimeError) as cause:
             text = "the slopes of the learned forces, which noise of the state asks for, cannot be used"
             return problem, learned, (f"{text}: {str(cause).splitlines()[0]}",)
-        growth = learned.value - found.value
+        growth = learned.value - relearned.value
         if growth > 0.0:
-            problem, learned = again, found
+            problem, learned = updated, relearned
         if not growth >= GROWTH:
             break
     return problem, learned, ()

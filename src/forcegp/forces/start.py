@@ -74,8 +74,8 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     else:
         start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks)
     for prior in problem.priors:
-        own = prior.initial_parameters(problem.system.robot)
-        start |= {f"{prior.name}.{name}": value for name, value in own.items()}
+        parameters = prior.initial_parameters(problem.system.robot)
+        start |= {f"{prior.name}.{name}": value for name, value in parameters.items()}
     start |= noise
     if learn_noise:
         stds = problem.training.noise_std
@@ -94,16 +94,16 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     """
     few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
     like = problem.system.robot.mass
-    known = initial_coulomb(problem.priors, like)
-    limits = below_jamming(problem.system, problem.training.measurements, problem.priors, limits_of(known))
+    friction = initial_coulomb(problem.priors, like)
+    limits = below_jamming(problem.system, problem.training.measurements, problem.priors, limits_of(friction))
 
     def start_at(x: float) -> tuple[Tensors, WhitenedRows]:
-        own = {
+        trial = {
             key: like.new_tensor(min(x, limits[key][1])) if key.endswith("log_coefficient") else value
-            for key, value in known.items()
+            for key, value in friction.items()
         }
-        rows = few.rows({**own, **noise})
-        return {**initial_hyperparameters(few.priors, rows.blocks), **own}, rows
+        rows = few.rows({**trial, **noise})
+        return {**initial_hyperparameters(few.priors, rows.blocks), **trial}, rows
 
     def value(x: float) -> float:
         start, rows = start_at(x)
@@ -111,8 +111,8 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
 
     best = min(range(1, len(COEFFICIENTS) - 1), key=lambda k: value(math.log(COEFFICIENTS[k])))
     around = (math.log(COEFFICIENTS[best - 1]), math.log(COEFFICIENTS[best + 1]))
-    found = scipy.optimize.minimize_scalar(value, bounds=around, method="bounded", options={"xatol": 1e-3})
-    return start_at(float(found.x))[0]
+    optimum = scipy.optimize.minimize_scalar(value, bounds=around, method="bounded", options={"xatol": 1e-3})
+    return start_at(float(optimum.x))[0]
 
 
 def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block]) -> dict[str, Tensor]:
@@ -137,13 +137,13 @@ def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool) -> Tensor:
     operators = [block.operators[p] for block in blocks]
     each = torch.arange(operators[0].shape[-1], device=operators[0].device)
     first = each if commensurate else _first_parallel(operators)
-    own, alone = first.unique(), (first[:, None] == first).sum(0) == 1
+    groups, alone = first.unique(), (first[:, None] == first).sum(0) == 1
     total = torch.zeros_like(blocks[0].operators[p][0, 0])
     weight = torch.zeros_like(total)
     for block in blocks:
         W = block.operators[p]
         force = torch.zeros_like(W[:, 0])
-        force[:, own] = (torch.linalg.pinv(W[..., own], rtol=1e-6) @ block.target[..., None])[..., 0]
+        force[:, groups] = (torch.linalg.pinv(W[..., groups], rtol=1e-6) @ block.target[..., None])[..., 0]
         size = torch.where(alone, 1.0, W.square().sum(1))
         total, weight = total + (force**2 * size)[:, first].sum(0), weight + size.sum(0)
     return (total / weight.clamp(min=1e-300)).sqrt().clamp(1e-3, 1e4)
@@ -218,19 +218,19 @@ def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tenso
     total: Tensor | float = 0.0
     for key, value in params.items():
         below, above = WIDTH.get(_kind(key), (3.0, 3.0))
-        apart = value - start[key]
-        total = total + (0.5 * (apart / torch.where(apart < 0.0, below, above)) ** 2).sum()
+        shift = value - start[key]
+        total = total + (0.5 * (shift / torch.where(shift < 0.0, below, above)) ** 2).sum()
     return total
 
 
-def given_start(given: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Given values of what is learned, checked against the default start.
 
     Raises:
         ModelError: a value is missing, or has another shape.
     """
     for key, value in start.items():
-        got = given[key].shape if key in given else None
+        got = values[key].shape if key in values else None
         if got != value.shape:
             raise ModelError(
                 f"incompatible initial hyperparameters: {key}",
@@ -238,7 +238,7 @@ def given_start(given: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dic
                 got="none" if got is None else tuple(got),
                 hint="take those of a model with the same priors",
             )
-    return {key: given[key].detach().to(value) for key, value in start.items()}
+    return {key: values[key].detach().to(value) for key, value in start.items()}
 
 
 def random_starts(start: Mapping[str, Tensor], restarts: int, seed: int) -> Iterator[dict[str, Tensor]]:
@@ -298,12 +298,12 @@ class Search:
             NumericalError: the likelihood cannot be computed.
         """
         if begin is not None:
-            return self._minimise(problem, given_start(begin, self.start), progress)
-        found = (
+            return self._minimise(problem, checked_start(begin, self.start), progress)
+        candidates = (
             self._minimise(problem, self._warmed(problem, cold), progress)
             for cold in random_starts(self.start, self.options.restarts, self.options.seed)
         )
-        return min(found, key=lambda learned: learned.value)
+        return min(candidates, key=lambda learned: learned.value)
 
     def objective(self, problem: Problem, tensors: Tensors) -> Tensor:
         """Negative log posterior: the likelihood of the rows, and weak priors around the start if any."""

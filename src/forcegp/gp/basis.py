@@ -15,7 +15,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from forcegp.gp.decomposition import Spectrum, Split, split
+from forcegp.gp.decomposition import KernelSplit, Spectrum, split
 from forcegp.gp.draws import FunctionDraw
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters, sub
@@ -34,7 +34,7 @@ class ProcessBasis:
         spectra: of K_zz of each component.
     """
 
-    split: Split
+    split: KernelSplit
     params: dict[str, Tensor]
     components: int
     inducing: Features
@@ -95,6 +95,7 @@ class ProcessBasis:
         if self.to_inducing is None:
             none = next(iter(features.values())).new_zeros(self.components, points(features), 0)
             return none if self.finite is None else self.finite.basis(features), none.sum(-1)
+        # V(x) = Rᵀ k(Z, x), |V|² = k(x, Z) K_zz⁻¹ k(Z, x)
         whitened = self.to_inducing(features) @ self.roots
         explained = torch.linalg.vecdot(whitened, whitened)
         if self.finite is None:
@@ -108,6 +109,7 @@ class ProcessBasis:
             W: operators `(n, d, components)`.
             values: V of the samples, as `values` gives it.
         """
+        # Φ_i = W_i V_iᵀ
         whole = W[..., None] * values.transpose(0, 1)[:, None]
         whole = whole.reshape(W.shape[0] * W.shape[1], self.used.numel())
         return whole if self._filled else whole.index_select(1, self.columns)
@@ -130,6 +132,7 @@ class ProcessBasis:
         filled[self.columns] = weights
         filled = filled.unflatten(0, self.used.shape)
         width = filled.shape[1] - self.finite_size
+        # V(x)ᵀ w = k(x, Z) (R w)
         on_kernel = self.roots @ filled[:, :width] if self.spectra else filled[:, :0]
         return on_kernel, filled[:, width:]
 
@@ -140,6 +143,7 @@ class ProcessBasis:
             features: kernel inputs.
             values: V(x), as `values` gives it.
         """
+        # k(x, x) = k_rest(x, x) + |φ(x)|²
         exact = values[..., values.shape[-1] - self.finite_size :]
         return self.rest_variance(features) + torch.linalg.vecdot(exact, exact)
 
@@ -210,13 +214,13 @@ class LatentBasis:
     @cached_property
     def owner(self) -> Tensor:
         """The component of each basis function `(size,)`, of the components of all processes in order."""
-        own = zip(self.parts, self.components, strict=True)
-        return torch.cat([part.owner + among.start for part, among in own])
+        pairs = zip(self.parts, self.components, strict=True)
+        return torch.cat([part.owner + among.start for part, among in pairs])
 
     def of_process(self, p: int) -> slice:
         """The basis functions of process p."""
-        own = self.columns[self.components[p]]
-        return slice(own[0].start, own[-1].stop)
+        slices = self.columns[self.components[p]]
+        return slice(slices[0].start, slices[-1].stop)
 
     def evaluate(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
         """Basis functions at n samples.
@@ -229,7 +233,7 @@ class LatentBasis:
             what is missed of it, k(x, x) − |V(x)|².
         """
         parts = [part.evaluate(x) for part, x in zip(self.parts, features, strict=True)]
-        V, prior, missed = (torch.cat(own, dim=-1) for own in zip(*parts, strict=True))
+        V, prior, missed = (torch.cat(columns, dim=-1) for columns in zip(*parts, strict=True))
         return V, prior, missed
 
 
@@ -249,10 +253,11 @@ def latent_basis(
     """
     parts = []
     for process, Z, count in zip(processes, inducing, components, strict=True):
-        own, kernel = sub(params, process.prefix), split(process.kernel)
+        process_params, kernel = sub(params, process.prefix), split(process.kernel)
         spectra: tuple[Spectrum, ...] = ()
         if kernel.rest is not None and points(Z):
-            K = kernel.rest.kernel.covariance(kernel.rest.parameters(own), Z, Z)
+            # K_zz = U Λ Uᵀ
+            K = kernel.rest.kernel.covariance(kernel.rest.parameters(process_params), Z, Z)
             spectra = tuple(Spectrum.of(0.5 * (k + k.mT)) for k in K)
-        parts.append(ProcessBasis(kernel, own, count, Z, spectra))
+        parts.append(ProcessBasis(kernel, process_params, count, Z, spectra))
     return LatentBasis(tuple(processes), dict(params), tuple(parts))

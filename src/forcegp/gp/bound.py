@@ -19,11 +19,12 @@ from forcegp.gp.kernels import Parameters
 from forcegp.gp.likelihood import Valued, with_gradient
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block, Gradient, Process, components_of, rows_of
-from forcegp.gp.sums import CHUNK_SAMPLES, Moments, accumulate
+from forcegp.gp.sums import CHUNK_SAMPLES, Moments, accumulate, normal_terms
 
 
 def bound_of(sums: Moments, posterior: SparsePosterior) -> Tensor:
     """The negative bound from the sums `()`."""
+    # −F = ½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ], log|A| = 2 Σ log L_ii
     fit = sums.yy - sums.v @ posterior.weights
     log_determinant = 2.0 * posterior.L.diagonal().abs().log().sum()
     return 0.5 * (fit + log_determinant + sums.rows * math.log(2.0 * math.pi) + sums.missed.sum())
@@ -68,6 +69,7 @@ class _BoundGradient:
 
     def __init__(self, posterior: SparsePosterior, deep: bool) -> None:
         self.basis, self.deep = posterior.basis, deep
+        # m = A⁻¹v, D = ½ (A⁻¹ + m mᵀ)
         self.m = posterior.weights
         self.D = 0.5 * torch.addr(torch.cholesky_inverse(posterior.L), self.m, self.m)
         self.total: Gradient = {}
@@ -93,35 +95,36 @@ class _BoundGradient:
     def _chunk(self, block: Block) -> Gradient:
         """Add the derivatives for hyperparameters; return those for the block's own tensors."""
         V, _, missed = self.basis.evaluate(block.features)
-        W = torch.cat(block.operators, dim=-1)
-        S = (W.mT @ W).permute(1, 2, 0).contiguous()
-        c = (W.mT @ block.target[..., None])[..., 0]
-        own: Gradient = {}
+        W, S, c = normal_terms(block)
+        gradient: Gradient = {}
         dV = self._basis_gradient(V, S, c)
         if self.deep:
+            # dS_kl = V_kᵀ D_kl V_l + ½ δ_kl (k − |V|²), dc_k = −m_kᵀ V_k
             columns = self.basis.columns
             dS = torch.stack([self._by_component(V * (V[:, l] @ self.D[l])) for l in columns], dim=-1)
             dS = 0.5 * (dS + dS.mT) + 0.5 * torch.diag_embed(missed)
             dc = -self._by_component(V * self.m)
+            # dW = 2 W dS + y dcᵀ, dy = y + W dc
             dW = 2.0 * W @ dS + block.target[..., None] * dc[:, None, :]
             for p, components in enumerate(self.basis.components):
-                own["operator", p] = dW[..., components]
-            own["target",] = block.target + (W @ dc[..., None])[..., 0]
+                gradient["operator", p] = dW[..., components]
+            gradient["target",] = block.target + (W @ dc[..., None])[..., 0]
         weight = torch.diagonal(S, dim1=0, dim2=1)
         for p in range(len(self.basis.parts)):
-            own |= self._through_kernel(p, block.features[p], dV, 0.5 * weight)
-        return own
+            gradient |= self._through_kernel(p, block.features[p], dV, 0.5 * weight)
+        return gradient
 
     def _basis_gradient(self, V: Tensor, S: Tensor, c: Tensor) -> Tensor:
         """Derivative for V `(n, size)`."""
+        # dV_k = 2 Σ_l S_kl D_kl V_l − m_k c_k − S_kk V_k
         owner, columns = self.basis.owner, self.basis.columns
         weight = torch.diagonal(S, dim1=0, dim2=1)
         dV = torch.addcmul(-self.m * c[:, owner], V * self.from_inducing, weight[:, owner], value=-1.0)
         twice, weighted = 2.0 * S, torch.empty_like(V)
-        for k, own in enumerate(columns):
-            for l, other in enumerate(columns):
-                torch.mul(V[:, other], twice[k, l, :, None], out=weighted[:, other])
-            dV[:, own].addmm_(weighted, self.D[:, own])
+        for k, of_k in enumerate(columns):
+            for l, of_l in enumerate(columns):
+                torch.mul(V[:, of_l], twice[k, l, :, None], out=weighted[:, of_l])
+            dV[:, of_k].addmm_(weighted, self.D[:, of_k])
         return dV
 
     @cached_property
@@ -144,19 +147,18 @@ class _BoundGradient:
         filled.index_copy_(1, part.columns, dV[:, self.basis.of_process(p)])
         filled = filled.unflatten(1, part.used.shape).transpose(0, 1)
         width = filled.shape[-1] - part.finite_size
-        params = {key: value.requires_grad_() for key, value in _detached(part.params).items()}
-        x = _detached(features)
-        if self.deep:
-            x = {key: value.requires_grad_() for key, value in x.items()}
+        params, x = _leaves(part.params), _leaves(features, self.deep)
         outputs, gradients = [], []
         with torch.enable_grad():
             rest, finite = part.split.rest, part.split.finite
             if rest is not None:
-                own = rest.parameters(params)
-                outputs.append(rest.kernel.diagonal(own, x))
+                rest_params = rest.parameters(params)
+                # d k(x, x) = ½ S_kk
+                outputs.append(rest.kernel.diagonal(rest_params, x))
                 gradients.append(weight[:, self.basis.components[p]].mT)
                 if part.spectra:
-                    kernel = rest.kernel.covariance(own, x, part.inducing)
+                    # V = k(x, Z) R: dR += k(Z, x) dV, dk(x, Z) = dV Rᵀ
+                    kernel = rest.kernel.covariance(rest_params, x, part.inducing)
                     self.roots[p] = self.roots[p] + kernel.detach().mT @ filled[..., :width]
                     outputs.append(kernel)
                     gradients.append(filled[..., :width] @ part.roots.mT)
@@ -177,26 +179,26 @@ class _BoundGradient:
         """Add what arrives at hyperparameters; return what arrives at kernel inputs."""
         leaves = {("param", f"{prefix}.{key}"): value for key, value in params.items()}
         leaves |= {("feature", p, key): value for key, value in x.items()}
-        found = torch.autograd.grad(outputs, list(leaves.values()), gradients, allow_unused=True)
-        own: Gradient = {}
-        for (place, leaf), grad in zip(leaves.items(), found, strict=True):
+        grads = torch.autograd.grad(outputs, list(leaves.values()), gradients, allow_unused=True)
+        by_feature: Gradient = {}
+        for (place, leaf), grad in zip(leaves.items(), grads, strict=True):
             value = torch.zeros_like(leaf) if grad is None else grad
             if place[0] == "feature":
-                own[place] = value
+                by_feature[place] = value
             else:
                 self.total[place] = self.total[place] + value if place in self.total else value
-        return own
+        return by_feature
 
     def _through_inducing(self, part: ProcessBasis, prefix: str, dR: Tensor) -> None:
         """Derivatives through K_zz."""
         rest = part.split.rest
         assert rest is not None
-        params = {key: value.requires_grad_() for key, value in _detached(part.params).items()}
+        params = _leaves(part.params)
         with torch.enable_grad():
             K = rest.kernel.covariance(rest.parameters(params), part.inducing, part.inducing)
         dK = torch.stack([s.pull_back(d) for s, d in zip(part.spectra, dR, strict=True)])
         self._add(prefix, params, {}, [K], [dK])
 
 
-def _detached(tensors: Parameters) -> dict[str, Tensor]:
-    return {key: value.detach() for key, value in tensors.items()}
+def _leaves(tensors: Parameters, requires_grad: bool = True) -> dict[str, Tensor]:
+    return {key: value.detach().requires_grad_(requires_grad) for key, value in tensors.items()}

@@ -1,9 +1,8 @@
 """Which part of a kernel is a finite number of features, and which part needs inducing points.
 
 A sum of linear kernels and of products of linear kernels is k(x, x′) = φ(x)ᵀφ(x′) exactly, with a few
-features φ. The rest, whatever contains a stationary factor, is approximated with inducing points.
-
-Truncated square root of the inverse covariance of inducing points, and its derivative.
+features φ. The rest, whatever contains a stationary factor, is approximated with inducing points, through
+the truncated square root R of the inverse of their covariance, R Rᵀ = K_zz⁺.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
 
 
 @dataclass(frozen=True)
-class Part:
+class KernelPart:
     """A kernel made of factors of another one.
 
     Attributes:
@@ -36,11 +35,11 @@ class Part:
 
     def parameters(self, whole: Parameters) -> dict[str, torch.Tensor]:
         """The part's hyperparameters among those of the whole kernel."""
-        found = {}
+        params = {}
         for here, there in self.names.items():
             factor = sub(whole, there) if there else whole
-            found |= {f"{here}.{key}" if here else key: value for key, value in factor.items()}
-        return found
+            params |= {f"{here}.{key}" if here else key: value for key, value in factor.items()}
+        return params
 
     def features(self, whole: Parameters) -> FunctionDraw:
         """φ of a finite part: features whose products are the kernel exactly."""
@@ -49,7 +48,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Split:
+class KernelSplit:
     """A kernel as the sum of a finite part and the rest.
 
     Attributes:
@@ -57,41 +56,41 @@ class Split:
         rest: everything else.
     """
 
-    finite: Part | None
-    rest: Part | None
+    finite: KernelPart | None
+    rest: KernelPart | None
 
 
-def split(kernel: Kernel) -> Split:
+def split(kernel: Kernel) -> KernelSplit:
     """The finite part of a kernel and the rest; products of sums are multiplied out where needed."""
     finite, rest = _terms(kernel, "")
-    return Split(_sum(finite), _sum(rest))
+    return KernelSplit(_sum(finite), _sum(rest))
 
 
-def _terms(kernel: Kernel, path: str) -> tuple[list[Part], list[Part]]:
+def _terms(kernel: Kernel, path: str) -> tuple[list[KernelPart], list[KernelPart]]:
     """Terms with and without a finite number of features."""
     if isinstance(kernel, EXACT):
-        return [Part(kernel, {"": path})], []
+        return [KernelPart(kernel, {"": path})], []
     if not isinstance(kernel, Sum):
-        return [], [Part(kernel, {"": path})]
+        return [], [KernelPart(kernel, {"": path})]
     sides = [_terms(getattr(kernel, side), f"{path}.{side}".lstrip(".")) for side in ("left", "right")]
     (finite_left, rest_left), (finite_right, rest_right) = sides
     if not isinstance(kernel, Product):
         return finite_left + finite_right, rest_left + rest_right
     if not finite_left or not finite_right:
-        return [], [Part(kernel, {"": path})]
+        return [], [KernelPart(kernel, {"": path})]
     finite = [_join(Product, a, b) for a in finite_left for b in finite_right]
     rest = [_join(Product, a, b) for a in finite_left for b in rest_right]
     rest += [_join(Product, a, b) for a in rest_left for b in finite_right + rest_right]
     return finite, rest
 
 
-def _join(kind: type[Sum], left: Part, right: Part) -> Part:
+def _join(kind: type[Sum], left: KernelPart, right: KernelPart) -> KernelPart:
     names = {f"left.{key}".rstrip("."): path for key, path in left.names.items()}
     names |= {f"right.{key}".rstrip("."): path for key, path in right.names.items()}
-    return Part(kind(left.kernel, right.kernel), names)
+    return KernelPart(kind(left.kernel, right.kernel), names)
 
 
-def _sum(terms: list[Part]) -> Part | None:
+def _sum(terms: list[KernelPart]) -> KernelPart | None:
     return reduce(lambda a, b: _join(Sum, a, b), terms) if terms else None
 
 
@@ -138,11 +137,14 @@ class Spectrum:
         Args:
             dR: `(m, kept)`, or wider, filled up with columns that are not read.
         """
+        # B = Uᵀ ∂F/∂R
         values, first = self.values, self.dropped
         kept = values[first:]
         B = self.vectors.mT @ dR[:, : len(kept)]
+        # G_jk = −½ B_jk λ_j⁻¹ λ_k^{−½} among kept ones, G_dk = B_dk λ_k^{−½} / (λ_k − λ_d) for dropped d
         G = torch.zeros_like(self.vectors)
         G[first:, first:] = -0.5 * B[first:] * kept.rsqrt() / kept[:, None]
         G[:first, first:] = B[:first] * kept.rsqrt() / (kept - values[:first, None])
+        # ∂F/∂K_zz = U G Uᵀ, made symmetric
         dK = self.vectors @ G @ self.vectors.mT
         return 0.5 * (dK + dK.mT)

@@ -102,7 +102,7 @@ def share_basis(basis: LatentBasis, source: int = 0, group: Group = None) -> Lat
             )
             for s in part.spectra
         )
-        params, Z = (share_tensors(given, source, group) for given in (part.params, part.inducing))
+        params, Z = (share_tensors(named, source, group) for named in (part.params, part.inducing))
         parts.append(dataclasses.replace(part, params=params, inducing=Z, spectra=spectra))
     return LatentBasis(basis.processes, share_tensors(basis.params, source, group), tuple(parts))
 

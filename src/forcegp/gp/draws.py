@@ -124,8 +124,8 @@ class SumDraw(FunctionDraw):
         return self.left.size + self.right.size
 
     def terms(self, weights: Tensor) -> list[tuple[Callable[[Features], Tensor], Tensor]]:
-        own = weights.split([self.left.size, self.right.size], dim=1)
-        return [*self.left.terms(own[0]), *self.right.terms(own[1])]
+        parts = weights.split([self.left.size, self.right.size], dim=1)
+        return [*self.left.terms(parts[0]), *self.right.terms(parts[1])]
 
     def basis(self, x: Features) -> Tensor:
         return torch.cat([self.left.basis(x), self.right.basis(x)], dim=-1)

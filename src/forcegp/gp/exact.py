@@ -15,7 +15,16 @@ from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.likelihood import Conditioned, condition, require_exact_fits, target_of
 from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors, kernel_terms
 from forcegp.gp.rounding import require_resolved_noise, require_resolved_variance
-from forcegp.gp.structured_covariance import Block, Process, add_rows, chunked, cross_gram, gram, offsets
+from forcegp.gp.structured_covariance import (
+    Block,
+    Process,
+    add_rows,
+    chunked,
+    cross_gram,
+    gram,
+    offsets,
+    rows_mean,
+)
 
 CHUNK_COLUMNS = 700
 """Columns of the triangular solve that are held at a time."""
@@ -73,24 +82,38 @@ class ExactPosterior:
         old, new, together = self.conditioned, list(blocks), [*self.blocks, *blocks]
         require_exact_fits(together, learning=False)
         cross = cross_gram(self.processes, self.params, self.blocks, new)
+        # Σ = [[L Lᵀ, C], [Cᵀ, K_new + I]], α = Σ⁻¹ y
         L, jitter = bordered(old.L, cross, gram(self.processes, self.params, new))
         alpha = torch.cholesky_solve(target_of(together)[:, None], L)[:, 0]
         result = ExactPosterior(self.processes, self.params, together, alpha)
         result.__dict__["conditioned"] = Conditioned(L, alpha, max(old.jitter, jitter))
         return result
 
+    def knowing(self, p: int, features: Features, value: Tensor) -> ExactPosterior:
+        """The posterior given that a constant process p has a value `(components,)`, its mean zero."""
+        # y ← y − W_p f_p, with W_p ← 0
+        blocks = [
+            Block(
+                block.features,
+                tuple(torch.zeros_like(W) if q == p else W for q, W in enumerate(block.operators)),
+                block.target - block.operators[p] @ value,
+            )
+            for block in self.blocks
+        ]
+        return ExactPosterior.of(self.processes, self.params, blocks)
+
     @cached_property
     def measured(self) -> tuple[bool, ...]:
         """Whether any row depends on each process; the data change nothing about the others."""
-        return tuple(map(any, self._heard))
+        return tuple(map(any, self._depends))
 
     @cached_property
-    def _heard(self) -> list[list[bool]]:
+    def _depends(self) -> list[list[bool]]:
         """By process and block, whether any row depends on the process."""
         return [[bool(b.operators[p].any()) for b in self.blocks] for p in range(len(self.processes))]
 
     @cached_property
-    def _own(self) -> list[dict[str, Tensor]]:
+    def _process_params(self) -> list[dict[str, Tensor]]:
         """Log-hyperparameters of each process."""
         return [sub(self.params, process.prefix) for process in self.processes]
 
@@ -104,10 +127,10 @@ class ExactPosterior:
         weights: list[list[Tensor]] = [[] for _ in self.processes]
         first = 0
         for block in self.blocks:
-            own = rows[first : first + block.rows].unflatten(0, block.target.shape)
+            by_sample = rows[first : first + block.rows].unflatten(0, block.target.shape)
             first += block.rows
             for p, W in enumerate(block.operators):
-                weighted = torch.einsum("nak,nas->kns", W, own)
+                weighted = torch.einsum("nak,nas->kns", W, by_sample)
                 weights[p].append(weighted[..., 0] if squeeze else weighted)
         return weights
 
@@ -115,7 +138,7 @@ class ExactPosterior:
     def kernels_to_data(self) -> list[list[Callable[[Features], Tensor]]]:
         """By process and block, x ↦ k(x, X)."""
         return [
-            [process.kernel.towards(self._own[p], block.features[p]) for block in self.blocks]
+            [process.kernel.towards(self._process_params[p], block.features[p]) for block in self.blocks]
             for p, process in enumerate(self.processes)
         ]
 
@@ -124,6 +147,7 @@ class ExactPosterior:
         if not self.measured[p]:
             x, components = next(iter(features.values())), self.blocks[0].operators[p].shape[-1]
             return x.new_zeros(len(x), components)
+        # μ(x) = k(x, X) Wᵀα (eqs. 11 and 23)
         parts = [
             (kernel(features) @ w[..., None])[..., 0]
             for kernel, w in zip(self.kernels_to_data[p], self._weights[p], strict=True)
@@ -132,10 +156,7 @@ class ExactPosterior:
 
     def mean(self, block: Block) -> Tensor:
         """Posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
-        mean = torch.zeros_like(block.target)
-        for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
-            mean = mean + (W @ self.latent_mean(p, x)[..., None])[..., 0]
-        return mean
+        return rows_mean(self.latent_mean, block)
 
     def covariance(self, block: Block) -> Tensor:
         """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise.
@@ -147,15 +168,16 @@ class ExactPosterior:
         if d == 0:  # such as the multiplier of a system without contacts
             return block.target.new_zeros(n, 0, 0)
         parts = [block.target.new_zeros(0, d, d)]
-        for own in chunked([block], max(1, CHUNK_COLUMNS // d)):
-            V = torch.linalg.solve_triangular(self.conditioned.L, self._cross(own).mT, upper=False)
+        for chunk in chunked([block], max(1, CHUNK_COLUMNS // d)):
+            # V = L⁻¹ Σ_X*
+            V = torch.linalg.solve_triangular(self.conditioned.L, self._cross(chunk).mT, upper=False)
             V = V.reshape(len(V), -1, d).transpose(0, 1)
+            # Σ_** = Σ_p W_p k_p(x, x) W_pᵀ
             prior = V.new_zeros(V.shape[0], d, d)
-            for process, params, x, W in zip(
-                self.processes, self._own, own.features, own.operators, strict=True
-            ):
-                variance = process.kernel.diagonal(params, x)
+            for p, (x, W) in enumerate(zip(chunk.features, chunk.operators, strict=True)):
+                variance = self.processes[p].kernel.diagonal(self._process_params[p], x)
                 prior = prior + torch.einsum("nak,kn,nbk->nab", W, variance, W)
+            # Σ* = Σ_** − Vᵀ V = Σ_** − Σ_*X Σ⁻¹ Σ_X* (eqs. 11 and 24)
             posterior = prior - V.mT @ V
             parts.append(require_resolved_variance(posterior, prior.diagonal(dim1=-2, dim2=-1)))
         covariance = torch.cat(parts)
@@ -166,8 +188,9 @@ class ExactPosterior:
         starts = offsets(self.blocks)
         cross = new.target.new_zeros(new.rows, starts[-1])
         for p, W in enumerate(new.operators):
-            for g, heard in enumerate(self._heard[p]):
-                if heard and bool(W.any()):
+            for g, depends in enumerate(self._depends[p]):
+                if depends and bool(W.any()):
+                    # Σ_*X = Σ_p W_* k_p(x_*, X) Wᵀ (eqs. 19 and 20)
                     k = self.kernels_to_data[p][g](new.features[p])
                     add_rows(cross[:, starts[g] : starts[g + 1]], W, k, self.blocks[g].operators[p])
         return cross
@@ -177,7 +200,7 @@ class ExactPosterior:
         return -self.conditioned.negative_log_likelihood(target_of(self.blocks))
 
     def draw(self, count: int, generator: torch.Generator, features: int = FEATURES) -> FunctionSamples:
-        """Functions from the posterior by Matheron's rule: f(x) + k(x, X) Wᵀ(K + I)⁻¹(y − W f(X) − ε).
+        """Functions from the posterior by Matheron's rule: f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε), Σ = K + I.
 
         Args:
             count: number of functions.
@@ -187,15 +210,14 @@ class ExactPosterior:
         draws: PriorDraws = draw_priors(
             self.processes, self.params, self.blocks, self.measured, count, generator, features
         )
+        # ε ~ N(0, I), β = Wᵀ Σ⁻¹ (y − W f(X) − ε)
         like = self.alpha
         noise = torch.randn(len(like), count, dtype=torch.float64, generator=generator).to(like)
         residual = target_of(self.blocks)[:, None] - draws.at_rows - noise
         weights = self.weights_of(torch.cholesky_solve(residual, self.conditioned.L))
-        terms = [draw.terms(own) for draw, own in zip(draws.draws, draws.weights, strict=True)]
+        # f(x) = φ(x)ᵀ w + k(x, X) β
+        terms = [draw.terms(weight) for draw, weight in zip(draws.draws, draws.weights, strict=True)]
         for p, process in enumerate(self.processes):
             for block, w in zip(self.blocks, weights[p], strict=True) if self.measured[p] else ():
-                terms[p] += kernel_terms(process.kernel, self._own[p], block.features[p], w)
-        return FunctionSamples(
-            tuple(tuple(function for function, _ in own) for own in terms),
-            tuple(tuple(w for _, w in own) for own in terms),
-        )
+                terms[p] += kernel_terms(process.kernel, self._process_params[p], block.features[p], w)
+        return FunctionSamples.of(terms)

@@ -91,6 +91,7 @@ def _kernel() -> Callable[[int, int, int, int, int], None] | None:
 def _extended_by_lapack(L: Tensor, rows: Tensor) -> Tensor:
     upper, below = np.array(L.numpy().T, order="F"), np.array(rows.numpy(), order="F")
     (tpqrt,) = scipy.linalg.lapack.get_lapack_funcs(("tpqrt",), (upper,))
+    # [Lᵀ; Φ] = Q R, so that Rᵀ R = L Lᵀ + Φᵀ Φ
     with threads_of_pytorch():
         R, _, _, info = tpqrt(0, min(PANEL, len(L)), upper, below, overwrite_a=1, overwrite_b=1)
     if info != 0:
@@ -113,8 +114,11 @@ def bordered(L: Tensor, cross: Tensor, corner: Tensor) -> tuple[Tensor, float]:
         NumericalError: the matrix is not positive definite.
     """
     n, r = cross.shape
+    # B = Cᵀ L⁻ᵀ
     below = torch.linalg.solve_triangular(L, cross, upper=False).mT
-    own, jitter = cholesky(corner - below @ below.mT)
+    # K − B Bᵀ = L_K L_Kᵀ
+    corner_factor, jitter = cholesky(corner - below @ below.mT)
+    # [[L, 0], [B, L_K]]
     whole = L.new_zeros(n + r, n + r)
-    whole[:n, :n], whole[n:, :n], whole[n:, n:] = L, below, own
+    whole[:n, :n], whole[n:, :n], whole[n:, n:] = L, below, corner_factor
     return whole, jitter

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.gp.decomposition import TRUNCATION, Part, split
+from forcegp.gp.decomposition import TRUNCATION, KernelPart, split
 from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters, sub
 from forcegp.gp.structured_covariance import Block, Process, points, rows_of
@@ -71,12 +71,12 @@ def candidates(blocks: Iterable[Block], samples: int, count: int = CANDIDATES) -
         samples: number of samples in all blocks.
         count: how many to keep.
     """
-    step, kept, seen = max(1, -(-samples // count)), [], 0
+    step, kept, first = max(1, -(-samples // count)), [], 0
     for block in blocks:
-        own = torch.arange(len(block.target), device=block.target.device)[-seen % step :: step]
-        seen += len(block.target)
-        if len(own):
-            kept.append(rows_of(block, own))
+        index = torch.arange(len(block.target), device=block.target.device)[-first % step :: step]
+        first += len(block.target)
+        if len(index):
+            kept.append(rows_of(block, index))
     return kept
 
 
@@ -101,46 +101,49 @@ def select_inducing(
         limit: most points of one process.
         share: missed variance of all rows, as a fraction of what the noise leaves of them, at which to stop.
     """
-    own_rows = sum(block.rows for block in blocks)
-    tolerance = share / (own_rows if rows is None else rows)
+    candidate_rows = sum(block.rows for block in blocks)
+    tolerance = share / (candidate_rows if rows is None else rows)
     chosen = []
     for p, prior in enumerate(processes):
         names = blocks[0].features[p]
         x = {name: torch.cat([block.features[p][name] for block in blocks]) for name in names}
-        weight = torch.cat([(block.operators[p] ** 2).sum(1) for block in blocks]).mT / own_rows
+        weight = torch.cat([(block.operators[p] ** 2).sum(1) for block in blocks]).mT / candidate_rows
         rest = split(prior.kernel).rest
-        own = sub(params, prior.prefix)
-        chosen.append(_greedy(rest, own, x, weight, limit, tolerance))
+        process_params = sub(params, prior.prefix)
+        chosen.append(_greedy(rest, process_params, x, weight, limit, tolerance))
     return chosen
 
 
 def _greedy(
-    rest: Part | None, own: Parameters, x: Features, weight: Tensor, limit: int, tolerance: float
+    rest: KernelPart | None, whole: Parameters, x: Features, weight: Tensor, limit: int, tolerance: float
 ) -> Selection:
     """Pivoted partial Cholesky factorisation of every component with common pivots."""
     none = Selection({name: value[:0] for name, value in x.items()}, weight.new_zeros(1))
     if rest is None or not bool(weight.any()):
         return none
-    params = rest.parameters(own)
+    params = rest.parameters(whole)
     prior = rest.kernel.diagonal(params, x)
-    left = prior.clone()
+    residual = prior.clone()
     columns = prior.new_zeros(len(prior), min(limit, points(x)), points(x))
-    kept, functions, missed = [], 0, [float((weight * left).sum())]
+    kept, functions, missed = [], 0, [float((weight * residual).sum())]
     while len(kept) < columns.shape[1] and missed[-1] > tolerance * functions:
-        i = int((weight * left).sum(0).argmax())
+        # i = argmax Σ_k S_kk Var(f_k(x_i) | f(Z))
+        i = int((weight * residual).sum(0).argmax())
         k = rest.kernel.covariance(params, x, {name: value[i : i + 1] for name, value in x.items()})[..., 0]
+        # ℓ = (k(X, x_i) − Lᵀ L_i) / √d_i
         so_far = columns[:, : len(kept)]
         k = k - (so_far[..., i, None].mT @ so_far)[:, 0]
         # A component that the points know here already gains nothing from another one.
-        fresh = left[:, i] > TRUNCATION * prior[:, i]
+        fresh = residual[:, i] > TRUNCATION * prior[:, i]
         if not bool(fresh.any()):
             break
-        column = torch.where(fresh[:, None], k * left[:, i, None].clamp(min=1e-300).rsqrt(), 0.0)
+        column = torch.where(fresh[:, None], k * residual[:, i, None].clamp(min=1e-300).rsqrt(), 0.0)
         columns[:, len(kept)] = column
-        left = (left - column**2).clamp(min=0.0)
-        left[:, i] = 0.0
+        # d ← d − ℓ²
+        residual = (residual - column**2).clamp(min=0.0)
+        residual[:, i] = 0.0
         kept.append(i)
         functions += int(fresh.sum())
-        missed.append(float((weight * left).sum()))
+        missed.append(float((weight * residual).sum()))
     index = torch.tensor(kept, dtype=torch.long, device=weight.device)
     return Selection({name: value[index] for name, value in x.items()}, weight.new_tensor(missed))

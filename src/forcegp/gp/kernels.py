@@ -141,6 +141,7 @@ class Linear(Kernel):
         return torch.exp(params["log_offset"]) * self.slope_std(params).square().mean(-1).sqrt()
 
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
+        # k = Σ_d (s σ_d x_d)(s σ_d x′_d) + σ_0²
         slope = self.slope_std(params)[:, None, :]
         b, bias = (stacked(x2, self.inputs) * slope).mT, self.bias_std(params).square()[:, None, None]
         return lambda x1: (stacked(x1, self.inputs) * slope) @ b + bias
@@ -209,6 +210,7 @@ class Stationary(Kernel):
         variance = torch.exp(2.0 * params["log_std"])[:, None, None]
 
         def covariance(x1: Features) -> Tensor:
+            # r² = |a|² + |b|² − 2 aᵀb with a = x/ℓ and b = x′/ℓ; k = σ² g(r²)
             a = stacked(x1, self.inputs) * inverse
             r2 = torch.baddbmm(vecdot(a, a)[:, :, None] + squares, a, b.mT, alpha=-2.0)
             return variance * self.profile(r2)
@@ -225,7 +227,7 @@ class Stationary(Kernel):
 
     def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
         lengthscale = params["log_lengthscale"].exp()
-        # Components that share length-scales share frequencies too; their weights are independent.
+        # ω ~ p(ω)/ℓ, φ ~ U(0, 2π); components that share length-scales share ω, with independent weights.
         k, width = lengthscale.shape
         omega = self.frequencies((k, features, width), generator).to(lengthscale) / lengthscale[:, None, :]
         phase = 2.0 * math.pi * torch.rand(k, features, dtype=torch.float64, generator=generator)
@@ -251,6 +253,7 @@ class _Matern(Stationary):
         return (self.degrees * r2.clamp(min=1e-30)).sqrt().clamp(max=LARGEST_EXPONENT)
 
     def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        # ω = z/√(χ²_ν/ν): a Student t distribution with ν = 2 s degrees of freedom at smoothness s
         normal = torch.randn(shape, dtype=torch.float64, generator=generator)
         chi2 = torch.randn(*shape[:-1], self.degrees, dtype=torch.float64, generator=generator)
         return normal / ((chi2**2).sum(-1, keepdim=True) / self.degrees).sqrt()

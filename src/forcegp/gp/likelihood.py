@@ -44,7 +44,8 @@ class Conditioned:
     jitter: float
 
     def negative_log_likelihood(self, y: Tensor) -> Tensor:
-        """½ yᵀK⁻¹y + ½ log|K| + ½ n log 2π."""
+        """−log p(y) = ½ yᵀ(K + I)⁻¹y + ½ log|K + I| + ½ n log 2π."""
+        # = ½ yᵀα + Σ log L_ii + ½ n log 2π
         return 0.5 * (y @ self.alpha) + self.L.diagonal().log().sum() + 0.5 * len(y) * math.log(2 * math.pi)
 
 
@@ -60,7 +61,9 @@ def condition(priors: Sequence[Process], params: Parameters, blocks: Sequence[Bl
         NumericalError: the covariance is not positive definite.
     """
     y = target_of(blocks)
+    # Σ = K + I = L Lᵀ (eq. 10, rows in units of their noise)
     L, jitter = cholesky(gram(priors, params, blocks))
+    # α = Σ⁻¹ y (eq. 11)
     alpha = torch.cholesky_solve(y[:, None], L)[:, 0]
     return Conditioned(L, alpha, jitter)
 
@@ -86,6 +89,7 @@ def negative_log_likelihood(priors: Sequence[Process], params: Parameters, block
         fit = condition(priors, params, blocks)
 
         def gradient(deep: bool) -> Gradient:
+            # ½ tr((Σ⁻¹ − α αᵀ) ∂Σ)
             return gram_gradient(priors, params, blocks, cholesky_inverse_(fit.L), fit.alpha, deep)
 
         return fit.negative_log_likelihood(target_of(blocks)), gradient
@@ -99,7 +103,7 @@ def cholesky_inverse_(L: Tensor) -> Tensor:
         return torch.cholesky_inverse(L)
     if L.shape[0] == 0:
         return L
-    # A row-major lower triangle is the upper triangle in LAPACK's column-major order.
+    # Σ⁻¹ = L⁻ᵀ L⁻¹; a row-major lower triangle is the upper one in LAPACK's column-major order.
     array = L.numpy().T
     (potri,) = scipy.linalg.lapack.get_lapack_funcs(("potri",), (array,))
     with threads_of_pytorch():
@@ -138,8 +142,8 @@ class _WithGradient(torch.autograd.Function):
         ctx.wanted = [i for i, need in enumerate(ctx.needs_input_grad[2:]) if need]
         if ctx.wanted:
             gradient = gradient_of(any(places[i][0] != "param" for i in ctx.wanted))
-            own = (gradient.get(places[i]) for i in ctx.wanted)
-            pairs = zip(ctx.wanted, own, strict=True)
+            gradients = (gradient.get(places[i]) for i in ctx.wanted)
+            pairs = zip(ctx.wanted, gradients, strict=True)
             ctx.save_for_backward(*(torch.zeros_like(tensors[i]) if g is None else g for i, g in pairs))
         return value
 
@@ -174,8 +178,8 @@ def _from_tensors(named: Mapping[Place, Tensor]) -> tuple[dict[str, Tensor], lis
         elif place[0] == "operator":
             operators.setdefault(place[1], []).append(x)
     blocks = [
-        Block(tuple(features[g][p] for p in range(len(own))), tuple(own), named["target", g])
-        for g, own in operators.items()
+        Block(tuple(features[g][p] for p in range(len(W))), tuple(W), named["target", g])
+        for g, W in operators.items()
     ]
     return params, blocks
 

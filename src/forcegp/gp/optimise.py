@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -166,24 +166,14 @@ def _lbfgs(
     bounds: Bounds,
     first_step: float,
 ) -> tuple[bool, str]:
-    shapes = {key: value.shape for key, value in start.items()}
-    like = next(iter(start.values()))
-
-    def unflatten(x: np.ndarray) -> dict[str, Tensor]:
-        flat, tensors = torch.as_tensor(x, dtype=like.dtype, device=like.device), {}
-        for key, shape in shapes.items():
-            tensors[key], flat = flat[: shape.numel()].reshape(shape), flat[shape.numel() :]
-        return tensors
-
     def function(x: np.ndarray) -> tuple[float, np.ndarray]:
         # SciPy counts between iterations only, so a line search would go on beyond the limit.
         if len(recorder.history) >= options.max_evaluations:
             raise _SpentError
-        value, grads = recorder(unflatten(x))
-        flat = torch.cat([grads[key].reshape(-1) for key in shapes])
-        return value, flat.to("cpu", torch.float64).numpy()
+        value, grads = recorder(_unflattened(x, start))
+        return value, _flattened(grads[key] for key in start)
 
-    x = torch.cat([value.detach().reshape(-1) for value in start.values()]).cpu().double().numpy()
+    x = _flattened(start.values())
     low, high = (_flat_bounds(start, bounds, side) for side in (0, 1))
     x = np.clip(x, low, high)
     first = function(x)
@@ -215,11 +205,24 @@ def _lbfgs(
     return bool(result.success), message
 
 
+def _flattened(tensors: Iterable[Tensor]) -> np.ndarray:
+    """All entries in one vector."""
+    return torch.cat([x.detach().reshape(-1) for x in tensors]).cpu().double().numpy()
+
+
+def _unflattened(x: np.ndarray, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors from a vector of all their entries, with the names, shapes and type of others."""
+    first, tensors = next(iter(like.values())), {}
+    flat = torch.as_tensor(x, dtype=first.dtype, device=first.device)
+    for key, value in like.items():
+        tensors[key], flat = flat[: value.numel()].reshape(value.shape), flat[value.numel() :]
+    return tensors
+
+
 def _flat_bounds(start: Mapping[str, Tensor], bounds: Bounds, side: int) -> np.ndarray:
     """The lower or upper bound of every entry."""
     free = (-math.inf, math.inf)
-    parts = (torch.zeros_like(value) + bounds.get(key, free)[side] for key, value in start.items())
-    return torch.cat([part.detach().reshape(-1) for part in parts]).cpu().double().numpy()
+    return _flattened(torch.zeros_like(value) + bounds.get(key, free)[side] for key, value in start.items())
 
 
 def _adam(

@@ -56,10 +56,10 @@ class OrnsteinUhlenbeck(Kernel):
         variance = torch.exp(2.0 * params["log_std"])[:, None, None]
 
         def covariance(x1: Features) -> Tensor:
-            apart = (x1[TIME] - x2[TIME].mT).abs()
-            together = x1[SEGMENT] == x2[SEGMENT].mT
-            decay = torch.exp(-(apart * rate).clamp(max=LARGEST_EXPONENT))
-            return variance * torch.where(together, decay, 0.0)
+            interval = (x1[TIME] - x2[TIME].mT).abs()
+            same_segment = x1[SEGMENT] == x2[SEGMENT].mT
+            decay = torch.exp(-(interval * rate).clamp(max=LARGEST_EXPONENT))
+            return variance * torch.where(same_segment, decay, 0.0)
 
         return covariance
 

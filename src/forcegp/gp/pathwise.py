@@ -3,12 +3,9 @@
 A function from the prior, made of random features, is corrected by the data. Each sample is one deterministic
 function, so a trajectory integrated under it obeys Newton's equation and the constraint.
 
-Functions k(x, X) w as sums that are cheap to evaluate at many x.
-
-Functions drawn from a sparse posterior, whose cost does not depend on the number of samples.
-
-Matheron's rule on the inducing points: f(x) = f_prior(x) + V(x)ᵀ(w − Rᵀf_prior(Z)) with weights
-w ~ N(A⁻¹v, A⁻¹), and φ(x)ᵀw for the part of the kernel that has exact features (Wilson et al. 2020).
+A sparse posterior applies Matheron's rule to the inducing points, at a cost that does not depend on the
+number of samples: f(x) = f_prior(x) + V(x)ᵀ(w − Rᵀf_prior(Z)) with weights w ~ N(A⁻¹v, A⁻¹), and φ(x)ᵀw for
+the part of the kernel that has exact features.
 """
 
 from __future__ import annotations
@@ -49,6 +46,12 @@ class FunctionSamples:
     bases: tuple[tuple[Basis, ...], ...]
     weights: tuple[tuple[Tensor, ...], ...]
 
+    @classmethod
+    def of(cls, terms: Sequence[Sequence[tuple[Basis, Tensor]]]) -> FunctionSamples:
+        """From the terms of each process, functions with their weights."""
+        bases = tuple(tuple(basis for basis, _ in process_terms) for process_terms in terms)
+        return cls(bases, tuple(tuple(w for _, w in process_terms) for process_terms in terms))
+
     @property
     def count(self) -> int:
         """Number of samples."""
@@ -65,6 +68,7 @@ class FunctionSamples:
         Returns:
             `(samples, n, components)`, or `(n, components)` where `sample` is given.
         """
+        # f_s(x) = Σ_t φ_t(x) w_ts
         terms = [(basis(features), w) for basis, w in zip(self.bases[p], self.weights[p], strict=True)]
         if sample is None:
             return sum((k @ w for k, w in terms[1:]), start=terms[0][0] @ terms[0][1]).permute(2, 1, 0)
@@ -74,18 +78,18 @@ class FunctionSamples:
     @cached_property
     def _weights_by_sample(self) -> list[list[Tensor]]:
         """By process and basis, `(samples, components, terms)`."""
-        return [[w.permute(2, 0, 1).contiguous() for w in own] for own in self.weights]
+        return [[w.permute(2, 0, 1).contiguous() for w in weights] for weights in self.weights]
 
     def by_runs(self, p: int, features: Features, samples: range, runs: int) -> Tensor:
         """Values of process p from some samples, each at its own runs of states: `(samples · runs,
         components)`."""
         parts = []
         for basis, w in zip(self.bases[p], self._weights_by_sample[p], strict=True):
-            phi, own = basis(features).unflatten(1, (len(samples), runs)), w[samples.start : samples.stop]
+            phi, w_runs = basis(features).unflatten(1, (len(samples), runs)), w[samples.start : samples.stop]
             if len(phi) == 1:
-                parts.append(phi[0] @ own.mT)
+                parts.append(phi[0] @ w_runs.mT)
             else:
-                parts.append(torch.einsum("ksrt,skt->srk", phi, own))
+                parts.append(torch.einsum("ksrt,skt->srk", phi, w_runs))
         return sum(parts[1:], start=parts[0]).flatten(0, 1)
 
 
@@ -126,17 +130,15 @@ def draw_priors(
     draws, weights = [], []
     at_rows = like.new_zeros(sum(block.rows for block in blocks), count)
     for p, process in enumerate(processes):
-        own = features if measured[p] else max(1, features // UNMEASURED)
-        draw = process.kernel.draw(sub(params, process.prefix), own, generator)
+        feature_count = features if measured[p] else max(1, features // UNMEASURED)
+        draw = process.kernel.draw(sub(params, process.prefix), feature_count, generator)
         size = draw.basis(blocks[0].features[p]).shape
+        # f = φᵀw with w ~ N(0, I); W f(X) at the rows
         w = torch.randn(size[0], size[2], count, dtype=torch.float64, generator=generator).to(like)
+        latent = (draw.basis(block.features[p]) @ w for block in blocks)
+        pairs = zip(blocks, latent, strict=True)
         at_rows += torch.cat(
-            [
-                torch.einsum("nak,kns->nas", block.operators[p], draw.basis(block.features[p]) @ w).flatten(
-                    0, 1
-                )
-                for block in blocks
-            ]
+            [torch.einsum("nak,kns->nas", block.operators[p], f).flatten(0, 1) for block, f in pairs]
         )
         draws.append(draw)
         weights.append(w)
@@ -160,9 +162,10 @@ def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> 
     """
     if isinstance(kernel, Sum) and not isinstance(kernel, Product):
         sides = ((getattr(kernel, side), sub(params, side)) for side in ("left", "right"))
-        return [term for own, given in sides for term in kernel_terms(own, given, X, w)]
+        return [term for k, theta in sides for term in kernel_terms(k, theta, X, w)]
     finite = split(kernel)
     if finite.rest is None and finite.finite is not None:
+        # k(x, X) w = φ(x)ᵀ (φ(X) w)
         draw = finite.finite.features(params)
         return [(draw.basis, draw.basis(X).mT @ w)]
     common = _common(kernel, params, X)
@@ -226,12 +229,9 @@ def draw_functions(
         generator: source of randomness, on the CPU.
         features: random features of each component's prior.
     """
-    terms = [
-        _terms(part, weights[basis.of_process(p)], generator, features) for p, part in enumerate(basis.parts)
-    ]
-    return FunctionSamples(
-        tuple(tuple(function for function, _ in own) for own in terms),
-        tuple(tuple(w for _, w in own) for own in terms),
+    parts = enumerate(basis.parts)
+    return FunctionSamples.of(
+        [_terms(part, weights[basis.of_process(p)], generator, features) for p, part in parts]
     )
 
 
@@ -243,6 +243,7 @@ def _terms(
     terms: list[tuple[Basis, Tensor]] = []
     rest = part.split.rest
     if rest is not None:
+        # f_prior(Z) = φ(Z)ᵀ u with u ~ N(0, I)
         draw = rest.kernel.draw(rest.parameters(part.params), features, generator)
         count = draw.basis(part.inducing).shape[-1]
         shape = (part.components, count, weights.shape[1])

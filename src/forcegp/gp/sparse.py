@@ -4,16 +4,13 @@ With A = I + Σ V_i S_i V_iᵀ and v = Σ V_i W_iᵀ y_i, the latent mean is V_*
 k_** − V_*ᵀV_* + V_*ᵀA⁻¹V_* (Titsias 2009; Hensman et al. 2013). A prediction costs the same after a
 hundred samples and after a million.
 
-Weights of basis functions that drift: a component that changes while the others stay.
-
-A drifting weight is an Ornstein–Uhlenbeck process with its prior as stationary distribution,
-w′ = ρ w + √(1 − ρ²) ξ, ξ ~ N(0, I). In information form, with A = I + G, v and the drifting weights p,
+Weights of basis functions may drift: some components change while the others stay. A drifting weight is an
+Ornstein–Uhlenbeck process with its prior as stationary distribution, w′ = ρ w + √(1 − ρ²) ξ, ξ ~ N(0, I). In
+information form, with A = I + G, v, the drifting weights p and the others o,
 
     S = A_pp + ρ²a I,  a = 1/(1 − ρ²),
     A′_oo = A_oo − A_op S⁻¹ A_po,  A′_op = ρa A_op S⁻¹,  A′_pp = a I − ρ²a² S⁻¹,
     v′_o = v_o − A_op S⁻¹ v_p,  v′_p = ρa S⁻¹ v_p.
-
-What a sparse posterior loses by its inducing points.
 """
 
 from __future__ import annotations
@@ -31,7 +28,7 @@ from forcegp.gp.factor import cholesky, extended
 from forcegp.gp.features import Features
 from forcegp.gp.pathwise import MISSED_FEATURES, FunctionSamples, draw_functions
 from forcegp.gp.rounding import require_resolved_noise, require_resolved_variance
-from forcegp.gp.structured_covariance import Block, chunked
+from forcegp.gp.structured_covariance import Block, chunked, rows_mean
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 
 
@@ -53,10 +50,13 @@ def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
     a, p = 1.0 / (1.0 - factor**2), weights
     A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
     eye = torch.eye(len(p), dtype=A.dtype, device=A.device)
+    # S = A_pp + ρ²a I = L Lᵀ
     L = torch.linalg.cholesky(A[p][:, p] + factor**2 * a * eye)
     inverse = torch.cholesky_inverse(L)
+    # A′_oo = A_oo − A_op S⁻¹ A_po, v′_o = v_o − A_op S⁻¹ v_p
     A_ap, gain = A[:, p], A[:, p] @ inverse
     G, v = sums.G - gain @ A_ap.mT, sums.v - gain @ sums.v[p]
+    # A′_op = ρa A_op S⁻¹, A′_pp = a I − ρ²a² S⁻¹, v′_p = ρa S⁻¹ v_p
     G[:, p] = factor * a * gain
     G[p, :] = G[:, p].mT
     G[p[:, None], p[None, :]] = a * eye - (factor * a) ** 2 * inverse - eye
@@ -95,6 +95,7 @@ class SparsePosterior:
         Raises:
             NumericalError: A is not positive definite, as after removing samples that were never added.
         """
+        # A = I + G = L Lᵀ
         A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
         L, jitter = cholesky(A)
         result = cls(basis, Moments(*sums.moments), L, jitter)
@@ -117,8 +118,8 @@ class SparsePosterior:
         """Of each process, whether any row shows it; the samples change nothing about the others."""
         # The factor of A = I + G is that of the identity where G is zero.
         diagonal = self.L.diagonal().abs()
-        own = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
-        return tuple(bool((diagonal[columns] > 1.0).any()) for columns in own)
+        slices = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
+        return tuple(bool((diagonal[columns] > 1.0).any()) for columns in slices)
 
     @cached_property
     def folded(self) -> list[tuple[Tensor, Tensor]]:
@@ -128,6 +129,7 @@ class SparsePosterior:
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
         """Posterior mean of process p, `(n, components)`."""
+        # μ(x) = V(x)ᵀ A⁻¹v = k(x, Z) (R m) + φ(x)ᵀ m (eq. 23)
         part, (on_kernel, on_features) = self.basis.parts[p], self.folded[p]
         x = next(iter(features.values()))
         mean = x.new_zeros(part.components, len(x), 1)
@@ -139,10 +141,24 @@ class SparsePosterior:
 
     def mean(self, block: Block) -> Tensor:
         """Posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
-        mean = torch.zeros_like(block.target)
-        for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
-            mean = mean + (W @ self.latent_mean(p, x)[..., None])[..., 0]
-        return mean
+        return rows_mean(self.latent_mean, block)
+
+    def knowing(self, p: int, features: Features, value: Tensor) -> SparsePosterior:
+        """The posterior given that a constant process p, with finite features, has a value `(components,)`.
+
+        The mean of process p itself becomes zero, since what it explained is part of the prior mean now.
+        """
+        part, own = self.basis.parts[p], self.basis.of_process(p)
+        eye = torch.eye(part.components, dtype=value.dtype, device=value.device)
+        # f_p = Φ w_p
+        Phi = part.rows(eye[None], part.values(features)[0])
+        weights = torch.linalg.lstsq(Phi, value[:, None]).solution[:, 0]
+        # v_o ← v_o − G_op w_p, without the rows of w_p; A = I + G = L Lᵀ
+        G = self.L @ self.L.mT - torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
+        v = self.moments.v - G[:, own] @ weights
+        G[own], G[:, own], v[own] = 0.0, 0.0, 0.0
+        _, yy, rows, prior, missed = self.moments.moments
+        return SparsePosterior.of(self.basis, Sums(v, yy, rows, prior, missed, G))
 
     @cached_property
     def _inverse_factor(self) -> list[Tensor]:
@@ -165,6 +181,7 @@ class SparsePosterior:
         `(n, components, size)`; the variance that it misses and that of the prior `(n, components)`."""
         T, missed, prior = [], [], []
         for part, inverse, x in zip(self.basis.parts, self._inverse_factor, features, strict=True):
+            # T = Vᵀ L⁻ᵀ, so that T Tᵀ = Vᵀ A⁻¹ V
             V, explained = part.values(x)
             T.append(V @ inverse)
             missed.append(part.missed(part.rest_variance(x), explained))
@@ -182,9 +199,10 @@ class SparsePosterior:
         """
         d = block.target.shape[1]
         parts = [block.target.new_zeros(0, d, d)]
-        for own in chunked([block], CHUNK_PREDICTIONS):
-            W = torch.cat(own.operators, dim=-1)
-            T, missed, prior = self._latent(own.features)
+        for chunk in chunked([block], CHUNK_PREDICTIONS):
+            W = torch.cat(chunk.operators, dim=-1)
+            T, missed, prior = self._latent(chunk.features)
+            # Σ* = W (T Tᵀ + diag(k − |V|²)) Wᵀ (eq. 24)
             root = W @ T
             posterior = root @ root.mT + (W * missed[:, None]) @ W.mT
             parts.append(require_resolved_variance(posterior, (W.square() @ prior[..., None])[..., 0]))
@@ -204,8 +222,10 @@ class SparsePosterior:
     def diagnostics(self) -> Diagnostics:
         """What the inducing points miss, and how well the samples are fitted."""
         sums, m = self.sums, self.weights
+        # tr A⁻¹G = size − tr A⁻¹ = size − |L⁻ᵀ|²
         inverse = sum((block**2).sum() for block in self._inverse_factor)
         learned = float(self.basis.size - inverse)
+        # |y − Φ m|² = Σ y² − 2 mᵀv + mᵀ G m
         residual = sums.yy - 2.0 * (m @ sums.v) + m @ (sums.G @ m)
         relative = torch.where(sums.prior > 0.0, sums.missed / sums.prior.where(sums.prior > 0.0, 1.0), 0.0)
         return Diagnostics(
@@ -227,6 +247,7 @@ class SparsePosterior:
             generator: source of randomness, on the CPU.
             features: random features per component.
         """
+        # w = m + L⁻ᵀ ξ ~ N(A⁻¹v, A⁻¹)
         m = self.weights[:, None]
         normal = torch.randn(len(m), count, dtype=torch.float64, generator=generator).to(m)
         weights = m + torch.linalg.solve_triangular(self.L.mT, normal, upper=True)
@@ -241,6 +262,7 @@ class SparsePosterior:
         rows = sum(block.rows for block in blocks)
         if rows > UPDATE_FRACTION * self.basis.size or self.L.device.type != "cpu":
             return SparsePosterior.of(self.basis, self.sums + accumulate(self.basis, blocks))
+        # A′ = A + ΦᵀΦ
         moments, Phi = add_rows(self.basis, self.moments, blocks)
         return SparsePosterior(self.basis, moments, extended(self.L, Phi), self.jitter)
 
@@ -259,8 +281,8 @@ class SparsePosterior:
             ModelError: the factor is not between 0 and 1.
         """
         columns = torch.arange(self.basis.size, device=self.L.device)
-        own = torch.cat([columns[self.basis.of_process(p)] for p in processes])
-        return SparsePosterior.of(self.basis, drifted(self.sums, own, factor))
+        weights = torch.cat([columns[self.basis.of_process(p)] for p in processes])
+        return SparsePosterior.of(self.basis, drifted(self.sums, weights, factor))
 
     def without(self, blocks: Sequence[Block]) -> SparsePosterior:
         """Without samples that it was conditioned on.

@@ -96,6 +96,6 @@ def _part(p: int, process: Process, params: Parameters, tensors: Mapping[str, Te
     components = int(tensors[f"{p}.components"])
     spectra = ()
     if f"{p}.0.values" in tensors:
-        given = [sub(tensors, f"{p}.{k}") for k in range(components)]
-        spectra = tuple(Spectrum(s["values"], s["vectors"], int(s["dropped"])) for s in given)
+        saved = [sub(tensors, f"{p}.{k}") for k in range(components)]
+        spectra = tuple(Spectrum(s["values"], s["vectors"], int(s["dropped"])) for s in saved)
     return ProcessBasis(split(process.kernel), sub(params, process.prefix), components, inducing, spectra)

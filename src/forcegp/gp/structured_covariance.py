@@ -7,7 +7,7 @@ form of H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by bl
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Protocol, runtime_checkable
@@ -80,13 +80,26 @@ def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
             yield rows_of(block, slice(first, first + samples))
 
 
-def rows_of(block: Block, own: slice | Tensor) -> Block:
+def rows_of(block: Block, index: slice | Tensor) -> Block:
     """Some of the samples of a block."""
     return Block(
-        tuple({name: x[own] for name, x in f.items()} for f in block.features),
-        tuple(W[own] for W in block.operators),
-        block.target[own],
+        tuple({name: x[index] for name, x in f.items()} for f in block.features),
+        tuple(W[index] for W in block.operators),
+        block.target[index],
     )
+
+
+def rows_mean(latent_mean: Callable[[int, Features], Tensor], block: Block) -> Tensor:
+    """Mean Σ_p W_p μ_p of the rows of each sample of a block, `(n, d)` (eq. 23).
+
+    Args:
+        latent_mean: μ_p of process p at kernel inputs, `(n, components)`.
+        block: samples; the targets are not read.
+    """
+    mean = torch.zeros_like(block.target)
+    for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
+        mean = mean + (W @ latent_mean(p, x)[..., None])[..., 0]
+    return mean
 
 
 def offsets(blocks: Sequence[Block]) -> list[int]:
@@ -109,6 +122,7 @@ def add_rows(out: Tensor, W1: Tensor, k: Tensor, W2: Tensor, lower: bool = False
     W2k = W2.permute(2, 0, 1)
     for i, j in _chunks(len(W1), W2.numel()):
         n = j if lower else len(W2)
+        # K_ij += Σ_k W_i k_k(x_i, x_j) W_jᵀ (eq. 12)
         weighted = k[:, i:j, :n].transpose(0, 1)[..., None] * W2k[:, :n]
         out[i * r : j * r, : n * W2.shape[1]] += (W1[i:j] @ weighted.flatten(2)).flatten(0, 1)
 
@@ -122,12 +136,12 @@ def _pairs(
 ) -> Iterator[tuple[int, dict[str, Tensor], int, int]]:
     """Each prior with its hyperparameters, and the pairs of blocks between which it contributes."""
     for p, prior in enumerate(priors):
-        heard1, heard2 = ([bool(b.operators[p].any()) for b in blocks] for blocks in (blocks1, blocks2))
-        own = sub(params, prior.prefix)
+        depends1, depends2 = ([bool(b.operators[p].any()) for b in blocks] for blocks in (blocks1, blocks2))
+        process_params = sub(params, prior.prefix)
         for g in range(len(blocks1)):
             for h in range(g + 1 if lower else len(blocks2)):
-                if heard1[g] and heard2[h]:
-                    yield p, own, g, h
+                if depends1[g] and depends2[h]:
+                    yield p, process_params, g, h
 
 
 def cross_gram(
@@ -144,9 +158,10 @@ def cross_gram(
     starts1, starts2 = offsets(blocks1), offsets(blocks2)
     like = blocks1[0].target
     K = torch.zeros(starts1[-1], starts2[-1], dtype=like.dtype, device=like.device)
-    for p, own, g, h in _pairs(priors, params, blocks1, blocks2, lower):
+    # K = Σ_p W_p k_p W_pᵀ (eqs. 13 and 15)
+    for p, process_params, g, h in _pairs(priors, params, blocks1, blocks2, lower):
         one, two = blocks1[g], blocks2[h]
-        k = priors[p].kernel.covariance(own, one.features[p], two.features[p])
+        k = priors[p].kernel.covariance(process_params, one.features[p], two.features[p])
         part = K[starts1[g] : starts1[g + 1], starts2[h] : starts2[h + 1]]
         add_rows(part, one.operators[p], k, two.operators[p], lower=lower and g == h)
     return K
@@ -154,6 +169,7 @@ def cross_gram(
 
 def gram(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
     """Covariance of the rows of blocks with unit white noise, `(rows, rows)`; the lower triangle is valid."""
+    # Σ = K + I (eq. 10)
     K = cross_gram(priors, params, blocks)
     K.diagonal().add_(1.0)
     return K
@@ -167,26 +183,28 @@ def gram_gradient(
     alpha: Tensor,
     deep: bool,
 ) -> Gradient:
-    """Derivatives of ½ log|K| + ½ yᵀK⁻¹y, from dK = ½(K⁻¹ − ααᵀ) in closed form.
+    """Derivatives of F = ½ log|Σ| + ½ yᵀΣ⁻¹y with Σ = K + I, from ∂F/∂Σ = ½(Σ⁻¹ − ααᵀ) in closed form.
 
-    With G = K⁻¹ − ααᵀ the derivative for the kernel between samples i and j is ½ W_iᵀ G_ij W_j; only
+    With G = Σ⁻¹ − ααᵀ the derivative for the kernel between samples i and j is ½ W_iᵀ G_ij W_j; only
     the kernels themselves are differentiated automatically.
 
     Args:
         priors, params, blocks: as given to `gram`.
-        K_inv: `(rows, rows)`, the lower triangle is read.
-        alpha: `(rows,)` K⁻¹ y.
+        K_inv: Σ⁻¹ `(rows, rows)`, the lower triangle is read.
+        alpha: Σ⁻¹ y `(rows,)`.
         deep: whether to compute derivatives for targets, operators and features too.
     """
     rows = [slice(*pair) for pair in pairwise(offsets(blocks))]
     total: Gradient = {}
     if deep:
+        # ∂F/∂y = α
         for g, block in enumerate(blocks):
             total["target", g] = alpha[rows[g]].reshape(block.target.shape)
             total |= {("operator", g, p): torch.zeros_like(W) for p, W in enumerate(block.operators)}
-    for p, own, g, h in _pairs(priors, params, blocks, blocks, lower=True):
+    for p, process_params, g, h in _pairs(priors, params, blocks, blocks, lower=True):
         one, two = blocks[g], blocks[h]
-        leaves, k = _kernel_with_leaves(priors[p], own, one.features[p], two.features[p], deep)
+        # ∂F/∂k_ij = ½ W_iᵀ G_ij W_j, for both triangles together
+        leaves, k = _kernel_with_leaves(priors[p], process_params, one.features[p], two.features[p], deep)
         dk = _kernel_gradient(
             K_inv[rows[g], rows[h]],
             (alpha[rows[g]], alpha[rows[h]]),
@@ -195,6 +213,7 @@ def gram_gradient(
             g == h,
             (total["operator", g, p], total["operator", h, p]) if deep else None,
         )
+        # ∂F/∂θ = Σ_ij ∂F/∂k_ij ∂k_ij/∂θ, and alike for kernel inputs
         grads = torch.autograd.grad(k, list(leaves.values()), dk, allow_unused=True)
         for (kind, key), grad in zip(leaves, grads, strict=True):
             where = ("feature", g if kind == "one" else h, p, key)
@@ -205,10 +224,10 @@ def gram_gradient(
 
 
 def _kernel_with_leaves(
-    prior: Process, own: Parameters, f1: Features, f2: Features, with_features: bool
+    prior: Process, process_params: Parameters, f1: Features, f2: Features, with_features: bool
 ) -> tuple[dict[tuple[str, str], Tensor], Tensor]:
     """The kernel matrix with a graph to fresh leaves of its parameters and, on request, its inputs."""
-    leaves = {("param", key): value.detach().requires_grad_() for key, value in own.items()}
+    leaves = {("param", key): value.detach().requires_grad_() for key, value in process_params.items()}
     one: Mapping[str, Tensor] = f1
     two: Mapping[str, Tensor] = f2
     if with_features:
@@ -216,7 +235,7 @@ def _kernel_with_leaves(
         leaves |= {("two", key): x.detach().requires_grad_() for key, x in f2.items()}
         one, two = ({key: leaves[side, key] for key in f1} for side in ("one", "two"))
     with torch.enable_grad():
-        k = prior.kernel.covariance({key: leaves["param", key] for key in own}, one, two)
+        k = prior.kernel.covariance({key: leaves["param", key] for key in process_params}, one, two)
     return leaves, k
 
 
@@ -238,14 +257,17 @@ def _kernel_gradient(
     W2k = W2.permute(2, 0, 1)
     for i, j in _chunks(len(W1), W2.numel()):
         n = j if lower else len(W2)
+        # G = Σ⁻¹ − α αᵀ off the diagonal, ½ (Σ⁻¹ − α αᵀ) on it
         G = torch.addr(K_inv[i * r : j * r, : n * s], alpha[0][i * r : j * r], alpha[1][: n * s], alpha=-1.0)
         if lower:
-            own = G[:, i * s :]
-            own.copy_(0.5 * (torch.tril(own) + torch.tril(own, -1).mT))
+            diagonal = G[:, i * s :]
+            diagonal.copy_(0.5 * (torch.tril(diagonal) + torch.tril(diagonal, -1).mT))
+        # Z = W_iᵀ G_ij, ∂F/∂k_ij = Z W_j
         G = G.unflatten(0, (j - i, r))
         Z = (W1[i:j].mT @ G).unflatten(2, (n, s))
         dk[:, i:j, :n] = (Z * W2k[:, :n]).sum(-1).transpose(0, 1)
         if into is not None:
+            # ∂F/∂W_i = G_ij W_j k_ij, ∂F/∂W_j = Zᵀ k_ij
             weighted = k[:, i:j, :n].transpose(0, 1)[..., None] * W2k[:, :n]
             into[0][i:j] += G @ weighted.flatten(2).mT
             into[1][:n] += torch.einsum("kij,ikjb->jbk", k[:, i:j, :n], Z)

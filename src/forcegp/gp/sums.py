@@ -1,7 +1,7 @@
 """The two sums over samples that a sparse posterior consists of; they stream, add and are forgotten.
 
-Of whitened rows y_i = W_i f(x_i) + ε only S_i = W_iᵀW_i and W_iᵀy_i enter: Σ V_i S_i V_iᵀ and
-Σ V_i W_iᵀ y_i, with V_i the basis functions of each component at sample i.
+Of whitened rows y_i = W_i f(x_i) + ε only S_i = W_iᵀW_i and c_i = W_iᵀy_i enter: G = Σ V_i S_i V_iᵀ and
+v = Σ V_i c_i, with V_i the basis functions of each component at sample i.
 """
 
 from __future__ import annotations
@@ -125,27 +125,35 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
     if total is None:
         like = next(iter(basis.params.values()))
         return Sums.zero(basis, like)
+    # G = Gᵀ, from its upper triangle
     total.G.copy_(torch.triu(total.G) + torch.triu(total.G, 1).mT)
     return total
+
+
+def normal_terms(block: Block) -> tuple[Tensor, Tensor, Tensor]:
+    """W of all components `(n, r, k)`, S = WᵀW `(k, k, n)` and c = Wᵀy `(n, k)` of each sample."""
+    W = torch.cat(block.operators, dim=-1)
+    S = (W.mT @ W).permute(1, 2, 0).contiguous()
+    return W, S, (W.mT @ block.target[..., None])[..., 0]
 
 
 def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
     """Add a block in place; only the upper triangle of G."""
     V, prior, missed = basis.evaluate(block.features)
-    W = torch.cat(block.operators, dim=-1)
-    S = (W.mT @ W).permute(1, 2, 0).contiguous()
-    c = (W.mT @ block.target[..., None])[..., 0]
+    _, S, c = normal_terms(block)
     weighted = torch.empty_like(V)
-    shown = [
+    active = [
         k for k in range(len(S)) if basis.columns[k].stop > basis.columns[k].start and bool(S[k, k].any())
     ]
-    for position, k in enumerate(shown):
-        own = basis.columns[k]
-        for l in shown[position:]:
+    for position, k in enumerate(active):
+        # G_kl += Σ_i V_k S_kl V_lᵀ, v_k += Σ_i V_k c_k
+        of_k = basis.columns[k]
+        for l in active[position:]:
             torch.mul(V[:, basis.columns[l]], S[k, l, :, None], out=weighted[:, basis.columns[l]])
-        for run in _runs([basis.columns[l] for l in shown[position:]]):
-            into.G[own, run].addmm_(V[:, own].mT, weighted[:, run])
-        into.v[own] += V[:, own].mT @ c[:, k]
+        for run in _runs([basis.columns[l] for l in active[position:]]):
+            into.G[of_k, run].addmm_(V[:, of_k].mT, weighted[:, run])
+        into.v[of_k] += V[:, of_k].mT @ c[:, k]
+    # tr W k Wᵀ = Σ_k S_kk k_k(x, x), and of what is missed, k − |V|²
     S_kk = torch.diagonal(S, dim1=0, dim2=1)
     into.prior.add_(_by_process(basis, S_kk, prior))
     into.missed.add_(_by_process(basis, S_kk, missed))
@@ -156,7 +164,7 @@ def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
 def _by_process(basis: LatentBasis, S_kk: Tensor, variance: Tensor) -> Tensor:
     """Σ S_kk var_k of each process, `(processes,)`, with S_kk and variances `(n, k)`."""
     traces = (S_kk * variance).sum(0)
-    return torch.stack([traces[own].sum() for own in basis.components])
+    return torch.stack([traces[components].sum() for components in basis.components])
 
 
 @torch.no_grad()
@@ -174,12 +182,15 @@ def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> t
         for p, (part, x, W) in enumerate(zip(basis.parts, block.features, block.operators, strict=True)):
             if not bool(W.any()):
                 continue
+            # Φ_i = W_i V_iᵀ
             values, explained = part.values(x)
             rows[:, basis.of_process(p)] = part.rows(W, values)
+            # Σ_k S_kk k_k(x, x) and Σ_k S_kk (k_k − |V_k|²)
             S_kk, variance = torch.linalg.vecdot(W, W, dim=1).mT, part.rest_variance(x)
             missed = part.missed(variance, explained)
             traces[p] = traces[p] + (S_kk * torch.stack([variance, missed])).sum((1, 2))
     y = torch.cat([block.target.reshape(-1) for block in blocks])
+    # v += Φᵀ y
     v = torch.addmv(moments.v, Phi.mT, y)
     prior, missed = torch.stack(traces, dim=1)
     yy, rows = moments.yy + y @ y, moments.rows + len(y)
@@ -189,9 +200,9 @@ def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> t
 def _runs(columns: list[slice]) -> list[slice]:
     """Neighbouring slices joined."""
     runs: list[slice] = []
-    for own in columns:
-        if runs and runs[-1].stop == own.start:
-            runs[-1] = slice(runs[-1].start, own.stop)
+    for part in columns:
+        if runs and runs[-1].stop == part.start:
+            runs[-1] = slice(runs[-1].start, part.stop)
         else:
-            runs.append(own)
+            runs.append(part)
     return runs

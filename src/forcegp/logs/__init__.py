@@ -114,21 +114,21 @@ def import_log(
     system = system_of(scene)
     robot = system.robot
     if mapping is None:
-        known = default_mapping(path, system)
+        log_mapping = default_mapping(path, system)
     else:
-        known = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
+        log_mapping = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
     report = ImportReport(str(path))
-    report.did(f"read {Path(path).name} by mapping {Path(known.source).name}")
+    report.did(f"read {Path(path).name} by mapping {Path(log_mapping.source).name}")
     try:
-        signals = gather(path, known, robot.joint_names, report, progress)
+        signals = gather(path, log_mapping, robot.joint_names, report, progress)
         announce_memory(_bytes(signals), f"importing {len(signals):,} rows")
-        even_clock(signals, known.sections.time.period, report)
-        found = _contacts(signals, system, known, report)
-        std = add_derivatives(signals, known.sections.derivatives, report)
-        data = _dataset(signals, std, known, system, report)
+        even_clock(signals, log_mapping.sections.time.period, report)
+        evidence = _contacts(signals, system, log_mapping, report)
+        std = add_derivatives(signals, log_mapping.sections.derivatives, report)
+        data = _dataset(signals, std, log_mapping, system, report)
     except DataError as error:
         raise error if str(path) in error.message else DataError.at(str(path), error) from None
-    return Imported(data, report, tuple(found))
+    return Imported(data, report, tuple(evidence))
 
 
 def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> ConstrainedSystem:
@@ -157,9 +157,9 @@ def _contacts(
     kept[trial.row] = True
     signals.keep(kept)
     signals.segment, trial.row, trial.contact = trial.segment, signals.row, signals.contact
-    found = detect(trial, system, mapping, report)
+    evidence = detect(trial, system, mapping, report)
     signals.contact = trial.contact
-    return found
+    return evidence
 
 
 def _dataset(
@@ -174,17 +174,7 @@ def _dataset(
     settings = mapping.sections.derivatives
     dt = usual_step(signals.t)
     margin = settings.impact_margin if settings.impact_margin is not None else 0.5 * settings.window * dt
-    extras = {} if std is None else {"qdd_std": _tensor(std)}
-    masks = impact_mask(signals, margin)
-    contact = {name: torch.from_numpy(value) for name, value in signals.contact.items()}
-    impact = {name: torch.from_numpy(value.astype(np.float64)) for name, value in masks.items()}
-    contact_extras = {"impact": impact} if impact else {}
-    if "wrench" in signals.vectors and contact:
-        sensed = per_contact(signals, system, mapping)
-        contact_extras |= {
-            name: {key: _tensor(value) for key, value in group.items()} for name, group in sensed.items()
-        }
-        report.did("took the tool's weight off the wrench and carried it to the contact")
+    contact_extras = _contact_extras(signals, margin, mapping, system, report)
     vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
     header = DataHeader(
         dt=dt,
@@ -201,12 +191,26 @@ def _dataset(
         t=_tensor(signals.t),
         **vectors,
         joint_names=robot.joint_names,
-        contact=contact,
-        extras=extras,
+        contact={name: torch.from_numpy(value) for name, value in signals.contact.items()},
+        extras={} if std is None else {"qdd_std": _tensor(std)},
         contact_extras=contact_extras,
         segment=torch.from_numpy(signals.segment),
         header=header,
     )
+
+
+def _contact_extras(
+    signals: Signals, margin: float, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
+) -> dict[str, dict[str, torch.Tensor]]:
+    """Rows at impacts of each contact, and the forces that a sensor measured there."""
+    masks = impact_mask(signals, margin)
+    impact = {name: torch.from_numpy(value.astype(np.float64)) for name, value in masks.items()}
+    extras = {"impact": impact} if impact else {}
+    if "wrench" in signals.vectors and signals.contact:
+        sensed = per_contact(signals, system, mapping)
+        extras |= {name: {key: _tensor(x) for key, x in group.items()} for name, group in sensed.items()}
+        report.did("took the tool's weight off the wrench and carried it to the contact")
+    return extras
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:

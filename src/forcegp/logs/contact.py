@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
-from forcegp.logs.mapping import ContactSection, Mapping, WrenchSection
+from forcegp.logs.mapping import ContactStateSection, Mapping, WrenchSection
 from forcegp.logs.signals import Array, ImportReport, Signals, runs
 from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
@@ -216,7 +216,7 @@ def detect(
         if name not in system.contact_names:
             listing = ", ".join(system.contact_names) or "no contacts"
             raise mapping.error(("contact", name), f"the scene has no contact {name!r}", listing)
-    found, states = [], {}
+    evidence, states = [], {}
     for contact in system.contacts:
         if contact.name not in sections:
             raise mapping.error(
@@ -236,14 +236,16 @@ def detect(
                 key, "only a contact with a surface can be detected", "column, always or never"
             )
         else:
-            state, seen = _detect(signals, system, mapping, contact, section)
+            state, detection = _detect(signals, system, mapping, contact, section)
             states[contact.name] = state
-            found.append(seen)
-            report.find("contact", seen.sentence(), signals.row[state])
-            if seen.merged:
-                report.find("short contact", f"{seen.merged} intervals of {contact.name!r} were too short")
+            evidence.append(detection)
+            report.find("contact", detection.sentence(), signals.row[state])
+            if detection.merged:
+                report.find(
+                    "short contact", f"{detection.merged} intervals of {contact.name!r} were too short"
+                )
     signals.contact = states
-    return found
+    return evidence
 
 
 def _detect(
@@ -251,7 +253,7 @@ def _detect(
     system: ConstrainedSystem,
     mapping: Mapping,
     contact: SurfaceContact,
-    section: ContactSection,
+    section: ContactStateSection,
 ) -> tuple[NDArray[np.bool_], Evidence]:
     if section.source == "distance":
         values = surface_distance(signals, system, contact)
@@ -291,7 +293,7 @@ def touching(distance: Array) -> float:
     return min(TOUCHING, level + max(DISTANCE_STD * spread, SMALLEST_DISTANCE))
 
 
-def force_levels(values: Array, name: str, section: ContactSection) -> tuple[float, float]:
+def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
     """Force from which a contact is closed, and the force up to which that interval then extends [N].
 
     The first is the one that parts the forces into the two groups with the least variance within them (Otsu

@@ -114,18 +114,18 @@ class _Gathering:
 
     def run(self) -> Signals:
         """The quantities, those of the reference stream first."""
-        own, others = {}, {}
+        reference, others = {}, {}
         for name, symbol in SYMBOLS.items():
             if self.mapping.quantity(name) is not None:
                 stream, values = self._vector(name)
-                (own if stream is self.reference else others)[symbol] = (stream, values)
+                (reference if stream is self.reference else others)[symbol] = (stream, values)
         if self.mapping.sections.wrench is not None:
             stream, values = self._wrench()
-            (own if stream is self.reference else others)["wrench"] = (stream, values)
+            (reference if stream is self.reference else others)["wrench"] = (stream, values)
         flags = self._flags()
         for name, (stream, values) in flags.items():
-            (own if stream is self.reference else others)[f"contact {name}"] = (stream, values)
-        signals = self._reference({name: values for name, (_, values) in own.items()})
+            (reference if stream is self.reference else others)[f"contact {name}"] = (stream, values)
+        signals = self._reference({name: values for name, (_, values) in reference.items()})
         for name, (stream, values) in others.items():
             t = self._stamps(stream)
             good = np.isfinite(values).all(axis=1) & np.isfinite(t)
@@ -168,7 +168,7 @@ class _Gathering:
         return stream, result
 
     def _flags(self) -> dict[str, tuple[Stream, Array]]:
-        found = {}
+        flags = {}
         for name, section in self.mapping.sections.contact.items():
             if section.source == "column" and section.column is not None:
                 stream = self.table.stream_of(section.column, section.stream)
@@ -180,8 +180,8 @@ class _Gathering:
                         expected="0 or 1",
                         got=values[wrong[0]],
                     )
-                found[name] = (stream, values[:, None])
-        return found
+                flags[name] = (stream, values[:, None])
+        return flags
 
     def _stamps(self, stream: Stream) -> Array:
         """Time stamps of a stream [s]."""

@@ -22,7 +22,7 @@ from forcegp.logs.contact import force_levels, level_and_spread, multiplier
 from forcegp.logs.draft import Draft
 from forcegp.logs.gather import gather
 from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
-from forcegp.logs.mapping import ContactSection, Mapping, parse_mapping
+from forcegp.logs.mapping import ContactStateSection, Mapping, parse_mapping
 from forcegp.logs.readers import read
 from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.logs.smoothing import add_derivatives, even_clock
@@ -215,10 +215,10 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
     for i in range(nq):
         others = np.column_stack([np.ones(len(rows)), qd[:, i], np.sign(qd[:, i]), A[:, :, i]])
         both = np.column_stack([rigid[:, i], tau[:, i]])
-        left = both - others @ np.linalg.lstsq(others, both, rcond=None)[0]
-        power = (left**2).sum(axis=0)
+        remainder = both - others @ np.linalg.lstsq(others, both, rcond=None)[0]
+        power = (remainder**2).sum(axis=0)
         if power.min() > 0.0:
-            product = float(left[:, 0] @ left[:, 1])
+            product = float(remainder[:, 0] @ remainder[:, 1])
             slopes[i], correlation[i] = product / power[0], product / float(np.sqrt(power[0] * power[1]))
     return slopes, correlation
 
@@ -260,7 +260,7 @@ def _state(values: Array, name: str) -> tuple[str, str]:
     """Whether λ of the rigid body shows two states, or which one it shows."""
     middle, spread = level_and_spread(values)
     try:
-        high, low = force_levels(values, name, ContactSection(source="multiplier"))
+        high, low = force_levels(values, name, ContactStateSection(source="multiplier"))
     except DataError:
         source = "always" if middle > max(2.0 * spread, LEAST_FORCE) else "never"
         return source, f"λ of the rigid body shows one state, {middle:.3g} ± {spread:.2g} N"

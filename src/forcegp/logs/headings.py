@@ -65,8 +65,8 @@ def declared_unit(name: str, stream: Stream) -> str | None:
     """The unit that a heading or the line below it declares, or `None`."""
     if name in stream.units:
         return units.spelled(stream.units[name])
-    for found in _DECLARED.finditer(name):
-        unit = units.spelled(found[1] if found[1] is not None else found[2])
+    for match in _DECLARED.finditer(name):
+        unit = units.spelled(match[1] if match[1] is not None else match[2])
         if unit is not None:
             return unit
     return None
@@ -79,7 +79,7 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
         MappingError: no column increases like time.
     """
     stream = max(table.streams, key=lambda s: (len(s.columns), len(s)))
-    found = []
+    candidates = []
     for name, values in stream.columns.items():
         steps = np.diff(values[np.isfinite(values)])
         if not len(steps) or not (steps > 0.0).mean() > 0.95:
@@ -87,14 +87,14 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
         middle = np.median(steps[steps > 0.0])
         even = float((np.abs(steps - middle) < 0.5 * middle).mean())
         named = bool(_TIME.match(name.lower())) or name == "header"
-        found.append((2.0 * named + even + (name == "header"), name))
-    if not found:
+        candidates.append((2.0 * named + even + (name == "header"), name))
+    if not candidates:
         raise MappingError(
             f"{table.source}: no column increases like time",
             expected="a column of time stamps",
             got=", ".join(stream.columns)[:300],
         )
-    draft.time = max(found)[1]
+    draft.time = max(candidates)[1]
     values = stream.columns[draft.time]
     unit = declared_unit(draft.time, stream)
     steps = np.diff(values[np.isfinite(values)])
@@ -144,11 +144,11 @@ def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
             )
     _match_joints(robot, draft)
     for quantity, family in draft.families.items():
-        found = {declared_unit(column, stream) for column in family.columns.values()} - {None}
-        known = [unit for unit in found if unit in units.QUANTITY[quantity]]
-        if len(known) == 1:
-            family.unit, family.declared = known[0], True
-            draft.say(quantity, f"the unit {known[0]} is declared")
+        declared = {declared_unit(column, stream) for column in family.columns.values()} - {None}
+        valid = [unit for unit in declared if unit in units.QUANTITY[quantity]]
+        if len(valid) == 1:
+            family.unit, family.declared = valid[0], True
+            draft.say(quantity, f"the unit {valid[0]} is declared")
 
 
 def _families(stream: Stream, robot: RobotModel) -> list[Family]:
@@ -160,9 +160,9 @@ def _families(stream: Stream, robot: RobotModel) -> list[Family]:
         if joint is not None:
             groups.setdefault(column.replace(joint, "{joint}", 1), {})[joint] = column
             continue
-        for found in re.finditer(r"\d+", column):
-            pattern = f"{column[: found.start()]}{{joint}}{column[found.end() :]}"
-            groups.setdefault(pattern, {})[found[0]] = column
+        for number in re.finditer(r"\d+", column):
+            pattern = f"{column[: number.start()]}{{joint}}{column[number.end() :]}"
+            groups.setdefault(pattern, {})[number[0]] = column
         head, dot, tail = column.partition(".")
         if dot and tail and head in ("position", "velocity", "effort"):
             groups.setdefault(f"{head}.{{joint}}", {})[tail] = column
@@ -233,18 +233,18 @@ def _likeness(joint: str, name: str) -> float:
 def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
     """Columns of a force-torque sensor: `force.x`, `Fx`, `f_x`, …"""
     for stream in table.streams:
-        found: dict[tuple[int, str], str] = {}
+        columns: dict[tuple[int, str], str] = {}
         for column in stream.columns:
             words = tokens(column)
             axis = words[-1][-1] if words and words[-1][-1] in "xyz" else ""
             stem = words[-1][:-1] or (words[-2] if len(words) > 1 else "")
             for part, names in enumerate(_AXES):
                 if axis and stem in names:
-                    found.setdefault((part, axis), column)
-        if all((0, axis) in found for axis in "xyz"):
+                    columns.setdefault((part, axis), column)
+        if all((0, axis) in columns for axis in "xyz"):
             draft.wrench_stream = stream.name
-            parts = [0, 1] if all((1, axis) in found for axis in "xyz") else [0]
-            draft.wrench = [[found[part, axis] for axis in "xyz"] for part in parts]
+            parts = [0, 1] if all((1, axis) in columns for axis in "xyz") else [0]
+            draft.wrench = [[columns[part, axis] for axis in "xyz"] for part in parts]
             draft.wrench_frame = robot.frame_names[-1]
             draft.say(
                 "wrench",
@@ -287,10 +287,10 @@ def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> Non
             if len(following) != 1:
                 break
             at = following[0]
-    left = [k for k in range(len(blocks)) if k not in roles.values()]
-    if "velocity" not in roles or len(left) != 1:
+    unassigned = [k for k in range(len(blocks)) if k not in roles.values()]
+    if "velocity" not in roles or len(unassigned) != 1:
         return
-    roles["torque"] = left[0]
+    roles["torque"] = unassigned[0]
     for quantity, k in roles.items():
         columns = dict(zip(joints, blocks[k], strict=True))
         draft.families[quantity] = Family("", columns, stream.name, by_joint=columns)

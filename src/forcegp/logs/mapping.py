@@ -79,7 +79,7 @@ class WrenchSection(Section):
     tool_com: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-class ContactSection(Section):
+class ContactStateSection(Section):
     """`[contact.<name>]`: where it is known from whether a contact of the scene is closed."""
 
     source: Literal["column", "wrench", "multiplier", "distance", "always", "never"]
@@ -111,7 +111,7 @@ class MappingSections(Section):
     acceleration: QuantitySection | None = None
     torque: TorqueSection
     wrench: WrenchSection | None = None
-    contact: dict[str, ContactSection] = Field(default_factory=dict)
+    contact: dict[str, ContactStateSection] = Field(default_factory=dict)
     derivatives: DerivativesSection = DerivativesSection()
 
 
@@ -154,12 +154,12 @@ class Mapping:
         assert section is not None
         self._check_joints(("joints",), self.sections.joints, joints)
         self._check_joints((name, "columns"), section.columns, joints)
-        found = []
+        columns = []
         for joint in joints:
             if joint in section.columns:
-                found.append(section.columns[joint])
+                columns.append(section.columns[joint])
             elif section.column is not None and (joint in self.sections.joints or not self.sections.joints):
-                found.append(section.column.replace("{joint}", self.sections.joints.get(joint, joint)))
+                columns.append(section.column.replace("{joint}", self.sections.joints.get(joint, joint)))
             else:
                 missing = [j for j in joints if j not in section.columns and j not in self.sections.joints]
                 raise self.error(
@@ -168,10 +168,10 @@ class Mapping:
                     expected=f"{joint} = under columns",
                     hint=lock_hint(missing),
                 )
-        if len(set(found)) < len(found):
-            twice = next(c for c in found if found.count(c) > 1)
+        if len(set(columns)) < len(columns):
+            twice = next(c for c in columns if columns.count(c) > 1)
             raise self.error((name,), f"column {twice!r} is given for two joints", expected="'{joint}' in it")
-        return found
+        return columns
 
     def per_joint(self, name: str, key: str, joints: Sequence[str]) -> list[float]:
         """The numbers of a key that holds one for all joints or one for each.
@@ -247,12 +247,12 @@ def _check(mapping: Mapping) -> None:
         section = mapping.quantity(name)
         if section is None:
             continue
-        known = units.QUANTITY[name]
-        if section.unit not in known:
+        allowed = units.QUANTITY[name]
+        if section.unit not in allowed:
             near = units.spelled(section.unit)
-            hint = f"did you mean {near!r}?" if near in known else None
+            hint = f"did you mean {near!r}?" if near in allowed else None
             raise mapping.error(
-                (name, "unit"), "unknown unit", f"one of {', '.join(known)}", repr(section.unit), hint
+                (name, "unit"), "unknown unit", f"one of {', '.join(allowed)}", repr(section.unit), hint
             )
         if section.column is None and not section.columns:
             raise mapping.error((name,), "no column", expected='column = "…{joint}…", or columns = {…}')
@@ -327,11 +327,11 @@ def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
     )
     if joint_states and "header" in names:
         return load_mapping("ros_joint_states")
-    shown = ", ".join(table.names[:12]) + (", …" if len(table.names) > 12 else "")
+    listing = ", ".join(table.names[:12]) + (", …" if len(table.names) > 12 else "")
     raise MappingError(
         f"{path}: the names of the columns do not say what they are",
         expected=f"t, q.{robot.joint_names[0]}, tau.{robot.joint_names[0]}, …, or a mapping",
-        got=shown,
+        got=listing,
         hint="write a mapping by --guess mapping.toml, check it, and pass it by --mapping",
     )
 

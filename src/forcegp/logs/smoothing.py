@@ -67,7 +67,7 @@ class Smoothed:
 
 
 @dataclass(frozen=True)
-class Gains:
+class SmootherGains:
     """What does not depend on the data: filter gains and covariances of n rows, in units of σ².
 
     Attributes:
@@ -103,7 +103,7 @@ def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = No
     n = len(q)
     mean, variance = np.empty((n, STATES)), np.empty((n, STATES))
     second = None if also is None else np.empty(n)
-    tables: dict[int, Gains] = {}
+    tables: dict[int, SmootherGains] = {}
     for rows in stretches:
         count = rows.stop - rows.start
         gains = tables.setdefault(count, _gains(count, rho))
@@ -126,11 +126,11 @@ def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
     Returns:
         ρ, and σ in the unit of q.
     """
-    chosen, left = [], LEARNED_ROWS
+    chosen, remaining = [], LEARNED_ROWS
     for rows in sorted(stretches, key=lambda s: s.start - s.stop):
-        chosen.append(q[rows][:left])
-        left -= len(chosen[-1])
-        if left < SHORTEST:
+        chosen.append(q[rows][:remaining])
+        remaining -= len(chosen[-1])
+        if remaining < SHORTEST:
             break
     longest = max(map(len, chosen))
 
@@ -172,7 +172,7 @@ def _forward(n: int, rho: float) -> tuple[Array, Array, Array, Array]:
     return gain, innovation, predicted, filtered
 
 
-def _gains(n: int, rho: float) -> Gains:
+def _gains(n: int, rho: float) -> SmootherGains:
     gain, innovation, predicted, filtered = _forward(n, rho)
     back, covariance = np.empty((n, STATES, STATES)), np.empty((n, STATES, STATES))
     covariance[-1], back[-1] = filtered[-1], 0.0
@@ -188,7 +188,7 @@ def _gains(n: int, rho: float) -> Gains:
         settled = bool(
             np.abs(covariance[k] - covariance[k + 1]).max() <= SETTLED * np.abs(covariance[k]).max()
         )
-    return Gains(gain, innovation, back, covariance)
+    return SmootherGains(gain, innovation, back, covariance)
 
 
 def _innovations(y: Array, gain: Array) -> Array:
@@ -201,7 +201,7 @@ def _innovations(y: Array, gain: Array) -> Array:
     return e
 
 
-def _run(y: Array, gains: Gains) -> Array:
+def _run(y: Array, gains: SmootherGains) -> Array:
     """Smoothed scaled states `(n, 4)`."""
     n = len(y)
     ahead, now = np.empty((n, STATES)), np.empty((n, STATES))
@@ -371,9 +371,9 @@ def impact_mask(signals: Signals, margin: float) -> dict[str, NDArray[np.bool_]]
     for name, closed in signals.contact.items():
         mask = np.zeros(len(signals), dtype=bool)
         for rows in signals.runs():
-            t, own = signals.t[rows], closed[rows]
+            t, state = signals.t[rows], closed[rows]
             # The switch lies between the last row of one state and the first row of the other.
-            for at in t[1:][own[1:] != own[:-1]]:
+            for at in t[1:][state[1:] != state[:-1]]:
                 mask[rows] |= np.abs(t - at) <= margin
         masks[name] = mask
     return masks

@@ -47,8 +47,8 @@ def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> So
     robust = start
     for _ in range(2):
         scale = max(float(robust_std(residual(robust))), ROUNDING)
-        found = least_squares(residual, robust, loss="soft_l1", f_scale=scale, x_scale="jac")
-        robust = found.x
+        fit = least_squares(residual, robust, loss="soft_l1", f_scale=scale, x_scale="jac")
+        robust = fit.x
     first = residual(robust)
     inside = np.abs(first - np.median(first)) <= OUTLIER_STD * max(float(robust_std(first)), ROUNDING)
     final = least_squares(lambda x: residual(x)[inside], robust, x_scale="jac")
@@ -105,7 +105,7 @@ class Tip:
         """The radius by parameters."""
         return float(x[-1]) if self.radius is None else self.radius
 
-    def std(self, found: Solution) -> dict[str, float]:
+    def std(self, solution: Solution) -> dict[str, float]:
         """Error bar of a fitted radius.
 
         Raises:
@@ -113,7 +113,7 @@ class Tip:
         """
         if self.radius is not None:
             return {}
-        radius, std = self.of(found.x), float(np.sqrt(found.covariance[-1, -1]))
+        radius, std = self.of(solution.x), float(np.sqrt(solution.covariance[-1, -1]))
         if not radius > LEAST_RADIUS_STD * std:
             raise DataError(
                 "the path does not determine the radius of the tip",
@@ -224,8 +224,8 @@ def fit_surface(
             straight or too short.
         UnknownNameError: the scene has no such contact.
     """
-    known = system.contact(contact)
-    if not isinstance(known, SurfaceContact):
+    touching = system.contact(contact)
+    if not isinstance(touching, SurfaceContact):
         raise DataError(f"{contact!r} is not a contact with a surface")
     rows = data.active([contact])[:, 0].nonzero()[:, 0]
     if len(rows) < LEAST_POINTS:
@@ -236,10 +236,10 @@ def fit_surface(
         )
     rows = rows[:: -(-len(rows) // MOST_POINTS)]
     q = data.select(system.robot.joint_names).q[rows]
-    points = kinematics.point_position(system.robot, q, known.frame, tuple(known.point))
-    normal = known.surface.gradient(points)
+    points = kinematics.point_position(system.robot, q, touching.frame, tuple(touching.point))
+    normal = touching.surface.gradient(points)
     fit = _plane if kind == "plane" else _sphere
-    return fit(contact, points.numpy(), normal.mean(0).numpy(), tip_of(system, known, q, tip_radius))
+    return fit(contact, points.numpy(), normal.mean(0).numpy(), tip_of(system, touching, q, tip_radius))
 
 
 def _plane(contact: str, points: Array, towards: Array, tip: Tip | None = None) -> SurfaceFit:
@@ -261,10 +261,10 @@ def _plane(contact: str, points: Array, towards: Array, tip: Tip | None = None) 
         n = normal(x)
         return centered @ n - tip.of(x) * (tip.axes @ n + 1.0) - x[2]
 
-    found = robust_least_squares(residual, tip.start([0.0, 0.0, 0.0]))
-    x, cov, across = found.x, found.covariance, float((centered @ v).std())
+    solution = robust_least_squares(residual, tip.start([0.0, 0.0, 0.0]))
+    x, cov, across = solution.x, solution.covariance, float((centered @ v).std())
     tilt = float(np.sqrt(max(cov[0, 0], cov[1, 1])))
-    if not (tilt < LARGEST_TILT and across > LEAST_WIDTH * found.residuals.std()):
+    if not (tilt < LARGEST_TILT and across > LEAST_WIDTH * solution.residuals.std()):
         raise DataError(
             "the path does not determine a plane: it is nearly straight or a point",
             expected=f"a tilt known to {np.degrees(LARGEST_TILT):.2g}°, on a path wider than its noise",
@@ -273,8 +273,8 @@ def _plane(contact: str, points: Array, towards: Array, tip: Tip | None = None) 
         )
     n = normal(x)
     plane = Plane(tuple(float(c) for c in n), float(n @ middle + x[2]))
-    std = {"offset": float(np.sqrt(cov[2, 2])), "tilt": tilt} | tip.std(found)
-    return _result(contact, plane, std, found, len(points), tip.of(x))
+    std = {"offset": float(np.sqrt(cov[2, 2])), "tilt": tilt} | tip.std(solution)
+    return _result(contact, plane, std, solution, len(points), tip.of(x))
 
 
 def _sphere(contact: str, points: Array, towards: Array, tip: Tip | None = None) -> SurfaceFit:
@@ -294,11 +294,11 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip | None = None)
         r = tip.of(x)
         return np.linalg.norm(centered - r * tip.axes - x[:3], axis=1) - r - x[3]
 
-    found = robust_least_squares(residual, tip.start([*start[:3], np.sqrt(squared)]))
-    x, cov = found.x, found.covariance
+    solution = robust_least_squares(residual, tip.start([*start[:3], np.sqrt(squared)]))
+    x, cov = solution.x, solution.covariance
     center, radius = x[:3] + middle, float(x[3])
     std = {"center": float(np.sqrt(np.diag(cov)[:3].max())), "radius": float(np.sqrt(cov[3, 3]))}
-    std |= tip.std(found)
+    std |= tip.std(solution)
     if not (std["radius"] < 0.5 * radius and (middle - center) @ towards > 0.0):
         raise DataError(
             "the path does not determine a sphere that is touched from outside",
@@ -306,11 +306,11 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip | None = None)
             hint="fit a plane, or slide over a larger part of the sphere",
         )
     sphere = Sphere(tuple(float(c) for c in center), radius)
-    return _result(contact, sphere, std, found, len(points), tip.of(x))
+    return _result(contact, sphere, std, solution, len(points), tip.of(x))
 
 
 def _result(
-    contact: str, surface: Plane | Sphere, std: dict[str, float], found: Solution, points: int, tip: float
+    contact: str, surface: Plane | Sphere, std: dict[str, float], solution: Solution, points: int, tip: float
 ) -> SurfaceFit:
-    used, residual = len(found.residuals), float(found.residuals.std())
-    return SurfaceFit(contact, surface, std, residual, used, points - used, found.effective, tip)
+    used, residual = len(solution.residuals), float(solution.residuals.std())
+    return SurfaceFit(contact, surface, std, residual, used, points - used, solution.effective, tip)

@@ -162,13 +162,13 @@ class Growing:
         return self._values
 
 
-def missing(source: str, kind: str, name: str, known: list[str]) -> DataError:
+def missing(source: str, kind: str, name: str, names: list[str]) -> DataError:
     """The error for a stream or column that a log does not hold."""
-    shown = ", ".join(repr(k) for k in known[:16]) + (f", … ({len(known)})" if len(known) > 16 else "")
+    shown = ", ".join(repr(k) for k in names[:16]) + (f", … ({len(names)})" if len(names) > 16 else "")
     return DataError(
         f"{source}: the log has no {kind} {name!r}",
-        expected=f"one of {shown}" if known else "a log with columns of numbers",
-        hint=did_you_mean(name, known, 0.5),
+        expected=f"one of {shown}" if names else "a log with columns of numbers",
+        hint=did_you_mean(name, names, 0.5),
     )
 
 

@@ -52,8 +52,8 @@ def spelled(text: str) -> str | None:
     ('deg/s', 's', None)
     """
     plain = text.strip().strip("[](){} ").strip()
-    known = {name for table in QUANTITY.values() for name in table}
-    if plain in known:
+    names = {name for table in QUANTITY.values() for name in table}
+    if plain in names:
         return plain
     low = plain.lower()
-    return low if low in known else _SPELLINGS.get(low)
+    return low if low in names else _SPELLINGS.get(low)

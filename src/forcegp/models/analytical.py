@@ -213,8 +213,8 @@ class AnalyticalFit(FittedModel):
         values: list[Tensor] = []
         parts: dict[str, slice] = {}
         for first in range(0, max(len(flat.q), 1), CHUNK_STATES):
-            own = flat.rows(slice(first, first + CHUNK_STATES))
-            at = states(system, own.q, own.qd, own.tau, own.active)
+            chunk = flat.rows(slice(first, first + CHUNK_STATES))
+            at = states(system, chunk.q, chunk.qd, chunk.tau, chunk.active)
             z, parts = affine_maps(system, at, quantity)
             values.append(z.o + (z.B_Q @ AnalyticalMean()(system, at)[..., None])[..., 0])
         mean = torch.cat(values)

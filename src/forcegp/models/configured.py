@@ -30,7 +30,7 @@ from forcegp.scene import ModelTable
 from forcegp.scene.sections import NoiseSection
 from forcegp.storage.descriptions import decode
 
-DEFAULT = "sgp-mean"
+DEFAULT = "sgp"
 """The model where none is named."""
 COMMON = ("name", "noise", "seed", "learning")
 """Keys of `[model]` that every model takes; one without noise or a random start ignores these."""
@@ -157,8 +157,10 @@ def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | N
     )
 
 
-def _priors(table: ModelTable) -> tuple[ForcePrior, ...]:
-    """The priors of `[[model.priors]]`."""
+def _priors(table: ModelTable) -> str | tuple[ForcePrior, ...]:
+    """The set of priors that `priors` names, or those of `[[model.priors]]`."""
+    if isinstance(table.section.priors, str):
+        return table.section.priors
     priors = []
     for i, described in enumerate(table.section.priors):
         key = ("model", "priors", i)

@@ -14,6 +14,35 @@ from forcegp.notebook import html_table
 
 
 @dataclass(frozen=True)
+class Compared:
+    """A set of force priors in the comparison on held-out stretches of the training log.
+
+    Attributes:
+        name: of the set.
+        log_density: mean log predictive density of held-out samples [nats per sample]; `None` if it was not
+            computed.
+        behind: difference to the best set [nats per sample].
+        standard_error: of that difference.
+        chosen: whether the model has this set.
+        note: why a set was not tested, or not on all stretches.
+    """
+
+    name: str
+    log_density: float | None = None
+    behind: float | None = None
+    standard_error: float | None = None
+    chosen: bool = False
+    note: str = ""
+
+    def __str__(self) -> str:
+        name = f"{self.name} (chosen)" if self.chosen else self.name
+        if self.log_density is None:
+            return f"{name}: {self.note}"
+        note = f", {self.note}" if self.note else ""
+        return f"{name}: {self.log_density:.2f} ({self.behind:.2f} ± {self.standard_error:.2f} behind){note}"
+
+
+@dataclass(frozen=True)
 class FitResult:
     """How a fit went.
 
@@ -40,6 +69,7 @@ class FitResult:
         missed: prior variance that the inducing points miss in all rows together, in units of the noise
             variance; what noise leaves of all rows is `determined` in the same units.
         more_points_would_help: whether `missed` is a tenth of `determined` or more.
+        comparison: the sets of force priors that the data chose between; empty if the caller named them.
     """
 
     converged: bool
@@ -60,6 +90,7 @@ class FitResult:
     determined: float | None = None
     missed: float | None = None
     more_points_would_help: bool | None = None
+    comparison: tuple[Compared, ...] = ()
 
     @classmethod
     def of(cls, learned: Learned, **more: Any) -> FitResult:

@@ -65,18 +65,18 @@ def follow(
     """
     if not 0.0 < change < 1.0:
         raise ModelError("invalid probability of a change", expected="between 0 and 1", got=change)
-    before = fit.forget(factor, priors=priors)
-    kept = before.update(data)
-    forgotten = before.forget(0.0, priors=priors)
-    anew = forgotten.update(data)
-    gain = _evidence(anew) - _evidence(forgotten) - (_evidence(kept) - _evidence(before))
+    aged = fit.forget(factor, priors=priors)
+    continued = aged.update(data)
+    forgotten = aged.forget(0.0, priors=priors)
+    restarted = forgotten.update(data)
+    gain = _evidence(restarted) - _evidence(forgotten) - (_evidence(continued) - _evidence(aged))
     log_odds = gain + math.log(change) - math.log1p(-change)
     changed = log_odds > 0.0
     if changed:
         # The first estimate is that of accelerations without the new payload, so it is made once more.
-        anew = _knowing(forgotten, anew, priors).update(data)
-    found = anew if changed else kept
-    return Followed(_knowing(found, found, priors, begin=changed), changed, log_odds)
+        restarted = _knowing(forgotten, restarted, priors).update(data)
+    result = restarted if changed else continued
+    return Followed(_knowing(result, result, priors, begin=changed), changed, log_odds)
 
 
 def _knowing(
@@ -91,7 +91,7 @@ def _knowing(
         begin: whether priors that know no payload are replaced too.
     """
     one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
-    known = tuple(
+    updated_priors = tuple(
         prior.around(estimate.posterior.latent.latent_mean(p, one)[0])
         if isinstance(prior, PayloadPrior) and prior.name in priors and (begin or prior.known)
         else prior
@@ -99,9 +99,9 @@ def _knowing(
     )
     return dataclasses.replace(
         fit,
-        specification=dataclasses.replace(fit.specification, priors=known),
-        problem=dataclasses.replace(fit.problem, priors=known),
-        posterior=dataclasses.replace(fit.posterior, priors=known),
+        specification=dataclasses.replace(fit.specification, priors=updated_priors),
+        problem=dataclasses.replace(fit.problem, priors=updated_priors),
+        posterior=dataclasses.replace(fit.posterior, priors=updated_priors),
     )
 
 

@@ -27,7 +27,7 @@ from forcegp.storage.model_file import (
     ModelHeader,
     model_bytes,
     model_path,
-    own_tensors,
+    model_tensors,
     parse_model,
     read_model,
 )
@@ -89,8 +89,8 @@ def _restored(
     """The model of a header and tensors."""
     if header.kind not in LOADERS:
         raise UnknownNameError(f"kind of models in {source}", header.kind, LOADERS)
-    own = unpack_system(header.system, tensors, source, system)
-    return LOADERS[header.kind](header, own_tensors(tensors), own, source)
+    model_system = unpack_system(header.system, tensors, source, system)
+    return LOADERS[header.kind](header, model_tensors(tensors), model_system, source)
 
 
 KINDS = (AnalyticalFit, NetworkFit, IndependentFit, StructuredFit)

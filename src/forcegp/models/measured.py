@@ -70,11 +70,11 @@ def score(model: Predicts, data: Dataset, quantity: str) -> float:
         predicted(model, data[first : first + CHUNK], quantity, covariance=False).mean
         for first in range(0, len(data), CHUNK)
     ]
-    left = (true - torch.cat(means)).square().sum(0)
+    unexplained = (true - torch.cat(means)).square().sum(0)
     spread = (true - true.mean(0)).square().sum(0)
     if not bool((spread > 0.0).any()):
         raise DataError(f"{quantity} is constant in the data, so that a score is not defined")
-    return float((1.0 - left / spread)[spread > 0.0].mean())
+    return float((1.0 - unexplained / spread)[spread > 0.0].mean())
 
 
 def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
@@ -108,17 +108,15 @@ def plot_model(
     system = settings.get("system") or model.system
     data.check_robot((settings.get("system") or getattr(model, "specified", system)).robot)
     data = data[:: max(1, -(-len(data) // MOST_SAMPLES))]
-    found = predicted(model, data, quantity, **settings)
+    prediction = predicted(model, data, quantity, **settings)
     names, kinds = component_names(system, quantity), system.robot.joint_types
-    true, std = measured_if_logged(system, data, quantity), found.std
+    true, mean, std = measured_if_logged(system, data, quantity), prediction.mean, prediction.std
     of_joints = names == list(system.robot.joint_names)
     panels = [
         Panel(
             names[i],
             axis_label(quantity, kinds[i : i + 1] if of_joints else ()),
-            _curves(
-                None if true is None else true[:, i], found.mean[:, i], None if std is None else std[:, i]
-            ),
+            _curves(None if true is None else true[:, i], mean[:, i], None if std is None else std[:, i]),
         )
         for i in chosen(joints, names, f"component of {quantity}")
     ]
@@ -169,5 +167,5 @@ def plot_prediction(
 
 
 def _curves(true: Tensor | None, mean: Tensor, std: Tensor | None) -> list[Curve]:
-    known = [] if true is None else [Curve(true, "measured", MEASURED, width=0.7)]
-    return [*known, Curve(mean, "predicted", PREDICTED, std)]
+    curves = [] if true is None else [Curve(true, "measured", MEASURED, width=0.7)]
+    return [*curves, Curve(mean, "predicted", PREDICTED, std)]

@@ -85,8 +85,8 @@ def train(
     began = time.perf_counter()
     held, rows = _split(samples, options.held_out, generator, next(iter(start.values())).device)
     state = _State.at(start, options.learning_rate, generator)
-    if saved is not None and (found := saved.read(state.tensors(), (HISTORY,))):
-        state.restore(found, saved.path)
+    if saved is not None and (tensors := saved.read(state.tensors(), (HISTORY,))):
+        state.restore(tensors, saved.path)
     while len(state.history) < options.epochs and state.since < options.patience:
         epoch = len(state.history)
         for group in state.optimizer.param_groups:
@@ -154,33 +154,33 @@ class _State:
 
     def tensors(self) -> dict[str, Tensor]:
         """The state by name."""
-        found = {HISTORY: torch.tensor(self.history, dtype=torch.float64)}
-        found["generator"] = self.generator.get_state()
+        tensors = {HISTORY: torch.tensor(self.history, dtype=torch.float64)}
+        tensors["generator"] = self.generator.get_state()
         for name, x in self.weights.items():
             moments = self.optimizer.state.get(x, {})
-            found[f"weights.{name}"] = x.detach()
-            found[f"best.{name}"] = self.best[name]
-            found[f"step.{name}"] = moments.get("step", torch.zeros(()))
+            tensors[f"weights.{name}"] = x.detach()
+            tensors[f"best.{name}"] = self.best[name]
+            tensors[f"step.{name}"] = moments.get("step", torch.zeros(()))
             for moment in ("exp_avg", "exp_avg_sq"):
-                found[f"{moment}.{name}"] = moments.get(moment, torch.zeros_like(x.detach()))
-        return found
+                tensors[f"{moment}.{name}"] = moments.get(moment, torch.zeros_like(x.detach()))
+        return tensors
 
-    def restore(self, found: Mapping[str, Tensor], source: Path) -> None:
+    def restore(self, tensors: Mapping[str, Tensor], source: Path) -> None:
         """Go on where a state was saved.
 
         Raises:
             ModelError: the state of the generator is damaged.
         """
         try:
-            self.generator.set_state(found["generator"])
+            self.generator.set_state(tensors["generator"])
         except RuntimeError as cause:
             raise ModelError(f"{source}: the checkpoint is damaged", got=str(cause)) from cause
-        self.history = found[HISTORY].tolist()
+        self.history = tensors[HISTORY].tolist()
         with torch.no_grad():
             for name, x in self.weights.items():
-                x.copy_(found[f"weights.{name}"])
-                self.best[name] = found[f"best.{name}"].clone()
-                kept = {key: found[f"{key}.{name}"].clone() for key in ("step", "exp_avg", "exp_avg_sq")}
+                x.copy_(tensors[f"weights.{name}"])
+                self.best[name] = tensors[f"best.{name}"].clone()
+                kept = {key: tensors[f"{key}.{name}"].clone() for key in ("step", "exp_avg", "exp_avg_sq")}
                 self.optimizer.state[x] = kept
 
 

@@ -10,7 +10,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
 from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd
-from forcegp.forces.priors.default import PAPER, contact_priors, default_priors, measured_priors
+from forcegp.forces.priors.sets import PAPER, contact_priors, default_priors
 from forcegp.gp.kernels import Kernel
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import Model
@@ -50,19 +50,18 @@ def _independent(system: ConstrainedSystem, noise: Stated, seed: int, **options:
     return IndependentGP(system, noise=noise, **options)
 
 
+def _chosen(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
+    options = {"mean": "analytical"} | options
+    return StructuredGP(system, noise=noise, **options)
+
+
 def _structured(mean: str, kernel: Kernel | None = None) -> Callable[..., Model]:
     def make(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
         options = {"mean": mean} | options
-        if kernel is not None:
-            options.setdefault("force_priors", default_priors(system, options["mean"], kernel))
+        options.setdefault("force_priors", default_priors(system, options["mean"], kernel))
         return StructuredGP(system, noise=noise, **options)
 
     return make
-
-
-def _measured(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
-    options = {"mean": "analytical", "force_priors": measured_priors(system), "inertia": "auto"} | options
-    return StructuredGP(system, noise=noise, **options)
 
 
 def _contact(kernel: Kernel | None = None) -> Callable[..., Model]:
@@ -82,14 +81,14 @@ MODELS: dict[str, Entry] = {
         IndependentGP.kind, "one Gaussian process per joint acceleration on (q, qd, tau)", _independent
     ),
     "sgp-zero": Entry(SGP, "structured GP, all joint forces unknown", _structured("zero")),
-    "sgp-mean": Entry(SGP, "structured GP around the analytical forces", _structured("analytical")),
+    "sgp": Entry(SGP, "structured GP around the analytical forces, priors chosen by the data", _chosen),
+    "sgp-mean": Entry(
+        SGP, "structured GP around the analytical forces, any joint force", _structured("analytical")
+    ),
     "sgp-zero-se": Entry(SGP, "sgp-zero with the paper's kernel alone", _structured("zero", PAPER)),
     "sgp-mean-se": Entry(SGP, "sgp-mean with the paper's kernel alone", _structured("analytical", PAPER)),
     "sgp-contact": Entry(
         SGP, "structured GP with mean and a prior on the contact's friction alone", _contact()
-    ),
-    "sgp-real": Entry(
-        SGP, "structured GP for measured robots: joint and contact friction, torque noise", _measured
     ),
     "sgp-contact-se": Entry(
         SGP, "the same with any tangential force and the paper's kernel", _contact(PAPER)

@@ -122,11 +122,11 @@ def force_from_sensor(fit: StructuredFit, data: Dataset) -> tuple[Tensor, Tensor
         )
     active = data.active(fit.system.contact_names)
     states = data.q, data.qd, data.tau
-    own = fit.predict(*states, "multiplier", active=active)
-    assert own.variance is not None
+    prediction = fit.predict(*states, "multiplier", active=active)
+    assert prediction.variance is not None
     noise = fit.noise_variance(*states, "multiplier", active, sensor=False)
-    spread = (own.variance + noise)[:, 0].clamp(min=TINY)
+    spread = (prediction.variance + noise)[:, 0].clamp(min=TINY)
     sensor = fit.noise["multiplier"][0] ** 2
     weight = spread / (spread + sensor)
-    mean = own.mean[:, 0] + weight * (sensed_force(data, fit.system) - own.mean[:, 0])
+    mean = prediction.mean[:, 0] + weight * (sensed_force(data, fit.system) - prediction.mean[:, 0])
     return mean, (weight * sensor).sqrt()

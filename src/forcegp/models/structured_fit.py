@@ -73,6 +73,7 @@ class StructuredFit(FittedModel):
             *((f"prior {prior.name}", type(prior).__name__) for prior in self.posterior.priors),
             *((f"noise of {name}", std) for name, std in self.noise.items()),
             *([] if self.torque_std is None else [("noise of the torque", self.torque_std)]),
+            *(("held-out log density", str(each)) for each in self.result.comparison),
         ]
 
     @property
@@ -207,11 +208,8 @@ class StructuredFit(FittedModel):
         measurements = self._with_slopes(measurements)
         problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
-        latent, central = self.posterior.latent, self.posterior.central
-        if central is not None:
-            known = problem.of_means().rows(self.hyperparameters).blocks
-            central = central.updated(problem.silenced(known))
-        posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows), central=central)
+        latent = self.posterior.latent
+        posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows))
         if isinstance(latent, SparsePosterior):
             return dataclasses.replace(self, posterior=posterior)
         noise = [problem.noise_at(self.hyperparameters, i) for i in range(len(measurements.measurements))]
@@ -253,21 +251,15 @@ class StructuredFit(FittedModel):
             return self._drifting(factor, priors)
         if not 0.0 < factor <= 1.0:
             raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)
-        latent, central = _sparse(self.posterior), self.posterior.central
-        if isinstance(central, SparsePosterior):
-            central = central.forgetting(factor)
-        posterior = dataclasses.replace(self.posterior, latent=latent.forgetting(factor), central=central)
+        latent = _sparse(self.posterior).forgetting(factor)
+        posterior = dataclasses.replace(self.posterior, latent=latent)
         return dataclasses.replace(self, posterior=posterior)
 
     def _without(self, measurements: Training) -> StructuredFit:
         """The fit without samples that it was conditioned on."""
         problem = self._problem_of(measurements)
-        latent, central = _sparse(self.posterior), self.posterior.central
-        if isinstance(central, SparsePosterior):
-            known = problem.of_means().rows(self.hyperparameters).blocks
-            central = central.without(problem.silenced(known))
-        latent = latent.without(problem.rows(self.hyperparameters).blocks)
-        posterior = dataclasses.replace(self.posterior, latent=latent, central=central)
+        latent = _sparse(self.posterior).without(problem.rows(self.hyperparameters).blocks)
+        posterior = dataclasses.replace(self.posterior, latent=latent)
         return dataclasses.replace(self, posterior=posterior)
 
     def _drifting(self, factor: float, priors: Sequence[str]) -> StructuredFit:
@@ -276,10 +268,8 @@ class StructuredFit(FittedModel):
             if name not in names:
                 raise UnknownNameError("force prior to forget", name, names)
         own = [names.index(name) for name in priors]
-        latent, central = _sparse(self.posterior), self.posterior.central
-        if isinstance(central, SparsePosterior):
-            central = central.drifting(factor, own)
-        posterior = dataclasses.replace(self.posterior, latent=latent.drifting(factor, own), central=central)
+        latent = _sparse(self.posterior).drifting(factor, own)
+        posterior = dataclasses.replace(self.posterior, latent=latent)
         return dataclasses.replace(self, posterior=posterior)
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:

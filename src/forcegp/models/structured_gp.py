@@ -18,20 +18,21 @@ from forcegp.forces.inference import check_method, require_double
 from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.observations import NoiseStd, Observation
 from forcegp.forces.priors.base import ForcePrior, check_priors
-from forcegp.forces.priors.default import default_priors
 from forcegp.forces.priors.joint import AnalyticalMean, mean_of
+from forcegp.forces.priors.sets import priors_of
 from forcegp.gp.inducing import LIMIT, check_limit
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
+from forcegp.models.selection import with_priors
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import (
-    chosen_of,
-    given_to,
+    check_learned,
     learned,
     search_of,
+    task_of,
 )
 from forcegp.models.structured_spec import Specification, check_inertia
-from forcegp.models.structured_stream import Pass, neighbours_of, sample_of
+from forcegp.models.structured_stream import Pass, sample_of
 
 FIT_COPIES = 3.0
 """Memory of a fit besides the matrices of its inference, in that of the equations of motion."""
@@ -43,11 +44,12 @@ class StructuredGP(Model[StructuredFit]):
     Args:
         system: robot and contacts.
         mean: `"zero"`, `"analytical"`, or an `AnalyticalMean` with some terms left out.
-        force_priors: priors on the unknown forces. The default depends on the mean and on the data: around
-            the analytical forces of a measured robot, `measured_priors` (friction of each joint and contact,
-            noise of the torque); else `default_priors`: a `JointForcePrior`, in contact its
-            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest,
-            and around the analytical forces a `SlidingFrictionPrior` for each surface.
+        force_priors: priors on the unknown forces; the name of a set of `SETS` (`"sliding"`, `"friction"`,
+            `"friction+residual"`); or `"auto"`. Then, around the analytical forces, held-out stretches of the
+            training log choose the set (`models/selection.py`), and `fit.result.comparison` has the table.
+            Logs of fewer than 100 samples, and fits with `learn=`, get `"friction"`. Around a mean without
+            the motor torque, `"auto"` stands for `default_priors`: a `JointForcePrior`, and in contact its
+            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest.
         noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint, or a `Noise`
             that also states that of torques and states; by default what the log states, else 0.1.
         analytical_parameters: a module whose `forward()` gives the robot with its analytical parameters θ_A
@@ -56,8 +58,9 @@ class StructuredGP(Model[StructuredFit]):
         inducing_points: maximum number of inducing points of one prior; fewer are taken where they suffice,
             and the result of the fit says where more would help.
         inertia: `"file"` keeps that of the robot; `"auto"` identifies links and drives where held-out
-            stretches of the log ask for it (`forces/inertia.py`), as the defaults of a measured robot do. It
-            needs a `JointFrictionPrior` and a mean with the motor torque.
+            stretches of the log ask for it (`forces/inertia.py`); `None` leaves that to the data if they
+            choose the priors, and is `"file"` elsewhere. It needs a `JointFrictionPrior` and a mean with the
+            motor torque.
         standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
             in the paper.
 
@@ -82,7 +85,7 @@ class StructuredGP(Model[StructuredFit]):
         self,
         system: ConstrainedSystem,
         mean: str | AnalyticalMean = "zero",
-        force_priors: Sequence[ForcePrior] | None = None,
+        force_priors: str | Sequence[ForcePrior] = "auto",
         noise: NoiseStd | Noise | None = None,
         analytical_parameters: nn.Module | None = None,
         inference: str = "auto",
@@ -93,7 +96,8 @@ class StructuredGP(Model[StructuredFit]):
         self._keep(locals())
         require_double(system)
         form, stated = mean_of(mean), Noise.of(noise)
-        priors = default_priors(system, form) if force_priors is None else tuple(force_priors)
+        automatic = force_priors == "auto" and "actuation" in form.terms
+        priors = priors_of(system, form, force_priors)
         check_priors(priors, system)
         state_std_of(stated.state, system.robot)
         self.system = system
@@ -101,11 +105,11 @@ class StructuredGP(Model[StructuredFit]):
             system,
             form,
             priors,
-            stated.for_priors(priors),
+            stated if automatic else stated.for_priors(priors),
             analytical_parameters,
             check_method(inference),
             check_limit(inducing_points),
-            force_priors is None and stated.torque == "auto" and "actuation" in form.terms,
+            automatic,
             check_inertia(inertia),
             standardize,
         )
@@ -157,34 +161,29 @@ class StructuredGP(Model[StructuredFit]):
             NumericalError: the likelihood cannot be computed.
         """
         spec = self.specification if after is None else self._continued(after)
-        sample = sample_of(spec, data) if isinstance(data, StreamedDataset) else None
-        known = data if sample is None else sample.data
-        assert not isinstance(known, StreamedDataset)
-        spec = spec.for_data(known)
-        chosen = None if learn is None else chosen_of(spec, learn)
-        if chosen == () and after is not None and sample is None:
-            return dataclasses.replace(after, specification=spec).condition(known)
-        given = given_to(spec, None if after is None else after.problem, known, chosen)
-        spec, training = given.specification, given.training
-        file = None if checkpoint is None else Path(checkpoint)
-        spec.system.announce_states(training.samples, FIT_COPIES, f"a fit to {training.samples:,} samples")
-        neighbours, forces = None, None
-        if sample is not None:
-            training = dataclasses.replace(training, part_of=sample.count)
-            neighbours = neighbours_of(spec, sample, training)
-        problem = spec.problem(training)
-        if given.robot is not spec.system.robot:
-            system = spec.system.with_robot(given.robot)
-            problem = dataclasses.replace(problem, system=system, pinned=given.pinned)
-        before = {} if after is None else after.hyperparameters
+        sample = sample_of(spec, data)
+        chosen = None if learn is None else tuple(learn)
+        spec, comparison = with_priors(spec, sample.data, chosen, progress)
+        check_learned(spec, chosen or ())
+        if chosen == () and after is not None and sample.log is None:
+            return dataclasses.replace(after, specification=spec).condition(sample.data)
+        task = task_of(spec, None if after is None else after.problem, sample.data, chosen)
+        spec, count = task.specification, task.training.samples
+        spec.system.announce_states(count, FIT_COPIES, f"a fit to {count:,} samples")
+        problem, before = task.problem(sample.count), {} if after is None else after.hyperparameters
         search = search_of(spec, problem, before, chosen, options)
         begins = chosen is None and after is not None
         begin = {key: before[key] for key in search.start if key in before} if begins else None
+        file = None if checkpoint is None else Path(checkpoint)
+        neighbours = sample.neighbours(spec, problem.training)
         lesson = learned(spec, problem, search, file, progress, begin, neighbours)
-        values, doubts = lesson.hyperparameters, (*given.doubts, *lesson.warnings)
-        if sample is not None and lesson.problem.inducing is not None:
-            forces = Pass(spec, sample, file, progress).forces(*lesson.problem.with_coulomb_errors(values))
-        return conditioned(spec, lesson.problem, values, lesson.learned, doubts, lesson.learned_on, forces)
+        values, forces = lesson.hyperparameters, None
+        if sample.log is not None and lesson.problem.inducing is not None:
+            whole = Pass(spec, sample.log, sample, file, progress)
+            forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
+        warnings = (*task.doubts, *lesson.warnings)
+        fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
+        return dataclasses.replace(fit, result=dataclasses.replace(fit.result, comparison=comparison))
 
     def _continued(self, after: StructuredFit) -> Specification:
         """This model with the priors of an earlier fit, which those that were left to its data belong to.

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from torch import Tensor
@@ -24,6 +24,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import calibrated_noise, likelihood_power, residual_times
+from forcegp.forces.inertia import with_updated_robot
 from forcegp.forces.inference import (
     is_finite,
     is_sparse,
@@ -36,7 +37,6 @@ from forcegp.forces.noise import REGION, TORQUE_NOISE
 from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.robot_update import with_updated_robot
 from forcegp.forces.slopes import with_learned_slopes, without_slopes
 from forcegp.forces.start import Search, initial
 from forcegp.forces.student_t import left_out, weighted
@@ -84,44 +84,63 @@ class Lesson:
 
 
 @dataclass(frozen=True)
-class Given:
+class Task:
     """What a fit learns from.
 
     Attributes:
         specification: the model; a first fit that identifies the robot adds a prior on what it does not know.
         training: the samples.
         robot: to learn with.
-        pinned: priors whose force the robot contains.
+        pinned: values of forces that the robot contains, by prior.
         doubts: about the samples and the robot.
     """
 
     specification: Specification
     training: Training
     robot: RobotModel
-    pinned: tuple[str, ...] = ()
+    pinned: Mapping[str, Tensor] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()
 
+    def problem(self, samples: int = 0) -> Problem:
+        """The learning problem.
 
-def given_to(
+        Args:
+            samples: number of samples that are conditioned on, if the training samples are a part of them.
+        """
+        problem = self.specification.problem(dataclasses.replace(self.training, part_of=samples))
+        if self.robot is self.specification.system.robot:
+            return problem
+        system = self.specification.system.with_robot(self.robot)
+        return dataclasses.replace(problem, system=system, pinned=self.pinned)
+
+
+def task_of(
     spec: Specification,
     before: Problem | None,
     data: Dataset | Sequence[Observation],
     chosen: Sequence[str] | None,
-) -> Given:
+) -> Task:
     """What a fit to data learns from, after the problem of an earlier fit or as the first."""
     training, doubts = training_for(spec, before, data, chosen)
-    if before is not None and not before.offsets:
-        return Given(spec, training, before.system.robot, before.pinned, doubts)
+    if before is not None and not any(bool(value.any()) for value in before.pinned.values()):
+        return Task(spec, training, before.system.robot, before.pinned, doubts)
     if before is not None or chosen is not None:
-        return Given(spec, training, spec.system.robot, (), doubts)
+        return Task(spec, training, spec.system.robot, doubts=doubts)
     found = spec.inertia_of(training)
     doubts = (*doubts, *found.doubts)
     if not found.identified:
-        return Given(spec, training, found.robot, (), doubts)
-    left = InertialPrior().around(spec.system.robot)
-    spec = dataclasses.replace(spec, priors=(*spec.priors, left))
+        return Task(spec, training, found.robot, doubts=doubts)
+    spec, pinned = identified(spec)
     training, _ = training_for(spec, before, data, chosen)
-    return Given(spec, training, found.robot, (left.name,), doubts)
+    return Task(spec, training, found.robot, pinned, doubts)
+
+
+def identified(spec: Specification) -> tuple[Specification, dict[str, Tensor]]:
+    """The model of a robot whose links were identified: errors of its inertia remain, with mean zero."""
+    robot = spec.system.robot
+    errors = InertialPrior().around(robot)
+    pinned = {errors.name: robot.mass.new_zeros(errors.outputs(robot))}
+    return dataclasses.replace(spec, priors=(*spec.priors, errors)), pinned
 
 
 def training_for(
@@ -142,18 +161,16 @@ def training_for(
     return in_motion(spec.system, training) if spec.noise.learns_torque else (training, ())
 
 
-def chosen_of(spec: Specification, learn: Iterable[str]) -> tuple[str, ...]:
-    """What is learned, by prefix of its tensors.
+def check_learned(spec: Specification, learn: Iterable[str]) -> None:
+    """Check the names of what is learned, the prefixes of its tensors.
 
     Raises:
-        UnknownNameError: it is neither a prior nor something else that can be learned.
+        UnknownNameError: one is neither a prior nor something else that can be learned.
     """
     names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
-    chosen = tuple(learn)
-    for name in chosen:
+    for name in learn:
         if name not in names:
             raise UnknownNameError("force prior to learn", name, names)
-    return chosen
 
 
 def search_of(
@@ -269,8 +286,8 @@ def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[s
         search.options,
     )
     return Checkpoint.key_of(
-        problem.mean, priors, problem.pinned, options, training.quantities, training.part_of, *data, *noise,
-        *scales, *problem.offsets, *problem.offsets.values(), record, *robot.values(),
+        problem.mean, priors, *problem.pinned, *problem.pinned.values(), options, training.quantities,
+        training.part_of, *data, *noise, *scales, record, *robot.values(),
         *(part for pair in named for part in pair),
     )  # fmt: skip
 

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError
-from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import Noise
@@ -84,7 +83,7 @@ def _check_types(tensors: Mapping[str, Tensor]) -> None:
     """Raise `ValueError` where a tensor is not of real numbers, or contacts are not flags."""
     for name, value in tensors.items():
         is_flag = name.startswith("data.") and name.endswith(".active")
-        is_count = name.startswith(("sparse.", "central.")) and name.endswith((".components", ".dropped"))
+        is_count = name.startswith("sparse.") and name.endswith((".components", ".dropped"))
         is_count |= name.startswith("data.") and name.endswith(".segment")
         fits = value.is_floating_point()
         if is_flag or is_count:
@@ -157,9 +156,8 @@ def _restored(
         system=spec.system if spec.analytical_parameters is not None else system,
         power=settings.power,
         correlation=_correlation(tensors, settings, system),
-        offsets=_below(tensors, "offset."),
+        pinned=_below(tensors, "pinned."),
         torque_std=tensors.get("torque_std"),
-        pinned=settings.pinned,
     )
     posterior = _posterior(*problem.with_coulomb_errors(hyper), tensors)
     constant = tuple(
@@ -167,7 +165,7 @@ def _restored(
         for p, scale in zip(spec.priors, training.scales, strict=True)
         for name in scale.constant
     )
-    result = FitResult(**settings.result.model_dump(), constant_inputs=constant)
+    result = FitResult(**dict(settings.result), constant_inputs=constant)
     noise = _below(tensors, "noise_std.")
     return StructuredFit(spec, problem, hyper, posterior, result, system, noise)
 
@@ -203,15 +201,12 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
     scales, params, coulomb = problem.training.scales, kernel_parameters(hyper), problem.coulomb(hyper)
     priors = problem.priors_at(hyper)
     if "alpha" not in tensors:
-        kept = {name: _in_order(problem, _below(tensors, name + ".")) for name in ("sparse", "central")}
-        latent = posterior_of_tensors(problem.priors, params, kept["sparse"])
-        central = posterior_of_tensors(problem.priors, params, kept["central"]) if kept["central"] else None
-        return ForcePosterior(priors, scales, problem.mean, latent, central, coulomb)
+        kept = _in_order(problem, _below(tensors, "sparse."))
+        latent = posterior_of_tensors(problem.priors, params, kept)
+        return ForcePosterior(priors, scales, problem.mean, latent, problem.pins(), coulomb)
     blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
     rows = sum(block.rows for block in blocks)
     if alpha.shape != (rows,):
         raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
-    if problem.pinned:
-        return force_posterior(problem, hyper)
     latent = ExactPosterior(problem.priors, params, blocks, alpha)
-    return ForcePosterior(priors, scales, problem.mean, latent, coulomb=coulomb)
+    return ForcePosterior(priors, scales, problem.mean, latent, problem.pins(), coulomb)

@@ -20,7 +20,6 @@ from forcegp.forces.measurements import Training
 from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.observations import (
     Observation,
-    is_simulated,
     observations_of,
     plain,
     states_noise,
@@ -28,7 +27,6 @@ from forcegp.forces.observations import (
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
-from forcegp.forces.priors.default import measured_priors
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import (
     AnalyticalMean,
@@ -37,13 +35,13 @@ from forcegp.forces.priors.joint import (
     JointForcePrior,
     JointFrictionPrior,
 )
+from forcegp.forces.priors.sets import PriorSet
 from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.inducing import LIMIT
 from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
-from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sparse_tensors import tensors_of_posterior
-from forcegp.models.fit_result import FitResult
+from forcegp.models.fit_result import Compared, FitResult
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import encode
 from forcegp.storage.model_file import Settings
@@ -91,9 +89,9 @@ class Specification:
         analytical_parameters: module whose `forward()` gives the robot at θ_A, or `None`.
         inference: `"auto"`, `"exact"` or `"sparse"`.
         inducing_points: maximum number of inducing points of one prior.
-        automatic: whether the priors depend on whether the data are simulated or measured.
-        inertia: `"file"`, or `"auto"` where the log may show another one; `None` for `"auto"` with the
-            defaults of a measured robot and `"file"` elsewhere.
+        automatic: whether the data choose the priors among `SETS`.
+        inertia: `"file"`, or `"auto"` where the log may show another one; `None` leaves that to the data
+            if they choose the priors, and is `"file"` elsewhere.
         standardize: whether the inputs of kernels are standardized.
     """
 
@@ -109,19 +107,22 @@ class Specification:
     standardize: bool = True
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
-        """The specification with what was left to the data filled in.
+        """The specification with the noise that was left to the data.
 
-        Around the analytical forces of a measured robot the default priors are `measured_priors`. The noise
-        of accelerations is learned with that of the torque where nobody states it.
+        The noise of accelerations is learned with that of the torque, or to compare sets of priors, if nobody
+        states it.
         """
-        spec, observations = self, observations_of(data)
-        if spec.automatic and not is_simulated(observations):
-            priors = measured_priors(spec.system)
-            noise = dataclasses.replace(spec.noise, torque="learn")
-            spec = dataclasses.replace(spec, priors=priors, noise=noise, inertia=spec.inertia or "auto")
-        if spec.noise.learns_torque and spec.noise.acceleration is None and not states_noise(observations):
-            spec = dataclasses.replace(spec, noise=dataclasses.replace(spec.noise, learn=True))
-        return dataclasses.replace(spec, automatic=False)
+        learns = self.noise.learns_torque or self.automatic
+        if learns and self.noise.acceleration is None and not states_noise(observations_of(data)):
+            return dataclasses.replace(self, noise=dataclasses.replace(self.noise, learn=True))
+        return self
+
+    def with_set(self, chosen: PriorSet) -> Specification:
+        """The specification with a set of priors, and the noise of the torque that goes with it."""
+        priors, noise = chosen.priors(self.system), self.noise
+        if isinstance(noise.torque, str) and noise.torque == "auto":
+            noise = noise.for_priors(priors)
+        return dataclasses.replace(self, priors=priors, noise=noise, automatic=False)
 
     def inertia_of(self, training: Training) -> Inertia:
         """The robot that the training samples ask for, where the model is to find it."""
@@ -173,6 +174,7 @@ class ResultSettings(Settings):
     determined: float | None = None
     missed: float | None = None
     more_points_would_help: bool | None = None
+    comparison: tuple[Compared, ...] = ()
 
 
 class NoiseSettings(Settings):
@@ -197,7 +199,6 @@ class StructuredSettings(Settings):
     power: float = Field(gt=0.0, le=1.0)
     correlation_time: float = Field(default=0.0, ge=0.0)
     priors: tuple[dict[str, Any], ...]
-    pinned: tuple[str, ...]
     measured: tuple[str, ...]
     constant: tuple[tuple[str, ...], ...]
     analytical_parameters: dict[str, tuple[str, ...]] | None
@@ -225,7 +226,7 @@ def pack(
     """
     own = spec.analytical_parameters if isinstance(spec.analytical_parameters, AnalyticalParameters) else None
     tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
-    tensors |= {f"offset.{name}": value for name, value in problem.offsets.items()}
+    tensors |= {f"pinned.{name}": value for name, value in problem.pinned.items()}
     if problem.torque_std is not None:
         tensors["torque_std"] = problem.torque_std
     if problem.correlation is not None:
@@ -259,7 +260,6 @@ def _settings_of(
         inertia=spec.inertia,  # pyright: ignore[reportArgumentType]
         power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
-        pinned=problem.pinned,
         measured=problem.training.quantities if exact else (),
         constant=tuple(scale.constant for scale in problem.training.scales),
         analytical_parameters=None if own is None else own.joints,
@@ -269,12 +269,10 @@ def _settings_of(
 
 def _conditioned_on(spec: Specification, training: Training, posterior: ForcePosterior) -> dict[str, Tensor]:
     """The data of an exact posterior, or the sums over them of a sparse one."""
-    latent, central = posterior.latent, posterior.central
+    latent = posterior.latent
     if isinstance(latent, ExactPosterior):
         return {"alpha": latent.alpha, **_tensors_of(training, any(p.in_time for p in spec.priors))}
-    tensors = {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
-    if isinstance(central, SparsePosterior):
-        tensors |= {f"central.{name}": value for name, value in tensors_of_posterior(central).items()}
+    return {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
     return tensors
 
 

@@ -16,13 +16,13 @@ import torch.distributed as dist
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.data.stream import StreamedDataset, spaced_sample
+from forcegp.data.stream import Keep, StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
 from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
 from forcegp.forces.inference import Totals, basis_of, posterior_of, total_over
 from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training
-from forcegp.forces.observations import training_of
+from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.gp.basis import LatentBasis
@@ -43,38 +43,73 @@ SAMPLE_ROWS = 20_000
 
 @dataclass(frozen=True)
 class Sample:
-    """Evenly spaced samples of a log.
+    """What one pass over a log keeps of it; all of a log in memory.
 
     Attributes:
-        log: the log.
-        data: the samples.
-        count: number of samples of the log that count.
-        moving: whether those at rest do not.
+        data: the samples: evenly spaced ones of a log that is read piece by piece.
+        count: number of samples that are conditioned on, of which these may be a part; 0 where these are all.
+        log: a log that is read piece by piece.
+        stretches: a few contiguous stretches of it, which show how long residuals are correlated.
+        moving: whether its samples at rest do not count.
     """
 
-    log: StreamedDataset
-    data: Dataset
-    count: int
-    moving: bool
+    data: Dataset | Sequence[Observation]
+    count: int = 0
+    log: StreamedDataset | None = None
+    stretches: Dataset | None = None
+    moving: bool = False
+
+    def neighbours(self, spec: Specification, training: Training) -> Training | None:
+        """Contiguous stretches of the log as training data.
+
+        Args:
+            spec: the model.
+            training: the sample, whose input scales are kept.
+
+        Returns:
+            `None` where the sample is the whole log, or the model does not ask for it.
+        """
+        if self.stretches is None or not spec.noise.learns_torque or len(self.data) == self.count:
+            return None
+        scales = kept_scales(spec.priors, training)
+        return training_of(self.stretches, spec.system, spec.priors, spec.noise.acceleration, scales)
 
 
 @torch.no_grad()
-def sample_of(spec: Specification, stream: StreamedDataset) -> Sample:
-    """What a model learns from: evenly spaced samples of the log, in motion where the model asks for that.
+def sample_of(spec: Specification, data: Dataset | Sequence[Observation] | StreamedDataset) -> Sample:
+    """What a model learns from: a log in memory, or evenly spaced samples of one that is read piece by piece,
+    in motion where the model asks for that.
 
     Raises:
         DataError: a file is damaged, or holds no samples.
         ModelError: exact inference is asked for on more samples than are read at once.
     """
-    first = next(stream.pieces(), None)
-    if first is not None and spec.for_data(first).noise.learns_torque:
-        data, count = spaced_sample(stream.pieces(), SAMPLE_ROWS, moving_rows)
-        if count >= FEWEST_MOVING:
-            _check_inference(spec, count, len(data))
-            return Sample(stream, data, count, moving=True)
-    data, count = spaced_sample(stream.pieces(), SAMPLE_ROWS)
-    _check_inference(spec, count, len(data))
-    return Sample(stream, data, count, moving=False)
+    if not isinstance(data, StreamedDataset):
+        return Sample(data)
+    moving = spec.automatic or spec.noise.learns_torque
+    rows, stretches, count = _rows_of(data, moving_rows if moving else None)
+    if moving and count < FEWEST_MOVING:
+        moving = False
+        rows, stretches, count = _rows_of(data, None)
+    _check_inference(spec, count, len(rows))
+    return Sample(rows, count, data, stretches, moving)
+
+
+def _rows_of(log: StreamedDataset, keep: Keep | None) -> tuple[Dataset, Dataset, int]:
+    """Evenly spaced rows that count, contiguous stretches of them, and the number of all of them."""
+    stretches: list[Dataset] = []
+    rows, count = spaced_sample(_with_stretches(log, stretches, keep), SAMPLE_ROWS, keep)
+    return rows, Dataset.concatenate(stretches), count
+
+
+def _with_stretches(stream: StreamedDataset, parts: list[Dataset], keep: Keep | None) -> Iterator[Dataset]:
+    """The pieces of a log; the first rows of some of them are appended to `parts`."""
+    last, length = stream.piece_count - 1, MOST_RESIDUALS // STRETCHES
+    wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
+    for number, piece in enumerate(stream.pieces()):
+        if number in wanted:
+            parts.append((piece if keep is None else piece[keep(piece)])[:length])
+        yield piece
 
 
 def _check_inference(spec: Specification, count: int, held: int) -> None:
@@ -95,30 +130,6 @@ def _check_inference(spec: Specification, count: int, held: int) -> None:
         )
 
 
-def neighbours_of(spec: Specification, sample: Sample, training: Training) -> Training | None:
-    """A few contiguous stretches of the log, which show how long residuals are correlated.
-
-    Args:
-        spec: the model.
-        sample: the log.
-        training: the sample, whose input scales are kept.
-
-    Returns:
-        `None` where the sample is the whole log, or the model does not ask for it.
-    """
-    if not spec.noise.learns_torque or len(sample.data) == sample.count:
-        return None
-    last, length = sample.log.piece_count - 1, MOST_RESIDUALS // STRETCHES
-    wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
-    parts = [piece for number, piece in enumerate(sample.log.pieces()) if number in wanted]
-    if sample.moving:
-        parts = [piece[moving_rows(piece)] for piece in parts]
-    data = Dataset.concatenate([piece[:length] for piece in parts])
-    return training_of(
-        data, spec.system, spec.priors, spec.noise.acceleration, kept_scales(spec.priors, training)
-    )
-
-
 def kept_scales(priors: Sequence[ForcePrior], training: Training) -> dict[str, Standardization]:
     """The input scales of training data by prior."""
     return {prior.name: scale for prior, scale in zip(priors, training.scales, strict=True)}
@@ -135,12 +146,14 @@ class Pass:
 
     Attributes:
         spec: the model.
-        sample: the log, and what the model learned from.
+        log: the log.
+        sample: what the model learned from.
         checkpoint: file that records the sums, or `None`.
         progress: called with the samples so far, the number of all, and NaN.
     """
 
     spec: Specification
+    log: StreamedDataset
     sample: Sample
     checkpoint: Path | None = None
     progress: FitProgress | None = None
@@ -162,9 +175,9 @@ class Pass:
         kept = {} if saved is None else saved.read(_tensors(basis, Totals.zero(problem, basis)))
         if kept:
             basis, begin = _restored(basis, kept)
-        elif self.sample.log.distributed:
+        elif self.log.distributed:
             basis = share_basis(basis)
-        processes = dist.get_world_size() if self.sample.log.distributed else 1
+        processes = dist.get_world_size() if self.log.distributed else 1
 
         def after(total: Totals) -> None:
             if saved is not None:
@@ -175,15 +188,15 @@ class Pass:
 
         pieces = self._pieces(problem, 0 if begin is None else begin.pieces)
         total = total_over(problem, hyperparameters, basis, pieces, begin, after)
-        if self.sample.log.distributed:
+        if self.log.distributed:
             total = total.over_processes()
         return posterior_of(problem, hyperparameters, basis, total), total.constant
 
     def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
         """The samples of this process, a piece at a time; a piece of another process has none."""
-        rank, processes = (dist.get_rank(), dist.get_world_size()) if self.sample.log.distributed else (0, 1)
+        rank, processes = (dist.get_rank(), dist.get_world_size()) if self.log.distributed else (0, 1)
         kept = kept_scales(problem.priors, problem.training)
-        for piece in self.sample.log.pieces(start, (rank, processes)):
+        for piece in self.log.pieces(start, (rank, processes)):
             if self.sample.moving:
                 piece = piece[moving_rows(piece)]
             if len(piece) == 0:
@@ -194,19 +207,19 @@ class Pass:
     def _own_file(self) -> Path:
         assert self.checkpoint is not None
         path = beside(self.checkpoint)
-        return path.with_name(f"{path.name}.{dist.get_rank()}") if self.sample.log.distributed else path
+        return path.with_name(f"{path.name}.{dist.get_rank()}") if self.log.distributed else path
 
     def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
         """Identifies the sums over a log, with a basis, a system and a noise."""
         training = problem.training
-        files = [(path.name, path.stat().st_size) for path in self.sample.log.files]
+        files = [(path.name, path.stat().st_size) for path in self.log.files]
         record, robot = pack_system(problem.system)
         data = [value for m in training.measurements for value in m.tensors]
         points = [x for Z in problem.inducing or () for x in Z.values()]
         named = [part for pair in sorted(hyperparameters.items()) for part in pair]
         return Checkpoint.key_of(
             problem.mean, [(type(prior).__name__, prior) for prior in problem.priors], problem.power, files,
-            self.sample.log.differentiate, training.part_of, *data, *training.noise_std, *points, *named,
+            self.log.differentiate, training.part_of, *data, *training.noise_std, *points, *named,
             record, *robot.values(),
         )  # fmt: skip
 
@@ -214,9 +227,7 @@ class Pass:
 def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
     """What a pass has computed so far, by name."""
     tensors = {f"basis.{name}": value for name, value in tensors_of_basis(basis).items()}
-    for name, sums in (("sums", total.sums), ("central", total.central)):
-        if sums is not None:
-            tensors |= {f"{name}.{i}": value for i, value in enumerate(sums.tensors)}
+    tensors |= {f"sums.{i}": value for i, value in enumerate(total.sums.tensors)}
     counts = {"constant": total.constant, "samples": total.samples, "pieces": torch.tensor(total.pieces)}
     return tensors | counts
 
@@ -224,14 +235,9 @@ def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
 def _restored(basis: LatentBasis, tensors: Mapping[str, Tensor]) -> tuple[LatentBasis, Totals]:
     """The basis and totals that `_tensors` was given; kernel inputs are in the order of the prior."""
     own = basis_of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
-    found = {
-        name: Sums(*(tensors[f"{name}.{i}"] for i in range(len(fields(Sums)))))
-        for name in ("sums", "central")
-        if f"{name}.0" in tensors
-    }
+    sums = Sums(*(tensors[f"sums.{i}"] for i in range(len(fields(Sums)))))
     return own, Totals(
-        found["sums"],
-        found.get("central"),
+        sums,
         tensors["constant"],
         tensors["samples"],
         int(tensors["pieces"]),

@@ -46,14 +46,14 @@ def private_folder(folder: Path) -> Path:
 
 def _check_owner(folder: Path) -> None:
     for place in (folder, *folder.parents):
-        found = place.stat()
-        if found.st_uid not in ((os.geteuid(),) if place == folder else (os.geteuid(), 0)):
-            raise _untrusted(folder, place, f"owned by user {found.st_uid}")
+        status = place.stat()
+        if status.st_uid not in ((os.geteuid(),) if place == folder else (os.geteuid(), 0)):
+            raise _untrusted(folder, place, f"owned by user {status.st_uid}")
         # In a folder with the sticky bit, such as /tmp, nobody replaces what belongs to another.
-        sticky = place != folder and bool(found.st_mode & stat.S_ISVTX)
-        shared = bool(found.st_mode & stat.S_IWGRP) and not (place != folder and _is_alone_in(found.st_gid))
-        if (shared or found.st_mode & stat.S_IWOTH) and not sticky:
-            raise _untrusted(folder, place, f"permissions {stat.S_IMODE(found.st_mode):04o}")
+        sticky = place != folder and bool(status.st_mode & stat.S_ISVTX)
+        shared = bool(status.st_mode & stat.S_IWGRP) and not (place != folder and _is_alone_in(status.st_gid))
+        if (shared or status.st_mode & stat.S_IWOTH) and not sticky:
+            raise _untrusted(folder, place, f"permissions {stat.S_IMODE(status.st_mode):04o}")
 
 
 def _is_alone_in(group: int) -> bool:
@@ -93,10 +93,10 @@ def _trusted(path: Path) -> bool:
     except OSError:
         return False
     with os.fdopen(descriptor, "rb") as file:
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode):
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
             return False
-        if os.name == "posix" and (found.st_uid != os.geteuid() or found.st_mode & _OTHERS_WRITE):
+        if os.name == "posix" and (status.st_uid != os.geteuid() or status.st_mode & _OTHERS_WRITE):
             return False
         return path.stem.partition("-")[2] == hashlib.sha256(file.read()).hexdigest()
 

@@ -41,8 +41,8 @@ def find_compiler() -> str:
     """
     wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
     for name in wanted:
-        if found := shutil.which(name):
-            return os.path.abspath(found)
+        if path := shutil.which(name):
+            return os.path.abspath(path)
     raise MissingDependencyError(
         "compiled kernels need a C++ compiler and none was found",
         expected=" or ".join(wanted) + " on the PATH",
@@ -117,8 +117,8 @@ def _built(compiler: Sequence[str], source: str, folder: Path) -> bytes:
         return (folder / LIBRARY).read_bytes()
     held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
-        found = os.fstat(held)
-        if found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) != 0o700:
+        status = os.fstat(held)
+        if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) != 0o700:
             raise OSError(errno.EPERM, "another folder was put in the place of the build folder", str(folder))
         _run_compiler(compiler, source, PROC / str(held))
         with os.fdopen(os.open(LIBRARY, os.O_RDONLY | os.O_NOFOLLOW, dir_fd=held), "rb") as file:

@@ -191,7 +191,7 @@ def _contact(finding: Finding, system: ConstrainedSystem, log: Log, rows: slice)
 
 
 @dataclass(frozen=True)
-class Section:
+class FindingSection:
     """One finding on the page.
 
     Attributes:
@@ -221,7 +221,7 @@ def write_check(path: Path, title: str, report: Report, system: ConstrainedSyste
     """
     log = of_robot(log, system.robot)
     sections = [
-        Section(finding, _title(finding), _rows(finding, report), picture_of(finding, system, log))
+        FindingSection(finding, _title(finding), _rows(finding, report), picture_of(finding, system, log))
         for finding in report.findings
     ]
     overview = draw_overview(report) if report.findings else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -10,7 +11,8 @@ from matplotlib.figure import Figure
 from forcegp.evaluation import Evaluation
 from forcegp.evaluation.scores import JointErrors
 from forcegp.files import write_text
-from forcegp.report.html import Block, Table, cell, render
+from forcegp.models.fit_result import Compared
+from forcegp.report.html import PictureBlock, Table, cell, render
 from forcegp.report.style import INK, Picture, colour, draw, label
 from forcegp.report.window import WindowData, draw_errors, draw_predictions
 
@@ -33,34 +35,46 @@ NAMES = {
 
 
 def write_evaluation(
-    folder: Path, model: str, data: str, found: Evaluation, window: WindowData, fitted_to: str | None = None
+    folder: Path,
+    model: str,
+    data: str,
+    scores: Evaluation,
+    window: WindowData,
+    fitted_to: str | None = None,
+    comparison: Sequence[Compared] = (),
 ) -> Path:
     """Write the page on one model, with its plots and their data.
 
     Args:
         folder: where the files go.
         model, data: the model file and the data file, as the page names them.
-        found: the scores.
+        scores: of the model.
         window: predictions over a few seconds of the data.
         fitted_to: the file that the trivial predictors were fitted to, if not halves of the data.
+        comparison: sets of force priors that the training log chose between.
 
     Returns:
         The path of the page.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
-    pictures += [draw_calibration(found)] if found.calibration else []
+    pictures += [draw_calibration(scores)] if scores.calibration else []
     for name, picture in zip(PLOTS, pictures, strict=False):
         write_text(folder / name, picture.svg)
     write_text(folder / WINDOW, window.to_json())
     page = render(
         "evaluation.html.j2",
-        title=_title(found.kind, Path(model).name, Path(data).name),
+        title=_title(scores.kind, Path(model).name, Path(data).name),
         model=model,
         data=data,
-        found=found,
+        scores=scores,
         baseline_data=fitted_to or "the other half of the data",
-        tables=(*error_tables(found), *uncertainty_tables(found), score_table(found)),
+        tables=(
+            *error_tables(scores),
+            *uncertainty_tables(scores),
+            score_table(scores),
+            *comparison_tables(comparison),
+        ),
         blocks=_blocks(window, pictures),
     )
     write_text(folder / PAGE, page)
@@ -73,9 +87,9 @@ def _title(kind: str, model: str, data: str) -> str:
     return f"{label(kind)}{name} on {data}"
 
 
-def _blocks(window: WindowData, pictures: list[Picture]) -> list[Block]:
+def _blocks(window: WindowData, pictures: list[Picture]) -> list[PictureBlock]:
     blocks = [
-        Block(
+        PictureBlock(
             "Predictions and errors",
             f"The first {window.seconds:.2g} s. Predictions: accelerations by joint, measured in black, "
             f"predicted "
@@ -91,42 +105,44 @@ def _blocks(window: WindowData, pictures: list[Picture]) -> list[Block]:
             "diagonal "
             "the uncertainty is right; below it the model is overconfident, above it underconfident."
         )
-        blocks.append(Block("Calibration", caption, tuple(pictures[2:]), "evaluation.json"))
+        blocks.append(PictureBlock("Calibration", caption, tuple(pictures[2:]), "evaluation.json"))
     return blocks
 
 
-def draw_calibration(found: Evaluation) -> Picture:
+def draw_calibration(evaluation: Evaluation) -> Picture:
     """Coverage over nominal probability."""
-    levels = {float(level): share for level, share in (found.calibration or {}).items()}
+    levels = {float(level): share for level, share in (evaluation.calibration or {}).items()}
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         axes.plot([0.4, 1.0], [0.4, 1.0], color=INK, linewidth=0.8, linestyle=":", label="nominal")
-        axes.plot(list(levels), list(levels.values()), color=colour(found.kind), marker="o", label="model")
+        axes.plot(
+            list(levels), list(levels.values()), color=colour(evaluation.kind), marker="o", label="model"
+        )
         axes.set_xlabel("probability of the interval")
         axes.set_ylabel("share of samples inside")
         axes.set_ylim(0.0, 1.02)
         figure.legend(loc="outside upper center", ncols=2)
 
     listed = ", ".join(f"{share:.2f} at {level:g}" for level, share in levels.items())
-    return draw(paint, (4.1, 3.4), f"Calibration, share of samples inside: {listed}.", label(found.kind))
+    return draw(paint, (4.1, 3.4), f"Calibration, share of samples inside: {listed}.", label(evaluation.kind))
 
 
-def error_tables(found: Evaluation) -> tuple[Table, ...]:
+def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
     """Torque and acceleration errors by joint, beside the trivial predictors; worse ones in red.
 
     nRMSE is the error over all samples divided by the standard deviation of the measured quantity.
     """
     units = {"torque": "[N m, N]", "acceleration": "[rad/s², m/s²]"}
     tables = []
-    for unit, names in units.items() if found.predictors else ():
-        errors: dict[str, JointErrors] = {p.name: getattr(p, unit) for p in found.predictors}
-        own, *others = errors.values()
+    for unit, names in units.items() if evaluation.predictors else ():
+        errors: dict[str, JointErrors] = {p.name: getattr(p, unit) for p in evaluation.predictors}
+        model_errors, *others = errors.values()
         head = ("joint", *errors, "model, at rest", "model, nRMSE")
         rows, bad = [], set()
-        for i, joint in enumerate(found.joint_names):
+        for i, joint in enumerate(evaluation.joint_names):
             shown = [e.in_motion[i] for e in errors.values()]
-            rows.append((joint, *map(_short, (*shown, own.rest[i], own.normalised[i]))))
+            rows.append((joint, *map(_short, (*shown, model_errors.rest[i], model_errors.normalised[i]))))
             if any((shown[0] or 0.0) > (e.in_motion[i] or 0.0) for e in others):
                 bad.add((i, 1))
         caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: worse than another"
@@ -134,22 +150,25 @@ def error_tables(found: Evaluation) -> tuple[Table, ...]:
     return tuple(tables)
 
 
-def uncertainty_tables(found: Evaluation) -> tuple[Table, ...]:
+def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
     """Coverage by joint, density beside the trivial predictors, and λ against its sensor."""
     tables = []
-    if found.uncertainty is not None:
-        shares = zip(found.joint_names, found.uncertainty.coverage_by_joint, strict=True)
+    if evaluation.uncertainty is not None:
+        shares = zip(evaluation.joint_names, evaluation.uncertainty.coverage_by_joint, strict=True)
         rows = tuple((joint, f"{share:.3f}") for joint, share in shares)
         tables.append(
             Table("±2σ coverage of measured accelerations (nominal 0.954)", ("joint", "share"), rows)
         )
-    if any(p.nlpd is not None for p in found.predictors):
-        rows = tuple((p.name, "–" if p.nlpd is None else f"{-p.nlpd:.3f}") for p in found.predictors)
+    if any(p.nlpd is not None for p in evaluation.predictors):
+        rows = tuple((p.name, "–" if p.nlpd is None else f"{-p.nlpd:.3f}") for p in evaluation.predictors)
         caption = "Mean log density of a measured joint acceleration [nats], higher is better"
         tables.append(Table(caption, ("predictor", "log density"), rows))
     head = ("contact", "samples", "bias [N]", "standard deviation [N]", "correlation", "±2σ coverage")
     caption = "Multiplier λ: predicted less logged"
-    for scores, title in ((found.multipliers, caption), (found.sensed, f"{caption}, with the force sensor")):
+    for scores, title in (
+        (evaluation.multipliers, caption),
+        (evaluation.sensed, f"{caption}, with the force sensor"),
+    ):
         rows = tuple(
             (m.contact, str(m.samples), *map(_short, (m.bias, m.spread, m.correlation, m.coverage)))
             for m in scores
@@ -159,11 +178,25 @@ def uncertainty_tables(found: Evaluation) -> tuple[Table, ...]:
     return tuple(tables)
 
 
-def score_table(found: Evaluation) -> Table:
+def score_table(evaluation: Evaluation) -> Table:
     """The scores over all joints, with units."""
-    scores = found.summary()
+    scores = evaluation.summary()
     rows = tuple((name, cell(scores[key])) for key, name in NAMES.items() if scores[key] is not None)
     return Table("Scores over all joints", ("score", "value"), rows)
+
+
+def comparison_tables(comparison: Sequence[Compared]) -> tuple[Table, ...]:
+    """The sets of force priors that the training log chose between; none if they were named."""
+    rows = tuple(
+        (
+            each.name,
+            *(_short(x) for x in (each.log_density, each.behind, each.standard_error)),
+            ", ".join(part for part in ("chosen" if each.chosen else "", each.note) if part),
+        )
+        for each in comparison
+    )
+    caption = "Force priors, compared on held-out stretches of the training log [nats per sample]"
+    return (Table(caption, ("set", "log density", "behind", "standard error", ""), rows),) if rows else ()
 
 
 def _short(value: float | None) -> str:

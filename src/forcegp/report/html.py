@@ -79,14 +79,14 @@ class Table:
 
 def number(values: Sequence[float | int | None], digits: int = 3) -> str:
     """The mean of values over seeds, with half their range if there are several."""
-    known = [float(v) for v in values if v is not None]
-    if not known:
+    present = [float(v) for v in values if v is not None]
+    if not present:
         return NONE
-    mean = sum(known) / len(known)
+    mean = sum(present) / len(present)
     plain = 1e-3 <= abs(mean) < 1e4 or mean == 0.0
     text = f"{mean:.{digits}f}" if plain else f"{mean:.1e}"
-    spread = (max(known) - min(known)) / 2.0
-    return text if len(known) == 1 or not plain or mean == 0.0 else f"{text} ± {spread:.{digits}f}"
+    spread = (max(present) - min(present)) / 2.0
+    return text if len(present) == 1 or not plain or mean == 0.0 else f"{text} ± {spread:.{digits}f}"
 
 
 def cell(value: object, digits: int = 4) -> str:
@@ -95,7 +95,7 @@ def cell(value: object, digits: int = 4) -> str:
 
 
 @dataclass(frozen=True)
-class Block:
+class PictureBlock:
     """Pictures under one heading and caption.
 
     Attributes:
@@ -112,7 +112,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Statement:
     """A sentence computed from results.
 
     Attributes:

@@ -113,33 +113,33 @@ class RolloutData(Header):
     films: list[Film]
 
 
-def rollout_data(found: Comparison, calibration: Comparison | None = None) -> RolloutData:
+def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
     """The data of the section from a comparison; curves are those of its first start.
 
     Args:
-        found: the comparison.
+        comparison: the comparison.
         calibration: the same models on another motion, on which the bands are calibrated.
     """
-    horizons = [h for h in HORIZONS if h <= float(found.t[-1]) * (1.0 + 1e-9)]
-    stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(found.t[1] - found.t[0]))))
-    joints = [arm_points(found.system.robot, found.q[0, ::stride], found)]
+    horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
+    stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
+    joints = [arm_points(comparison.system.robot, comparison.q[0, ::stride], comparison)]
     films = [Film(label="logged", points=_rounded(joints[0]))]
-    for name, rolled in found.predicted.items():
+    for name, rolled in comparison.predicted.items():
         sound = _sound(rolled.q[0])
-        points = arm_points(rolled.system.robot, rolled.q[0, :sound:stride], found)
+        points = arm_points(rolled.system.robot, rolled.q[0, :sound:stride], comparison)
         films.append(Film(label=name, points=_rounded(points)))
-    logged = found.multiplier
+    logged = comparison.multiplier
     return RolloutData(
-        t=series(found.t),
-        tip=[series(x) for x in found.tip[0].T],
+        t=series(comparison.t),
+        tip=[series(x) for x in comparison.tip[0].T],
         multiplier=[] if logged is None else series(logged[0, :, 0]),
-        starts=len(found.q),
-        band_starts=len(found.q),
-        band_seconds=float(found.t[-1]),
+        starts=len(comparison.q),
+        band_starts=len(comparison.q),
+        band_seconds=float(comparison.t[-1]),
         level=LEVEL,
         horizons=horizons,
-        models=[_model_path(found, name, horizons, calibration) for name in found.predicted],
-        frame_times=series(found.t[::stride]),
+        models=[_model_path(comparison, name, horizons, calibration) for name in comparison.predicted],
+        frame_times=series(comparison.t[::stride]),
         bodies=joints[0].shape[1],
         films=films,
     )
@@ -182,31 +182,31 @@ def _with_bands(path: ModelPath, band: ModelPath) -> ModelPath:
 
 
 def _model_path(
-    found: Comparison, name: str, horizons: list[float], calibration: Comparison | None
+    comparison: Comparison, name: str, horizons: list[float], calibration: Comparison | None
 ) -> ModelPath:
-    rolled = found.predicted[name]
+    rolled = comparison.predicted[name]
     n = _sound(rolled.q[0])
     samples, contacts = rolled.samples, rolled.system.m > 0
     multiplier = rolled.multiplier[0, :n, 0] if contacts else rolled.multiplier.new_zeros(0)
-    known = bool(torch.isfinite(multiplier).all()) and len(multiplier) > 0
-    errors = [found.error_at(name, horizon) for horizon in horizons]
+    has_multiplier = bool(torch.isfinite(multiplier).all()) and len(multiplier) > 0
+    errors = [comparison.error_at(name, horizon) for horizon in horizons]
     times = [d.t for d in (*rolled.diverged, *(samples.diverged if samples else ()))]
     factor = calibration.inflation(name) if samples and calibration else math.inf
     inflation = factor if math.isfinite(factor) else None
     drifts = [x.drift.nan_to_num(0.0).abs().max() for x in (rolled, samples) if x is not None and contacts]
     return ModelPath(
         model=name,
-        tip=[series(x) for x in found.predicted_tip(name)[0, :n].T],
-        tip_bands=[] if samples is None else _bands(rolled, found.sampled_tip(name)[:, 0], n),
-        tip_error=series(_finite(found.tip_error(name).median(0).values)),
+        tip=[series(x) for x in comparison.predicted_tip(name)[0, :n].T],
+        tip_bands=[] if samples is None else _bands(rolled, comparison.sampled_tip(name)[:, 0], n),
+        tip_error=series(_finite(comparison.tip_error(name).median(0).values)),
         drift=series(rolled.drift[0, :n, 0]) if contacts else [],
-        multiplier=series(multiplier) if known else [],
+        multiplier=series(multiplier) if has_multiplier else [],
         multiplier_band=_bands(rolled, samples.multiplier[:, 0], n)[0] if samples and contacts else None,
         lost=series(rolled.contact_lost()[0, :n, 0]) if samples and contacts else [],
         errors=[e if math.isfinite(e) else None for e in errors],
-        coverage=found.coverage(name) if samples else None,
+        coverage=comparison.coverage(name) if samples else None,
         inflation=inflation,
-        calibrated_coverage=None if inflation is None else found.coverage(name, inflation=inflation),
+        calibrated_coverage=None if inflation is None else comparison.coverage(name, inflation=inflation),
         worst_drift=float(torch.stack(drifts).max()) if drifts else None,
         diverged_at=min(times) if times else None,
     )
@@ -231,17 +231,17 @@ def _finite(values: Tensor) -> Tensor:
     return values[torch.isfinite(values)]
 
 
-def arm_points(robot: RobotModel, q: Tensor, found: Comparison) -> Tensor:
+def arm_points(robot: RobotModel, q: Tensor, comparison: Comparison) -> Tensor:
     """Base, link origins on the way to the tip, and the tip: `(frames, points, 3)` in the world [m]."""
     poses = kinematics.link_poses(robot, q)
-    joint = robot.frame_parents[robot.frame_index(found.frame)]
+    joint = robot.frame_parents[robot.frame_index(comparison.frame)]
     chain: list[int] = []
     while joint != BASE:
         chain.insert(0, joint)
         joint = robot.parents[joint]
     origins = poses.position[:, chain] + robot.base_position
     base = robot.base_position.expand(len(q), 1, 3)
-    tip = kinematics.point_position(robot, q, found.frame, tuple(found.point))[:, None]
+    tip = kinematics.point_position(robot, q, comparison.frame, tuple(comparison.point))[:, None]
     return torch.cat([base, origins, tip], dim=1)
 
 

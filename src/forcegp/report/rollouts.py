@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.files import write_text
-from forcegp.report.html import NONE, Block, Series, Table, render
+from forcegp.report.html import NONE, PictureBlock, Series, Table, render
 from forcegp.report.rollout_data import Band, ModelPath, RolloutData
 from forcegp.report.style import DASHES, INK, Picture, colour, draw, label, line
 
@@ -112,12 +112,12 @@ def _draw_logarithmic(
 
 def draw_contact_force(data: RolloutData) -> Picture:
     """The multiplier along predicted trajectories with its band, and the probability of lost contact."""
-    shown = [path for path in data.models if path.multiplier]
-    losing = [path for path in shown if any(path.lost)]
+    paths = [path for path in data.models if path.multiplier]
+    losing = [path for path in paths if any(path.lost)]
 
     def paint(figure: Figure) -> None:
         panels = figure.subplots(2 if losing else 1, 1, sharex=True, squeeze=False)[:, 0]
-        for path in shown:
+        for path in paths:
             _curve(panels[0], data, path, path.multiplier, path.multiplier_band)
         if data.multiplier:
             panels[0].plot(data.t, data.multiplier, color=INK, linestyle=(0, (4, 1.5)), label="simulated")
@@ -193,7 +193,7 @@ class RolloutSection:
         script: hash of the animation's script for the page's content security policy.
     """
 
-    block: Block
+    block: PictureBlock
     table: Table
     animation: Markup
     script: str
@@ -209,7 +209,7 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
         f"first {data.band_seconds:.3g} s. Errors are medians over {data.starts} starts. A curve ends where "
         "its prediction diverged."
     )
-    block = Block("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
+    block = PictureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
     return RolloutSection(block, rollout_table(data), animation(data), animation_source())
 
 

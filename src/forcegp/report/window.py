@@ -57,9 +57,9 @@ class WindowData(Header):
 
 def opening(data: Dataset, seconds: float) -> Dataset:
     """The first seconds of the first trajectory of a data set, sorted by time."""
-    own = (data.segment == data.segment[0]).nonzero()[:, 0]
-    own = own[data.t[own].argsort()]
-    return data[own[data.t[own] <= data.t[own[0]] + seconds]]
+    rows = (data.segment == data.segment[0]).nonzero()[:, 0]
+    rows = rows[data.t[rows].argsort()]
+    return data[rows[data.t[rows] <= data.t[rows[0]] + seconds]]
 
 
 @torch.no_grad()
@@ -140,15 +140,21 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
     """One row per joint, everything drawn relative to `centre`."""
     rows = figure.subplots(len(window.joint_names), 1, sharex=True, squeeze=False)[:, 0]
     measured, mean = as_tensor(window.measured) - centre, as_tensor(window.mean) - centre
-    relative, shown = centre.dim() > 1, colour(window.model)
+    relative, model_colour = centre.dim() > 1, colour(window.model)
     for i, axes in enumerate(rows):
         ink = GREY if relative else INK
         axes.plot(window.t, measured[i], color=ink, linewidth=0.7, label="measured")
         if window.std is not None:
             spread = 2.0 * as_tensor(window.std[i])
-            band: dict[str, Any] = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ", "zorder": 3}
+            band: dict[str, Any] = {
+                "color": model_colour,
+                "alpha": 0.3,
+                "linewidth": 0,
+                "label": "±2σ",
+                "zorder": 3,
+            }
             axes.fill_between(window.t, mean[i] - spread, mean[i] + spread, **band)
-        axes.plot(window.t, mean[i], color=shown, linewidth=1.1, label="predicted", zorder=4)
+        axes.plot(window.t, mean[i], color=model_colour, linewidth=1.1, label="predicted", zorder=4)
         if relative and window.clean is not None:
             clean = as_tensor(window.clean[i]) - centre[i]
             axes.plot(window.t, clean, color=INK, linewidth=0.9, label="noise-free", zorder=5)

@@ -76,12 +76,12 @@ def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
     The handler belongs to the whole process: one reader at a time replaces it, warnings of other threads
     go on to theirs, and it is put back.
     """
-    own = threading.get_ident()
+    thread = threading.get_ident()
     with _HANDLER:
         before = mujoco.get_mju_user_warning()
 
         def note(text: str) -> None:
-            if threading.get_ident() == own:
+            if threading.get_ident() == thread:
                 remarks.append(f"{label}: MuJoCo warns: {text}")
             elif before is not None:
                 before(text)
@@ -208,10 +208,10 @@ def _drive_effort(model: Any, a: int) -> float:
 
 
 def _sites(model: Any, names: list[str]) -> tuple[Site, ...]:
-    found = []
+    sites = []
     for s in range(model.nsite):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
         if name:
             body = names[model.site_bodyid[s]]
-            found.append(Site(name, body, _pose(model.site_pos[s], model.site_quat[s])))
-    return tuple(found)
+            sites.append(Site(name, body, _pose(model.site_pos[s], model.site_quat[s])))
+    return tuple(sites)

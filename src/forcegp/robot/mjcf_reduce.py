@@ -85,7 +85,7 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling]
 def _expand_includes(root: Element, path: Path) -> None:
     """Insert included files, each at most once, and only from the folder of the robot file or below."""
     folder = path.resolve().parent
-    seen = {path.resolve()}
+    included = {path.resolve()}
     stack = [root]
     count = 0
     while stack:
@@ -97,28 +97,28 @@ def _expand_includes(root: Element, path: Path) -> None:
             if count > MAX_ELEMENTS:
                 raise RobotFileError(f"{path}: too many elements", expected=f"at most {MAX_ELEMENTS}")
             if child.tag == "include":
-                element[position : position + 1] = list(_included(child, folder, seen, path))
+                element[position : position + 1] = list(_included(child, folder, included, path))
             else:
                 stack.append(child)
                 position += 1
 
 
-def _included(include: Element, folder: Path, seen: set[Path], path: Path) -> Element:
+def _included(include: Element, folder: Path, included: set[Path], path: Path) -> Element:
     name = include.get("file", "")
     try:
         target = (folder / name).resolve()
         inside = target.is_relative_to(folder) and target.is_file()
     except (ValueError, OSError, RuntimeError):
         target, inside = folder, False
-    if not inside or target in seen:
+    if not inside or target in included:
         raise RobotFileError(
             f"{path}: include of {name!r} is refused",
             expected="a file in the folder of the robot file, included once",
             got="a file that is already included"
-            if target in seen
+            if target in included
             else "a missing file, or one in another folder",
         )
-    seen.add(target)
+    included.add(target)
     return parse_xml(read_bytes(target), str(target))
 
 

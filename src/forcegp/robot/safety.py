@@ -56,8 +56,8 @@ def read_bytes(path: Path) -> bytes:
     """
     try:
         if not path.is_file():
-            found = "a folder" if path.is_dir() else "something else" if path.exists() else "no such file"
-            raise RobotFileError(f"{path}: cannot be read", expected="a URDF or MJCF file", got=found)
+            kind = "a folder" if path.is_dir() else "something else" if path.exists() else "no such file"
+            raise RobotFileError(f"{path}: cannot be read", expected="a URDF or MJCF file", got=kind)
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:

@@ -246,7 +246,8 @@ def inertia_doubt(body: Inertial) -> str:
 
 
 def _check_names(tree: Tree) -> None:
-    for kind, names in (("link", [link.name for link in tree.links]), ("joint", _joint_names(tree))):
+    joints = [joint.name for joint in tree.joints if joint.name]
+    for kind, names in (("link", [link.name for link in tree.links]), ("joint", joints)):
         name, count = Counter(names).most_common(1)[0] if names else ("", 0)
         if count > 1:
             raise RobotFileError(
@@ -270,10 +271,6 @@ def _check_names(tree: Tree) -> None:
                 got=_shown(several),
                 hint="open the loop and close it with a point constraint",
             )
-
-
-def _joint_names(tree: Tree) -> list[str]:
-    return [joint.name for joint in tree.joints if joint.name]
 
 
 def _root(tree: Tree) -> str:

@@ -116,17 +116,17 @@ def _copy(document: Element, source: Element, parts: tuple[str, ...], where: str
     """Copy the validated parts of a link or joint, so that nothing else reaches the parser."""
     copy = SubElement(document, source.tag, dict(source.attrib))
     for part in parts:
-        found = source.findall(part)
-        if len(found) > 1:
-            raise RobotFileError(f"{where} has several <{part}>", expected="one", got=len(found))
-        if not found:
+        elements = source.findall(part)
+        if len(elements) > 1:
+            raise RobotFileError(f"{where} has several <{part}>", expected="one", got=len(elements))
+        if not elements:
             continue
         if part == "inertial":
-            _check_inertial(found[0], where)
-            _copy(copy, found[0], ("origin", "mass", "inertia"), where)
+            _check_inertial(elements[0], where)
+            _copy(copy, elements[0], ("origin", "mass", "inertia"), where)
         else:
-            _check_attributes(found[0], where)
-            SubElement(copy, part, dict(found[0].attrib))
+            _check_attributes(elements[0], where)
+            SubElement(copy, part, dict(elements[0].attrib))
 
 
 def _check_inertial(inertial: Element, where: str) -> None:

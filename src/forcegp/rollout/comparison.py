@@ -48,9 +48,9 @@ def widening(values: Tensor, band: Bands, level: float) -> float:
         >>> widening(torch.tensor([[0.5], [-3.0], [2.0]]), bands, 0.5)
         2.0
     """
-    apart = values - band.median
-    half = torch.where(apart < 0.0, band.median - band.lower, band.upper - band.median)
-    ratios = (apart.abs() / half).nan_to_num(torch.inf).flatten(1).sort(dim=1).values
+    error = values - band.median
+    half = torch.where(error < 0.0, band.median - band.lower, band.upper - band.median)
+    ratios = (error.abs() / half).nan_to_num(torch.inf).flatten(1).sort(dim=1).values
     scores = ratios[:, math.ceil(ratios.shape[1] * level) - 1].sort().values
     rank = math.ceil((len(scores) + 1) * level)
     return float(scores[rank - 1]) if rank <= len(scores) else math.inf
@@ -234,8 +234,8 @@ def _beside(
 ) -> Comparison:
     frame, point = tip_of(system)
     logged = data.contact_extras.get("multiplier", {})
-    known = bool(system.contacts) and all(name in logged for name in system.contact_names)
-    multiplier = torch.stack([logged[c][rows] for c in system.contact_names], -1) if known else None
+    complete = bool(system.contacts) and all(name in logged for name in system.contact_names)
+    multiplier = torch.stack([logged[c][rows] for c in system.contact_names], -1) if complete else None
     t = torch.arange(rows.shape[1], dtype=data.dtype) * dt
     return Comparison(system, frame, point, t, data.q[rows], multiplier, predicted)
 

@@ -173,14 +173,14 @@ def contact_loss_probability(
     Raises:
         ModelError: the model gives no variance of the multiplier.
     """
-    found = model.predict(q, qd, tau, "multiplier", active=active, covariance=True)
-    if found.std is None:
+    prediction = model.predict(q, qd, tau, "multiplier", active=active, covariance=True)
+    if prediction.std is None:
         raise ModelError(
             f"a {model.kind!r} model gives no uncertainty of the multiplier",
             hint="use StructuredGP, or compare the predicted multiplier with zero",
         )
-    certain = found.std == 0.0
-    probability = torch.special.ndtr(-found.mean / torch.where(certain, 1.0, found.std))
-    probability = torch.where(certain, (found.mean < 0.0).to(probability.dtype), probability)
-    closed = model.system.active_rows(active, found.mean.shape[:-1])
+    certain = prediction.std == 0.0
+    probability = torch.special.ndtr(-prediction.mean / torch.where(certain, 1.0, prediction.std))
+    probability = torch.where(certain, (prediction.mean < 0.0).to(probability.dtype), probability)
+    closed = model.system.active_rows(active, prediction.mean.shape[:-1])
     return torch.where(closed, probability, 1.0)

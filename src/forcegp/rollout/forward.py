@@ -182,7 +182,7 @@ def rollout_model(
     law, system = law_of(model, system), system or model.system
     shares, start = (2 if samples else 1), (q0, qd0)
     report = share_of(progress, 0, shares)
-    found = _run(law, system, start, tau, duration, batch, active, options, report)
+    rollout = _run(law, system, start, tau, duration, batch, active, options, report)
     if samples:
         generator = torch.Generator().manual_seed(seed)
         force = ForceLaw(model.force_samples(samples, generator))
@@ -192,8 +192,8 @@ def rollout_model(
         sampled = _run(
             force, system, start, tau, duration, whole, active, options, report, batch=batch, noise=noise
         )
-        found = dataclasses.replace(found, samples=sampled)
-    return _checked(found, options)
+        rollout = dataclasses.replace(rollout, samples=sampled)
+    return _checked(rollout, options)
 
 
 def _run(
@@ -228,7 +228,7 @@ def _run(
     mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
     problem = RolloutProblem(mechanics, law, inputs, unilateral, options.sticking)
     with one_thread() if n <= FEW else nullcontext():
-        found = integrate(
+        trajectories = integrate(
             problem,
             METHODS[options.method],
             _initial(problem, start, whole, active),
@@ -239,10 +239,10 @@ def _run(
             progress=progress,
         )
     shaped = {
-        name: getattr(found, name).unflatten(0, whole) if whole else getattr(found, name)[0]
+        name: getattr(trajectories, name).unflatten(0, whole) if whole else getattr(trajectories, name)[0]
         for name in FIELDS
     }
-    return dataclasses.replace(found, system=system, **shaped)
+    return dataclasses.replace(trajectories, system=system, **shaped)
 
 
 def _initial(
@@ -263,8 +263,8 @@ def _initial(
 def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
     """Contacts that touch, or cannot open `(n, n_contacts)`."""
     with torch.no_grad():
-        apart = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
-    return ~(apart & can_open(system, apart))
+        is_open = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
+    return ~(is_open & can_open(system, is_open))
 
 
 def share_of(progress: Progress | None, part: int, parts: int) -> Progress | None:
@@ -274,8 +274,8 @@ def share_of(progress: Progress | None, part: int, parts: int) -> Progress | Non
     return lambda done, total: progress(part * total + done, parts * total)
 
 
-def _checked(found: Rollout, options: RolloutOptions) -> Rollout:
-    for member in (found, found.samples):
+def _checked(rollout: Rollout, options: RolloutOptions) -> Rollout:
+    for member in (rollout, rollout.samples):
         if options.on_divergence == "raise" and member is not None and member.diverged:
-            raise DivergedError(member.diverged, member.rows, found)
-    return found
+            raise DivergedError(member.diverged, member.rows, rollout)
+    return rollout

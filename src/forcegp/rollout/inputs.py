@@ -166,9 +166,9 @@ class TaskSpaceControl(Inputs):
         tool = tool_motion(robot, eom.poses, eom.motion, qd, self.plan.frame, self.plan.point)
         k = torch.floor(t[:, 0] / self.dt + EDGE).long().clamp(max=len(self.plan.reference.t) - 1)
         target = Target(*(values[k] for values in self.plan.targets))
-        wanted = control_torque(tool, eom, q, qd, target, self.plan.press(eom), self.gains)
+        command = control_torque(tool, eom, q, qd, target, self.plan.press(eom), self.gains)
         limit = robot.effort_limit if self.limit is None else self.limit
-        return wanted.clamp(-limit, limit)
+        return command.clamp(-limit, limit)
 
 
 def inputs_of(

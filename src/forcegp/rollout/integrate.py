@@ -18,11 +18,11 @@ import scipy
 import torch
 from torch import Tensor
 
-from forcegp.constraints.gauss import Equations
 from forcegp.constraints.system import ConstrainedSystem
+from forcegp.constraints.unilateral import project_velocity
 from forcegp.errors import ForceGPError, ModelError, NumericalError
 from forcegp.rollout.events import ContactEvent, advance, settle
-from forcegp.rollout.law import REGULARIZATION, STILL, Instant, RolloutProblem, State, Step
+from forcegp.rollout.law import REGULARIZATION, STILL, Instant, RolloutProblem, State, Step, compliance_of
 from forcegp.rollout.trajectory import Divergence, Rollout
 from forcegp.types import ActiveContacts, JointVector
 
@@ -34,11 +34,6 @@ MAX_ITERATIONS = 30
 """Newton doubles the digits in each iteration; a state off by a centimetre needs four."""
 MAX_STEP = 0.2
 """Largest move of a joint in one iteration [rad, m]; light wrist joints are asked for more than they give."""
-
-
-def project_velocity(eom: Equations, qd: JointVector) -> JointVector:
-    """T q̇ = q̇ − L A q̇, the velocity after an inelastic impact on the active constraints, `(*batch, nq)`."""
-    return qd - (eom.L @ (eom.A @ qd[..., None]))[..., 0]
 
 
 def project_state(
@@ -270,10 +265,8 @@ def _braked(problem: RolloutProblem, state: State, held: Tensor) -> State:
     It changes the speed of the others too. Without that, stopping a joint alone can add kinetic energy.
     """
     G = problem.system.equations(state.q, state.qd, state.active).H
-    own = G.diagonal(dim1=-2, dim2=-1)
-    compliance = own.clamp(min=1e-3 * own.amax(-1, keepdim=True))
     eye = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device)
-    sticks = torch.where(held[..., None], G + torch.diag_embed(REGULARIZATION * compliance), eye)
+    sticks = torch.where(held[..., None], G + torch.diag_embed(REGULARIZATION * compliance_of(G)), eye)
     impulse = torch.linalg.solve(sticks, torch.where(held, -state.qd, 0.0)[..., None])
     return state._replace(qd=state.qd + (G @ impulse)[..., 0])
 

@@ -110,6 +110,12 @@ def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tens
     return both[..., 0], both[..., 1:]
 
 
+def compliance_of(G: Tensor) -> Tensor:
+    """Acceleration of each joint per force of its own, G_ii `(n, nq)`, at least 1/1000 of the largest."""
+    diagonal = G.diagonal(dim1=-2, dim2=-1)
+    return diagonal.clamp(min=1e-3 * diagonal.amax(-1, keepdim=True))
+
+
 def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Tensor) -> Stuck:
     """The dry friction of joints over a step.
 
@@ -131,8 +137,7 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
     """
     stopping = -torch.where(qd.abs() > STILL, qd, 0.0) / h.clamp(min=INSTANT)
     free = qdd - stopping
-    own = G.diagonal(dim1=-2, dim2=-1)
-    compliance = own.clamp(min=1e-3 * own.amax(-1, keepdim=True))
+    compliance = compliance_of(G)
     G = G + torch.diag_embed(REGULARIZATION * compliance)
     slack_force = CONTRADICTION * (limit + (free / compliance).abs())
     slack_motion = CONTRADICTION * (free.abs() + compliance * limit)
@@ -145,8 +150,8 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
     for _ in range(MAX_EXCHANGES):
         sticks = (direction == 0.0)[..., None]
         system = torch.where(sticks, G, eye)
-        known = torch.where(sticks[..., 0], -free, -direction * limit)
-        force = torch.linalg.solve(system, known[..., None])[..., 0]
+        rhs = torch.where(sticks[..., 0], -free, -direction * limit)
+        force = torch.linalg.solve(system, rhs[..., None])[..., 0]
         motion = free + (G @ force[..., None])[..., 0]
         over = torch.where(sticks[..., 0] & (force.abs() > limit + slack_force), -force.sign(), 0.0)
         back = (direction * motion < -slack_motion) & ~sticks[..., 0]
@@ -168,7 +173,7 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
 
 
 @runtime_checkable
-class Predicted(Protocol):
+class PredictedQuantity(Protocol):
     """A predicted quantity."""
 
     @property
@@ -223,7 +228,7 @@ class ForwardModel(Protocol):
         *,
         active: Tensor | None = None,
         covariance: bool = True,
-    ) -> Predicted:
+    ) -> PredictedQuantity:
         """Predict a quantity at states `(*batch, nq)`."""
         ...
 
@@ -267,8 +272,9 @@ class ForceLaw(Law):
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
         force = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
         mean, priors = (force.mean, force.priors) if isinstance(force, ForcePosterior) else (force, ())
-        known = isinstance(mean, AnalyticalMean) and "friction" in mean.terms
-        declared = known and bool(((system.robot.friction != 0.0) | (system.robot.stribeck != 0.0)).any())
+        robot = system.robot
+        in_mean = isinstance(mean, AnalyticalMean) and "friction" in mean.terms
+        declared = in_mean and bool(((robot.friction != 0.0) | (robot.stribeck != 0.0)).any())
         if not declared and not any(prior.sticks for prior in priors):
             return None
         return lambda at: split(system, at, self.force)
@@ -296,13 +302,16 @@ def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
     Raises:
         ModelError: a model of accelerations alone is asked for the motion of another system.
     """
-    own, force = model.system, model.force_field()
+    trained, force = model.system, model.force_field()
     if force is not None:
         return ForceLaw(force)
-    if system is not None and (system.robot is not own.robot or [*system.contacts] != [*own.contacts]):
+    if system is not None and (
+        system.robot is not trained.robot or [*system.contacts] != [*trained.contacts]
+    ):
         raise ModelError(
             f"this model ({model.kind}) predicts accelerations of the system that it was fitted on only",
-            expected=f"robot {own.robot.name!r} with contacts {', '.join(own.contact_names) or '(none)'}",
+            expected=f"robot {trained.robot.name!r} with contacts "
+            f"{', '.join(trained.contact_names) or '(none)'}",
             got=f"another system: robot {system.robot.name!r} with contacts "
             f"{', '.join(system.contact_names) or '(none)'}",
             hint="leave `system` out, or use a model of forces such as StructuredGP",

@@ -106,5 +106,5 @@ def _logged(path: Trajectories, log: Dataset, quantity: str) -> Tensor | None:
     if quantity in JOINT_QUANTITIES:
         return getattr(log.select(path.system.robot.joint_names), quantity)[: len(path.t)]
     columns = [log.contact_extras.get(quantity, {}).get(name) for name in path.system.contact_names]
-    known = [column[: len(path.t), None] for column in columns if column is not None]
-    return torch.cat(known, dim=-1) if len(known) == len(_row_names(path.system)) > 0 else None
+    present = [column[: len(path.t), None] for column in columns if column is not None]
+    return torch.cat(present, dim=-1) if len(present) == len(_row_names(path.system)) > 0 else None

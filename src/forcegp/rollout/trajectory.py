@@ -197,9 +197,6 @@ class Rollout:
     def __getitem__(self, index: object) -> Rollout:
         """The trajectories of some members of the batch; events keep their row of the whole batch."""
         chosen = {name: getattr(self, name)[index] for name in FIELDS}
-        samples = None if self.samples is None else self.samples[(slice(None), *_as_tuple(index))]
+        places = index if isinstance(index, tuple) else (index,)
+        samples = None if self.samples is None else self.samples[(slice(None), *places)]
         return dataclasses.replace(self, **chosen, samples=samples)
-
-
-def _as_tuple(index: object) -> tuple:
-    return index if isinstance(index, tuple) else (index,)

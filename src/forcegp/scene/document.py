@@ -59,8 +59,8 @@ class Document:
         try:
             self.data: dict[str, Any] = tomllib.loads(text)
         except (ValueError, RecursionError) as cause:
-            found = re.search(r"line (\d+)", str(cause))
-            line = int(found[1]) if found else text.count("\n") + 1
+            match = re.search(r"line (\d+)", str(cause))
+            line = int(match[1]) if match else text.count("\n") + 1
             raise error(
                 f"{source}:{line}: not valid TOML", got=str(cause) or "brackets nested too deeply"
             ) from cause
@@ -82,7 +82,7 @@ class Document:
             raise self.error(f"{self.source}: nested too deeply") from error
         except ValidationError as error:
             # A misspelt key is also a missing one: the spelling is what has to be corrected.
-            errors = sorted(error.errors(), key=lambda found: found["type"] not in _UNKNOWN_KEY)
+            errors = sorted(error.errors(), key=lambda item: item["type"] not in _UNKNOWN_KEY)
             raise self._error(schema, errors[0]) from error
 
     def at(self, key: Key, make: Callable[..., T], *args: object, **options: object) -> T:
@@ -98,17 +98,17 @@ class Document:
 
     def place(self, key: Key) -> str:
         """`file:line: key` of a key, or of the nearest enclosing key that is in the file."""
-        known: Key = ()
+        prefix: Key = ()
         value: Any = self.data
         for part in key:
             members: Any = dict(enumerate(value)) if isinstance(value, list) else value
             if isinstance(members, dict) and part in members:
-                known, value = (*known, part), members[part]
+                prefix, value = (*prefix, part), members[part]
         line = next(
-            (self._lines[known[:n]] for n in range(len(known), 0, -1) if known[:n] in self._lines), None
+            (self._lines[prefix[:n]] for n in range(len(prefix), 0, -1) if prefix[:n] in self._lines), None
         )
         where = self.source if line is None else f"{self.source}:{line}"
-        return f"{where}: {dotted(known)}" if known else where
+        return f"{where}: {dotted(prefix)}" if prefix else where
 
     def _error(self, schema: type[BaseModel], error: ErrorDetails) -> ForceGPError:
         """The message of a validation error."""
@@ -119,9 +119,9 @@ class Document:
         if kind == "json_invalid":  # well-formed, as it was just written, but too deep for the validator
             return self.error(f"{self.source}: nested too deeply", got=context.get("error"))
         if kind in _UNKNOWN_KEY:
-            known = _known_keys(schema, key)
+            allowed = _allowed_keys(schema, key)
             return self.error(
-                f"{place}: unknown key", expected=_one_of(known), hint=did_you_mean(last, known)
+                f"{place}: unknown key", expected=_one_of(allowed), hint=did_you_mean(last, allowed)
             )
         if kind == "missing" and isinstance(key[-1], int):
             return self.error(f"{place}: too few numbers", expected=f"more than {last}")
@@ -142,8 +142,8 @@ class Document:
         for part in key:
             members: Any = dict(enumerate(table)) if isinstance(table, list) else table
             table = members.get(part, table)
-        found = (name for name in table if re.search(rf"\b{re.escape(name)}\b", message))
-        name = next(found, None)
+        matches = (name for name in table if re.search(rf"\b{re.escape(name)}\b", message))
+        name = next(matches, None)
         return key if name is None else (*key, name)
 
 
@@ -170,7 +170,7 @@ def _one_of(names: list[str]) -> str:
     return f"one of {', '.join(names)}"
 
 
-def _known_keys(schema: type, key: Key) -> list[str]:
+def _allowed_keys(schema: type, key: Key) -> list[str]:
     """The keys of the table that contains a key."""
     return list(dict.fromkeys(name for table in _tables_at(schema, key[:-1]) for name in _hints(table)))
 
@@ -184,9 +184,9 @@ def _tables_at(schema: type, key: Key) -> list[type]:
     """The classes that may describe the table at a key."""
     tables = [schema]
     for part in key:
-        found = [_hints(table)[str(part)] for table in tables if str(part) in _hints(table)]
-        if found:
-            tables = [table for annotation in found for table in _tables_in(annotation)]
+        members = [_hints(table)[str(part)] for table in tables if str(part) in _hints(table)]
+        if members:
+            tables = [table for annotation in members for table in _tables_in(annotation)]
         elif isinstance(part, str):  # the tag of a union, such as the type of a surface
             tables = [table for table in tables if part in get_args(_hints(table).get("type"))]
     return tables
@@ -221,18 +221,18 @@ def _lines_of_keys(text: str) -> dict[Key, int]:
     counts: dict[Key, int] = {}
     table: Key = ()
     for number, line in enumerate(text.splitlines(), start=1):
-        if found := _ARRAY.match(line):
-            name = _split(found[1])
+        if match := _ARRAY.match(line):
+            name = _split(match[1])
             counts[name] = counts.get(name, -1) + 1
             table = (*name, counts[name])
             lines.setdefault(name, number)
-        elif found := _TABLE.match(line):
-            name = _split(found[1])
+        elif match := _TABLE.match(line):
+            name = _split(match[1])
             # A table below an array of tables belongs to the latest of them.
             outer = next((name[:n] for n in range(len(name), 0, -1) if name[:n] in counts), None)
             table = (*outer, counts[outer], *name[len(outer) :]) if outer else name
-        elif found := _KEY.match(line):
-            lines.setdefault((*table, *_split(found[1])), number)
+        elif match := _KEY.match(line):
+            lines.setdefault((*table, *_split(match[1])), number)
             continue
         else:
             continue

@@ -92,7 +92,7 @@ class ModelSection(Section):
     inducing_points: PositiveInt = 100
     standardize: bool = True
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
-    priors: tuple[dict[str, Any], ...] = ()
+    priors: str | tuple[dict[str, Any], ...] = ()
     analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = {}
     hidden: tuple[PositiveInt, ...] = ()
     window: WindowSection = WindowSection()

@@ -118,14 +118,14 @@ class Mechanics:
         M, Q_C, Q_G, *points = self._blocks(q, qd)
         frames = [points[i : i + POINT] for i in range(0, len(points), POINT)]
         moving = [_moving_point(p, J, bias, qd) for _, p, J, bias in frames]
-        found = [
+        terms = [
             contact.terms_of([moving[k] for k in places])
             for contact, places in zip(self.contacts, self._places, strict=True)
         ]
         nq = len(q)
-        c = np.concatenate([np.zeros(0), *(x.c.numpy() for x in found)])
-        A = np.concatenate([np.zeros((0, nq)), *(x.A.numpy() for x in found)])
-        b = np.concatenate([np.zeros(0), *(x.b.numpy() for x in found)])
+        c = np.concatenate([np.zeros(0), *(x.c.numpy() for x in terms)])
+        A = np.concatenate([np.zeros((0, nq)), *(x.A.numpy() for x in terms)])
+        b = np.concatenate([np.zeros(0), *(x.b.numpy() for x in terms)])
         cd = A @ qd
         if self._system.baumgarte is not None:
             b = self._system.baumgarte.stabilized(*(torch.from_numpy(x) for x in (b, c, cd))).numpy()
@@ -141,7 +141,7 @@ class Mechanics:
             Q_C=Q_C,
             Q_D=Q_D,
             Q_K=Q_C + Q_G + Q_D,
-            contact_points=_contact_points(self.contacts, found),
+            contact_points=_contact_points(self.contacts, terms),
             tool=ToolMotion(rotation, position, jacobian @ qd, jacobian, bias),
         )
 
@@ -151,8 +151,8 @@ def _moving_point(position: Vector, jacobian: Vector, bias: Vector, qd: Vector) 
     return MovingPoint.of(*(torch.from_numpy(x) for x in (position, jacobian, bias, qd)))
 
 
-def _contact_points(contacts: Sequence[Constraint], found: Sequence) -> dict[str, TouchingPoint]:
-    named = ((contact.name, terms.point) for contact, terms in zip(contacts, found, strict=True))
+def _contact_points(contacts: Sequence[Constraint], constraint_terms: Sequence) -> dict[str, TouchingPoint]:
+    named = ((contact.name, terms.point) for contact, terms in zip(contacts, constraint_terms, strict=True))
     return {
         name: TouchingPoint(*(x.numpy() for x in (at.position, at.velocity, at.jacobian, at.normal)))
         for name, at in named

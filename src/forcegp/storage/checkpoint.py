@@ -96,9 +96,9 @@ class Checkpoint:
         Raises:
             DestinationError: the place cannot be written.
         """
-        own = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
+        copies = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
         with atomic_file(self.path) as temporary:
-            temporary.write_bytes(safetensors.torch.save(own, {"key": self.key}))
+            temporary.write_bytes(safetensors.torch.save(copies, {"key": self.key}))
         self._written = time.monotonic()
 
 
@@ -133,18 +133,18 @@ class Evaluations:
         """
         size = sum(value.numel() for value in start.values())
         rows = torch.zeros(0, size, dtype=torch.float64)
-        found = self.checkpoint.read(dict(zip(NAMES, (rows, rows[:, 0], rows), strict=True)), NAMES)
-        if not found:
+        record = self.checkpoint.read(dict(zip(NAMES, (rows, rows[:, 0], rows), strict=True)), NAMES)
+        if not record:
             return 0
-        lengths = {len(value) for value in found.values()}
-        if len(lengths) > 1 or not bool((found["positions"].abs() <= CHECKPOINT_VALUE).all()):
+        lengths = {len(value) for value in record.values()}
+        if len(lengths) > 1 or not bool((record["positions"].abs() <= CHECKPOINT_VALUE).all()):
             raise ModelError(
                 f"{self.checkpoint.path}: the checkpoint is damaged: 'positions' that no fit reaches, or of "
                 "another length than the objectives",
                 expected=f"finite numbers up to ±{CHECKPOINT_VALUE:g}",
                 hint="remove the checkpoint to start anew",
             )
-        self._record = list(zip(*(found[name] for name in NAMES), strict=True))
+        self._record = list(zip(*(record[name] for name in NAMES), strict=True))
         self._next = 0
         return lengths.pop()
 
@@ -164,8 +164,8 @@ class Evaluations:
                     self.checkpoint.write_now_and_then(self._tensors)
             self._next += 1
             like = tensors[names[0]]
-            given = value.to(like), gradient.to(like)
-            return _Given.apply(*given, *(tensors[name] for name in names))  # pyright: ignore[reportReturnType]
+            pair = value.to(like), gradient.to(like)
+            return _StoredGradient.apply(*pair, *(tensors[name] for name in names))  # pyright: ignore[reportReturnType]
 
         return again
 
@@ -209,7 +209,7 @@ def _evaluated(
     return value.detach().to("cpu", torch.float64), _flat(whole)
 
 
-class _Given(torch.autograd.Function):
+class _StoredGradient(torch.autograd.Function):
     """A value whose gradient is known."""
 
     @staticmethod

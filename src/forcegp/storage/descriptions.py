@@ -30,8 +30,8 @@ def encode(value: Any, classes: Classes) -> Any:
     """
     names = {kind: name for name, kind in classes.items()}
     if type(value) in names:
-        own = {field.name: encode(getattr(value, field.name), classes) for field in _written(value)}
-        return {"type": names[type(value)], **own}
+        members = {field.name: encode(getattr(value, field.name), classes) for field in _written(value)}
+        return {"type": names[type(value)], **members}
     if isinstance(value, tuple | list):
         return [encode(part, classes) for part in value]
     if value is None or isinstance(value, str | int | float | bool):
@@ -68,14 +68,14 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bo
         raise UnknownNameError(f"type in {place}", name, classes)
     kind = classes[name]
     assert is_dataclass(kind)
-    given = {key: value for key, value in json.items() if key != "type"}
-    _check_fields(kind, name, given, place, whole)
+    members = {key: value for key, value in json.items() if key != "type"}
+    _check_fields(kind, name, members, place, whole)
     hints = get_type_hints(kind)
     values = {
         key: _checked(
             decode(value, classes, f"{place}.{key}", depth + 1, whole=whole), hints[key], f"{place}.{key}"
         )
-        for key, value in given.items()
+        for key, value in members.items()
     }
     try:
         return kind(**values)
@@ -88,19 +88,19 @@ def _written(kind: Any) -> list[Field[Any]]:
     return [field for field in fields(kind) if field.init]
 
 
-def _check_fields(kind: type, name: str, given: Mapping[str, Any], place: str, whole: bool) -> None:
+def _check_fields(kind: type, name: str, members: Mapping[str, Any], place: str, whole: bool) -> None:
     """Raise `ModelError` where a field is unknown or missing."""
     assert is_dataclass(kind)
-    known = {field.name for field in _written(kind)}
+    names = {field.name for field in _written(kind)}
     without = {f.name for f in _written(kind) if f.default is MISSING and f.default_factory is MISSING}
-    needed = known if whole else without
-    if needed <= set(given) <= known:
+    needed = names if whole else without
+    if needed <= set(members) <= names:
         return
-    near = [other for key in given if key not in known for other in near_names(key, known)]
+    near = [other for key in members if key not in names for other in near_names(key, names)]
     raise ModelError(
         f"{place}: wrong fields of {name!r}",
-        expected=sorted(known),
-        got=sorted(given),
+        expected=sorted(names),
+        got=sorted(members),
         hint=f"did you mean {near[0]!r}?" if near else None,
     )
 

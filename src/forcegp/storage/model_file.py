@@ -122,9 +122,9 @@ def model_bytes(
         tensors: of the model, by names that do not begin with `system.`.
     """
     record, robot = pack_system(system)
-    own = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
+    copies = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
     header = ModelHeader(kind=kind, settings=settings.model_dump(mode="json"), system=record)
-    data = safetensors.torch.save(own | robot, {HEADER: f"{NO_HASH}\n{header.to_json()}"})
+    data = safetensors.torch.save(copies | robot, {HEADER: f"{NO_HASH}\n{header.to_json()}"})
     return data.replace(_entry(NO_HASH), _entry(hashlib.sha256(data).hexdigest()), 1)
 
 
@@ -191,14 +191,14 @@ def _metadata(data: bytes, source: str) -> str:
     try:
         if not 0 < size <= min(len(data) - 8, HEADER_BYTES):
             raise ValueError(f"header of {size} bytes in a file of {len(data)}")
-        found = json.loads(data[8 : 8 + size])["__metadata__"][HEADER]
-        if not isinstance(found, str):
+        text = json.loads(data[8 : 8 + size])["__metadata__"][HEADER]
+        if not isinstance(text, str):
             raise ValueError("the metadata are not text")
     except (ValueError, KeyError, TypeError, RecursionError) as cause:
         raise ModelError(
             f"{source}: not a model of forcegp, or damaged", expected="a safetensors file", got=str(cause)
         ) from cause
-    return found
+    return text
 
 
 def _digest(data: bytes, stated: str) -> str:
@@ -243,7 +243,7 @@ def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:
     check_destination(model_path(path), needed_bytes=needed_bytes)
 
 
-def own_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def model_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The tensors of the model itself, without its system's."""
     return {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}
 

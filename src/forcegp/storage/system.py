@@ -171,7 +171,7 @@ def unpack_system(
     json: Mapping[str, Any],
     tensors: Mapping[str, Tensor],
     source: str,
-    given: ConstrainedSystem | None = None,
+    fallback: ConstrainedSystem | None = None,
 ) -> ConstrainedSystem:
     """The system that `pack_system` wrote.
 
@@ -179,7 +179,7 @@ def unpack_system(
         json: the JSON object.
         tensors: at least the tensors named `system.<field>`.
         source: name of the file, for messages.
-        given: system that provides the constraints that cannot be saved.
+        fallback: system that provides the constraints that cannot be saved.
 
     Raises:
         ModelError: a field or tensor is missing or not valid, or a constraint that was not saved is needed.
@@ -199,7 +199,7 @@ def unpack_system(
     try:
         return ConstrainedSystem(
             robot,
-            tuple(_contact(contact, source, given) for contact in record.contacts),
+            tuple(_contact(contact, source, fallback) for contact in record.contacts),
             None if rule is None else Baumgarte(rule.natural_frequency, rule.damping_ratio),
         )
     except ForceGPError as cause:
@@ -209,16 +209,16 @@ def unpack_system(
 def _contact(
     record: SurfaceContactRecord | PointConnectionRecord | UnsavedRecord,
     source: str,
-    given: ConstrainedSystem | None,
+    fallback: ConstrainedSystem | None,
 ) -> Constraint:
     if not isinstance(record, UnsavedRecord):
         return record.build()
-    if given is None:
+    if fallback is None:
         raise ModelError(
             f"contact {record.name!r} is a {record.described_by} defined in Python, which is not saved",
             hint="pass the system that the model was made with: load_model(path, system=…)",
         )
-    return given.contact(record.name)
+    return fallback.contact(record.name)
 
 
 def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> RobotModel:
@@ -234,13 +234,13 @@ def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> R
     _check_parents(record, source)
     axis = tensors.get(PREFIX + "axis")
     dtype = axis.dtype if axis is not None and axis.is_floating_point() else torch.float64
-    own = {}
+    arrays = {}
     for field in dataclasses.fields(RobotModel):
         if field.name not in type(record).model_fields:
             shape = tuple(sizes.get(str(n), n) for n in SHAPES.get(field.name, ("nq",)))
             finite = field.name not in MAY_BE_INFINITE
-            own[field.name] = take(tensors, PREFIX + field.name, shape, dtype, source, finite=finite)
-    return RobotModel(**{name: getattr(record, name) for name in type(record).model_fields}, **own)
+            arrays[field.name] = take(tensors, PREFIX + field.name, shape, dtype, source, finite=finite)
+    return RobotModel(**{name: getattr(record, name) for name in type(record).model_fields}, **arrays)
 
 
 def _check_parents(record: RobotRecord, source: str) -> None:

@@ -97,23 +97,23 @@ def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = N
     if not len(data):
         raise DataError("there is no motion to look at", expected="one row or more", got="none")
     rows = pictures(data.t)
-    shown = data[rows]
+    frames = data[rows]
     return Motion(
         system,
-        _array(shown.t - data.t[0]),
-        shown.q,
-        _forces(system, shown, model),
+        _array(frames.t - data.t[0]),
+        frames.q,
+        _forces(system, frames, model),
         [Path3D(LOGGED, tip_path(system, data.q))],
     )
 
 
 def with_rollout(motion: Motion, path: Rollout) -> Motion:
     """The motion with the paths of a rollout: the mean, and one of each function sample."""
-    found = [Path3D(MEAN, tip_path(motion.system, path.q.reshape(-1, path.q.shape[-1])))]
+    paths = [Path3D(MEAN, tip_path(motion.system, path.q.reshape(-1, path.q.shape[-1])))]
     if path.samples is not None:
         sampled = path.samples.q.reshape(-1, *path.samples.q.shape[-2:])
-        found += [Path3D(SAMPLE, tip_path(motion.system, q)) for q in sampled]
-    return Motion(motion.system, motion.t, motion.q, motion.forces, [*motion.paths, *found])
+        paths += [Path3D(SAMPLE, tip_path(motion.system, q)) for q in sampled]
+    return Motion(motion.system, motion.t, motion.q, motion.forces, [*motion.paths, *paths])
 
 
 def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float, seed: int = 0) -> Rollout:
@@ -161,15 +161,15 @@ def _forces(system: ConstrainedSystem, data: Dataset, model: Predictor | None) -
         eom = system.equations(data.q, data.qd, active)
     value = std = None
     if model is not None and model.force_field() is not None:
-        found = model.predict(data.q, data.qd, data.tau, "multiplier", active=active)
-        value, std = found.mean, found.std
-    forces, row = [], 0
+        prediction = model.predict(data.q, data.qd, data.tau, "multiplier", active=active)
+        value, std = prediction.mean, prediction.std
+    forces, row, logged = [], 0, data.contact_extras.get("multiplier", {})
     for i, contact in enumerate(system.contacts):
         point = eom.contact_points.get(contact.name)
-        own = data.contact_extras.get("multiplier", {}).get(contact.name) if value is None else value[:, row]
-        if point is not None and own is not None:
-            spread = torch.zeros_like(own) if std is None else std[:, row]
-            shown = torch.where(active[:, i], own, torch.nan)
+        multiplier = logged.get(contact.name) if value is None else value[:, row]
+        if point is not None and multiplier is not None:
+            spread = torch.zeros_like(multiplier) if std is None else std[:, row]
+            shown = torch.where(active[:, i], multiplier, torch.nan)
             parts = (point.position, point.normal, shown, spread)
             forces.append(Force(contact.name, *(_array(x) for x in parts)))
         row += contact.rows

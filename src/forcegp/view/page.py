@@ -129,8 +129,9 @@ class Stage:
 
     def _around(self, contact: str) -> Array:
         """Points that a surface is drawn around."""
-        own = [force.point for force in self.motion.forces if force.contact == contact]
-        points = np.concatenate(own or [path.points for path in self.motion.paths] or [np.zeros((0, 3))])
+        positions = [force.point for force in self.motion.forces if force.contact == contact]
+        paths = [path.points for path in self.motion.paths]
+        points = np.concatenate(positions or paths or [np.zeros((0, 3))])
         return points if len(points) else self._position[:, -1]
 
     def _add_surface(self, name: str, surface: Surface, points: Array) -> None:

@@ -56,16 +56,16 @@ def shapes_of(robot: RobotModel, source: str | Path | None = None) -> list[Shape
     Raises:
         RobotFileError: the shapes of the file are not valid.
     """
-    own = str(source) if source is not None else robot.name
-    if own in BUNDLED:
-        path = Path(str(files("forcegp.robot") / "bundled" / f"{own}.urdf"))
+    name = str(source) if source is not None else robot.name
+    if name in BUNDLED:
+        path = Path(str(files("forcegp.robot") / "bundled" / f"{name}.urdf"))
     elif source is None:
         return rods(robot)
     else:
         path = Path(source)
     root = parse_xml(read_bytes(path), str(path))
-    found = _visuals(root, path, robot) if root.tag == "robot" else []
-    return found or rods(robot)
+    shapes = _visuals(root, path, robot) if root.tag == "robot" else []
+    return shapes or rods(robot)
 
 
 def rods(robot: RobotModel) -> list[Shape]:
@@ -73,9 +73,9 @@ def rods(robot: RobotModel) -> list[Shape]:
     place, at = robot.placement_position.detach().cpu().numpy(), robot.frame_position.detach().cpu().numpy()
     ends = list(zip(robot.parents, place, strict=True))
     for link in range(robot.nq):
-        own = [at[i] for i, parent in enumerate(robot.frame_parents) if parent == link]
-        if link not in robot.parents and own:
-            ends.append((link, max(own, key=lambda x: float(np.linalg.norm(x)))))
+        frames = [at[i] for i, parent in enumerate(robot.frame_parents) if parent == link]
+        if link not in robot.parents and frames:
+            ends.append((link, max(frames, key=lambda x: float(np.linalg.norm(x)))))
     radius = 0.02 * sum(float(np.linalg.norm(end)) for _, end in ends)
     parts = [Shape(i, "sphere", (1.4 * radius,), np.eye(3), np.zeros(3)) for i in range(robot.nq)]
     for link, end in ends:

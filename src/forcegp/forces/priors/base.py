@@ -92,7 +92,7 @@ class ForcePrior(ABC):
         """Raise a typed error where the prior does not fit the system."""
 
 
-def check_inputs(name: str, inputs: tuple[str, ...], known: tuple[str, ...]) -> None:
+def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> None:
     """Check what a force depends on.
 
     Raises:
@@ -101,9 +101,9 @@ def check_inputs(name: str, inputs: tuple[str, ...], known: tuple[str, ...]) -> 
     """
     if not inputs:
         raise ModelError(f"force prior {name!r} depends on nothing", expected="one input at least")
-    for given in inputs:
-        if given not in known:
-            raise UnknownNameError(f"input of force prior {name!r}", given, known)
+    for symbol in inputs:
+        if symbol not in valid:
+            raise UnknownNameError(f"input of force prior {name!r}", symbol, valid)
 
 
 def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> None:
@@ -141,7 +141,7 @@ def prior_rows(
     at: States,
     z: AffineMap,
 ) -> Block:
-    """What priors say of a quantity z = B_Q Q + B_z Q_z + o at states.
+    """A quantity z = B_Q Q + B_z Q_z + o at states as rows of the force priors.
 
     Args:
         priors, scales: the force priors and the standardization of their inputs.
@@ -153,10 +153,12 @@ def prior_rows(
     Returns:
         Kernel inputs and operators B(x) E(x) of each prior, with o(x) + B(x) m(x) as target.
     """
+    # E[z] = o + B_Q m (eq. 15)
     target = z.o + vecdot(z.B_Q, mean(system, at)[..., None, :])
     by_target = {CONTACT: z.B_z, CONSTRAINT: z.B_N}
     features, operators = [], []
     for prior in priors:
+        # W = B E (eq. 12), with E the identity for a prior per joint
         features.append(prior.features(system, at))
         B = by_target.get(prior.target, z.B_Q)
         if B is None:

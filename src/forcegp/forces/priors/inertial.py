@@ -129,12 +129,13 @@ class InertialPrior(ForcePrior):
         scale = self.scale(robot).unflatten(0, (robot.nq, PER_LINK))
         inverse = torch.linalg.inv(J0[sound])
 
-        def delta_of(x: Tensor) -> Tensor:
-            bodies = from_pseudo_inertia(from_log_cholesky(x))
-            delta = torch.zeros_like(pi0).index_put((sound.nonzero()[:, 0],), inertial_parameters(*bodies))
-            return torch.where(sound[:, None], (delta - pi0) / scale, 0.0).flatten()
-
         rows = (sound.nonzero()[:, 0],)
+
+        def delta_of(x: Tensor) -> Tensor:
+            # δ = (π − π₀)/s
+            bodies = from_pseudo_inertia(from_log_cholesky(x))
+            pi = torch.zeros_like(pi0).index_put(rows, inertial_parameters(*bodies))
+            return torch.where(sound[:, None], (pi - pi0) / scale, 0.0).flatten()
 
         def robot_of(x: Tensor) -> RobotModel:
             mass, com, inertia = from_pseudo_inertia(from_log_cholesky(x))
@@ -145,19 +146,20 @@ class InertialPrior(ForcePrior):
             )
 
         def objective(tensors: dict[str, Tensor]) -> Tensor:
+            # ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J| + const] − V(δ)
             x = tensors["x"]
-            apart = delta_of(x) - mean
+            error = delta_of(x) - mean
             ratio = inverse @ from_log_cholesky(x)
             log_det = 8.0 * x[:, 0] + 2.0 * x[:, 1:4].sum(-1)
             divergence = ratio.diagonal(dim1=-2, dim2=-1).sum(-1) - log_det
-            fit = 0.5 * apart @ (precision @ apart) + DIVERGENCE * divergence.sum()
+            fit = 0.5 * error @ (precision @ error) + DIVERGENCE * divergence.sum()
             return fit - log_volume(robot_of(x))
 
         if not bool(sound.any()):
             return robot, torch.zeros_like(mean)
         with torch.enable_grad():
-            found = minimise(objective, {"x": log_cholesky(J0[sound])}, CONSISTENT).tensors["x"]
-        return robot_of(found), delta_of(found).detach()
+            theta = minimise(objective, {"x": log_cholesky(J0[sound])}, CONSISTENT).tensors["x"]
+        return robot_of(theta), delta_of(theta).detach()
 
 
 DIVERGENCE = 0.01

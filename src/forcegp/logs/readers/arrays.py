@@ -111,15 +111,21 @@ def _read_hdf5(path: Path, format_: str, separator: str) -> LogTable:
     remarks: list[str] = []
     arrays: Arrays = {}
     with foreign(str(path), "HDF5"), h5py.File(path, "r") as file:
-        seen: set[Any] = {h5py.h5o.get_info(file.id).addr}
-        _walk(h5py, file, "", separator, arrays, remarks, seen)
+        addresses: set[Any] = {h5py.h5o.get_info(file.id).addr}
+        _walk(h5py, file, "", separator, arrays, remarks, addresses)
     if format_ == "matlab":
         arrays = {name: array.T for name, array in arrays.items()}
     return LogTable(str(path), format_, arrays_to_streams(str(path), arrays, remarks), tuple(remarks))
 
 
 def _walk(
-    h5py: Any, group: Any, prefix: str, separator: str, arrays: Arrays, remarks: list[str], seen: set[Any]
+    h5py: Any,
+    group: Any,
+    prefix: str,
+    separator: str,
+    arrays: Arrays,
+    remarks: list[str],
+    addresses: set[Any],
 ) -> None:
     """Collect the data sets below a group, each once, though links may lead to it several times."""
     if prefix.count(separator) > limits.GROUP_DEPTH:
@@ -133,12 +139,12 @@ def _walk(
             continue
         item = group[key]
         mark = h5py.h5o.get_info(item.id).addr
-        if mark in seen:
+        if mark in addresses:
             continue
-        seen.add(mark)
-        check_count(group.file.filename, "objects", len(seen), limits.COLUMNS)
+        addresses.add(mark)
+        check_count(group.file.filename, "objects", len(addresses), limits.COLUMNS)
         if isinstance(item, h5py.Group):
-            _walk(h5py, item, f"{name}{separator}", separator, arrays, remarks, seen)
+            _walk(h5py, item, f"{name}{separator}", separator, arrays, remarks, addresses)
         elif isinstance(item, h5py.Dataset):
             _take(item, name, arrays, remarks)
 

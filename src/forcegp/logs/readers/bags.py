@@ -249,10 +249,10 @@ def _check_metadata(path: Path) -> None:
     file = path / "metadata.yaml"
     check_count(str(file), "bytes", file.stat().st_size, 8 << 20)
     text = file.read_text(encoding="utf-8", errors="replace")
-    found = re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE)
-    if found:
+    compression = re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE)
+    if compression:
         raise DataError(
-            f"{path}: the bag is compressed by {found[1].lower()}",
+            f"{path}: the bag is compressed by {compression[1].lower()}",
             expected="a bag without compression, or MCAP with compressed chunks",
             hint="unpack it with `ros2 bag convert`",
         )
@@ -284,8 +284,8 @@ def read_mcap(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
                 kind = canonical(schema.name) if schema is not None else ""
                 topics[channel.topic] = kind or channel.message_encoding
                 check_count(str(path), "topics", len(decoders), limits.LOG_STREAMS)
-                known = kind in KINDS and channel.message_encoding in ("cdr", "ros1")
-                decoders[channel.id] = decoder(kind, channel.message_encoding) if known else None
+                readable = kind in KINDS and channel.message_encoding in ("cdr", "ros1")
+                decoders[channel.id] = decoder(kind, channel.message_encoding) if readable else None
             decode = decoders[channel.id]
             if decode is not None:
                 collector.add(channel.topic, topics[channel.topic], message.log_time, message.data, decode)

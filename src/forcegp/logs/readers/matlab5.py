@@ -97,10 +97,10 @@ class _Reader:
             at = end if kind == COMPRESSED else end + -end % 8
 
     def next(self, elements: Iterator[_Element]) -> _Element:
-        found = next(elements, None)
-        if found is None:
+        element = next(elements, None)
+        if element is None:
             raise self.damaged("a further element", "the end of the variable")
-        return found
+        return element
 
     def matrix(self, body: memoryview, depth: int) -> Variable:
         """A variable, or a field of a struct."""
@@ -133,14 +133,14 @@ class _Reader:
         length = int(lengths[0]) if len(lengths) else 0
         if length <= 0 or len(names) % length or len(names) // length > limits.COLUMNS:
             raise self.damaged("the names of a struct's fields", f"{len(names)} bytes in steps of {length}")
-        found = []
+        variables = []
         for start in range(0, len(names), length):
             element = self.next(parts)
             if element.kind != MATRIX:
                 raise self.damaged("a field of a struct", f"an element of type {element.kind}")
             field = names[start : start + length].split(b"\0")[0].decode("utf-8", "replace")
-            found.append(Variable(field, self.matrix(element.body, depth + 1).value))
-        return tuple(found)
+            variables.append(Variable(field, self.matrix(element.body, depth + 1).value))
+        return tuple(variables)
 
     def array(self, element: _Element, shape: tuple[int, ...]) -> NDArray[np.generic]:
         values = self.numbers(element)

@@ -113,10 +113,10 @@ def _readable(file: object, wanted: Wanted, remarks: list[str]) -> list[str]:
         if kinds.is_list(kind) or kinds.is_fixed_size_list(kind) or kinds.is_large_list(kind):
             kind, listed = kind.value_type, True
         numeric = kinds.is_floating(kind) or kinds.is_integer(kind) or kinds.is_boolean(kind)
-        asked = wanted(field.name) or (listed and any(wanted(f"{field.name}[{i}]") for i in range(64)))
-        if asked and (numeric or (kinds.is_timestamp(kind) and not listed)):
+        selected = wanted(field.name) or (listed and any(wanted(f"{field.name}[{i}]") for i in range(64)))
+        if selected and (numeric or (kinds.is_timestamp(kind) and not listed)):
             names.append(field.name)
-        elif asked:
+        elif selected:
             remark = f"column {field.name!r} of type {field.type} was left out"
             remarks += [remark] if remark not in remarks else []
     return names

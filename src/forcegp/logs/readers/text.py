@@ -85,8 +85,8 @@ def sniff(path: Path) -> Dialect:
         lines = lines[:-1]
     if not any(line.strip() for line in lines):
         raise DataError(f"{path}: the file is empty" if not head else f"{path}: a line is too long")
-    found = max((_try(lines, s, d) for s in SEPARATORS for d in ".," if s != d), key=lambda item: item[0])
-    score, separator, decimal, first = found
+    best = max((_try(lines, s, d) for s in SEPARATORS for d in ".," if s != d), key=lambda item: item[0])
+    score, separator, decimal, first = best
     if score <= 0:
         raise DataError(
             f"{path}: no table of numbers was found",
@@ -143,8 +143,8 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, st
 
 
 def _is_value(field: str, decimal: str) -> bool:
-    known = bool(_DATE.match(field)) or field.lower() in ("true", "false")
-    return field != "" and (known or is_number(field, decimal))
+    special = bool(_DATE.match(field)) or field.lower() in ("true", "false")
+    return field != "" and (special or is_number(field, decimal))
 
 
 def _numeric(fields: list[str], decimal: str) -> bool:

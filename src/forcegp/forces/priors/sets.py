@@ -1,8 +1,12 @@
-"""The force priors that models have unless they are given others."""
+"""Named sets of force priors: those that the data choose between, and those of the paper."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.errors import UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, JointFrictionPrior, mean_of
@@ -17,6 +21,9 @@ WHOLE = Linear(("tau",)) + ANGLES + RATES * RATES * ANGLES + SquaredExponential(
 bias and damping, which there are quadratic and linear in the speed, and any friction of the joints."""
 REMAINING = RATES * ANGLES + SquaredExponential(shared=True)
 """Of a force without it: damping that depends on the configuration, and anything else."""
+STATE_RESIDUAL = SquaredExponential(("q", "qd"), shared=True)
+"""Of a force that friction leaves. It does not read the motor torque: in closed loop, a residual that does
+learns to cancel it."""
 
 
 def default_priors(
@@ -47,10 +54,10 @@ def default_priors(
     return (joint, NormalForcePrior(joint), *sliding)
 
 
-def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """Priors for a robot that is measured: friction of each joint, and of each contact with a surface.
+def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
+    """Friction of each joint, and Coulomb friction of each contact with a surface.
 
-    None of them reads the motor torque. The torque noise that goes with them is learned.
+    None of the priors reads the motor torque.
 
     Args:
         system: robot and contacts.
@@ -58,11 +65,46 @@ def measured_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
     Example:
         >>> import torch, forcegp
         >>> system = forcegp.load_scene("kuka_plane").system()
-        >>> [type(prior).__name__ for prior in measured_priors(system)]
+        >>> [type(prior).__name__ for prior in friction_priors(system)]
         ['JointFrictionPrior', 'SlidingFrictionPrior']
     """
     sliding = (SlidingFrictionPrior(name, Linear(), coupled=True) for name in _surfaces(system))
     return (JointFrictionPrior(), *sliding)
+
+
+def friction_and_residual_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
+    """`friction_priors`, and any force of each joint that depends on (q, q̇).
+
+    Args:
+        system: robot and contacts.
+    """
+    residual = JointForcePrior(STATE_RESIDUAL, inputs=("q", "qd"))
+    normal = (NormalForcePrior(residual),) if system.m else ()
+    return (*friction_priors(system), residual, *normal)
+
+
+@dataclass(frozen=True)
+class PriorSet:
+    """Force priors around the analytical forces, by name.
+
+    Attributes:
+        name: of the set.
+        description: the forces that it models.
+        priors: the priors for a system.
+        has_joint_friction: whether the friction of the joints is modelled, and with it noise of the motor
+            torque; the inertia can only be identified then.
+        needs_surface: whether the set is for systems with a contact with a surface.
+    """
+
+    name: str
+    description: str
+    priors: Callable[[ConstrainedSystem], tuple[ForcePrior, ...]]
+    has_joint_friction: bool = True
+    needs_surface: bool = False
+
+    def fits(self, system: ConstrainedSystem) -> bool:
+        """Whether the set is for this system."""
+        return not self.needs_surface or bool(_surfaces(system))
 
 
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
@@ -90,3 +132,35 @@ def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> t
 def _surfaces(system: ConstrainedSystem) -> list[str]:
     """Names of the contacts with a surface."""
     return [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
+
+
+SETS: dict[str, PriorSet] = {
+    each.name: each
+    for each in (
+        PriorSet("sliding", "friction of contacts", contact_priors, False, needs_surface=True),
+        PriorSet("friction", "friction of joints and contacts, noise of the torque", friction_priors),
+        PriorSet(
+            "friction+residual", "the same, and any joint force of (q, q̇)", friction_and_residual_priors
+        ),
+    )
+}
+"""Sets around the analytical forces that the data choose between, simplest first."""
+FEW = SETS["friction"]
+"""The set for few samples."""
+
+
+def priors_of(
+    system: ConstrainedSystem, mean: AnalyticalMean, force_priors: str | Sequence[ForcePrior]
+) -> tuple[ForcePrior, ...]:
+    """Force priors as given, or those of a named set; those for few samples where the data are to choose.
+
+    Raises:
+        UnknownNameError: no such set.
+    """
+    if not isinstance(force_priors, str):
+        return tuple(force_priors)
+    if force_priors == "auto":
+        return FEW.priors(system) if "actuation" in mean.terms else default_priors(system, mean)
+    if force_priors not in SETS:
+        raise UnknownNameError("set of force priors", force_priors, ("auto", *SETS))
+    return SETS[force_priors].priors(system)
