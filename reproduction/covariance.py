@@ -78,7 +78,11 @@ def covariance_blocks(model: StructuredFit, data: Dataset, name: str) -> Covaria
     system, fitted = model.system, model.posterior
     at = states(system, data.q, data.qd, data.tau, data.active(system.contact_names))
     # A force along the constraint, which no acceleration shows, is left out of the plot.
-    pairs = [pair for pair in zip(fitted.priors, fitted.scales, strict=True) if pair[0].target != CONSTRAINT]
+    pairs = [
+        pair
+        for pair in zip(fitted.priors, fitted.process.scales, strict=True)
+        if pair[0].target != CONSTRAINT
+    ]
     priors = [prior for prior, _ in pairs]
     features = tuple(scale.apply(prior.features(system, at)) for prior, scale in pairs)
     E = tuple(prior.operator(system, at) for prior in priors)

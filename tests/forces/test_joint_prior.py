@@ -8,9 +8,10 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.priors.base import ForcePrior, check_priors, prior_rows
+from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.contact import NormalForcePrior
 from forcegp.forces.priors.joint import AnalyticalMean, DisturbancePrior, JointForcePrior, JointFrictionPrior
+from forcegp.forces.process import ForceProcess
 from forcegp.forces.quantities import QUANTITIES, States, affine_map, states
 from forcegp.gp.features import Standardization
 from forces.cases import draw, mixed_contacts, two_contacts
@@ -29,7 +30,7 @@ class Geared(JointForcePrior):
 def operators_of(prior: ForcePrior, quantity: str | list[str]) -> Tensor:
     scale = Standardization.none(prior.features(system, at))
     z = affine_map(system, at, quantity)
-    return prior_rows([prior], [scale], AnalyticalMean(), system, at, z).operators[0]
+    return ForceProcess((prior,), (scale,), AnalyticalMean()).rows(system, at, z).operators[0]
 
 
 @pytest.mark.parametrize("prior", [JointForcePrior(), JointFrictionPrior(), DisturbancePrior(), Geared()])

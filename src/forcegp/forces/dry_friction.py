@@ -71,7 +71,8 @@ def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFricti
     coulomb: Sequence[CoulombFriction] = ()
     if isinstance(force, ForcePosterior | ForceSamples):
         posterior = force if isinstance(force, ForcePosterior) else force.posterior
-        mean, unknown, priors, coulomb = posterior.mean, force, posterior.priors, posterior.coulomb
+        process, unknown = posterior.process, force
+        mean, priors, coulomb = process.mean, process.priors, process.coulomb
     sticking = [p for p, prior in enumerate(priors) if prior.sticks]
     others = [p for p, prior in enumerate(priors) if not prior.sticks]
 

@@ -363,7 +363,7 @@ def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tenso
     """Kernel inputs of every prior at the first sample; constants have the same value everywhere."""
     m = problem.training.measurements[0]
     at = m[torch.zeros(1, dtype=torch.int64, device=m.q.device)].at(problem.system)
-    return [posterior.features_of(p, problem.system, at) for p in range(len(problem.priors))]
+    return [posterior.process.features(p, problem.system, at) for p in range(len(problem.priors))]
 
 
 def latent_precision(

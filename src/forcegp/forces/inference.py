@@ -116,9 +116,7 @@ def posterior_of(
     # A = I + Σ V S Vᵀ, w ~ N(A⁻¹v, A⁻¹)
     latent = SparsePosterior.of(basis, total.sums)
     latent.require_resolved()
-    scales, coulomb = problem.training.scales, problem.coulomb(hyperparameters)
-    priors = problem.priors_at(hyperparameters)
-    return ForcePosterior(priors, scales, problem.mean, latent, problem.pins(), coulomb)
+    return ForcePosterior(problem.process_at(hyperparameters), latent)
 
 
 METHODS = ("auto", "exact", "sparse")
@@ -227,14 +225,11 @@ def forces_and_constant(
         basis = basis_of(problem, hyperparameters)
         total = total_over(problem, hyperparameters, basis, problem.training.pieces(PIECE_SAMPLES))
         return posterior_of(problem, hyperparameters, basis, total), total.constant
-    scales, params = problem.training.scales, kernel_parameters(hyperparameters)
-    rows = problem.rows(hyperparameters)
+    params, rows = kernel_parameters(hyperparameters), problem.rows(hyperparameters)
     require_exact_fits(rows.blocks, learning=False)
     # f | y ~ N(k Wᵀ Σ⁻¹ y, k − k Wᵀ Σ⁻¹ W k), Σ = W k Wᵀ + I (eqs. 22 to 24)
     latent = ExactPosterior.of(problem.priors, params, rows.blocks)
-    coulomb, priors = problem.coulomb(hyperparameters), problem.priors_at(hyperparameters)
-    posterior = ForcePosterior(priors, scales, problem.mean, latent, problem.pins(), coulomb)
-    return posterior, rows.constant
+    return ForcePosterior(problem.process_at(hyperparameters), latent), rows.constant
 
 
 def log_likelihood(posterior: ForcePosterior) -> float:

@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.measurements import Training
-from forcegp.forces.noise import TORQUE_NOISE, state_jacobian, stick_variance
-from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForcePrior
-from forcegp.forces.projection import ForceMean, ForceNoise, WhitenedRows, combine, whiten
+from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian, stick_variance
+from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
+from forcegp.forces.process import ForceProcess
+from forcegp.forces.projection import WhitenedRows, combine, whiten
 from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.kernels import sub
@@ -137,33 +138,35 @@ class Problem:
         G = state_jacobian(system, m) if slopes is None else slopes[measurement]
         return None if G is None else G * self.state_std
 
+    def process_at(self, tensors: Mapping[str, Tensor]) -> ForceProcess:
+        """The forces a priori, with what operators and Coulomb friction have learned."""
+        names = [prior.name for prior in self.priors]
+        pinned = {names.index(name): value for name, value in self.pinned.items()}
+        return ForceProcess(
+            self.priors_at(tensors), self.training.scales, self.mean, self.coulomb(tensors), pinned
+        )
+
+    def sample_noise(
+        self, tensors: Mapping[str, Tensor], system: ConstrainedSystem, measurement: int
+    ) -> SampleNoise:
+        """Noise of the samples of a measurement."""
+        weights = self.training.weights
+        return SampleNoise(
+            self.noise_at(tensors, measurement),
+            self.force_noise(tensors),
+            self.state_factor(system, measurement),
+            None if weights is None else weights[measurement],
+        )
+
     def rows(self, tensors: Mapping[str, Tensor]) -> WhitenedRows:
         """Whitened rows at the noise and analytical parameters among the tensors."""
-        system, force_noise = self.system_at(tensors), self.force_noise(tensors)
-        friction, priors = self.coulomb(tensors), self.priors_at(tensors)
+        system, process = self.system_at(tensors), self.process_at(tensors)
         return combine(
             [
-                whiten(
-                    system,
-                    priors,
-                    self.training.scales,
-                    self.mean,
-                    m,
-                    self.noise_at(tensors, i),
-                    force_noise,
-                    {name: -value for name, value in self.pinned.items()},
-                    friction,
-                    self.state_factor(system, i),
-                    None if self.training.weights is None else self.training.weights[i],
-                )
+                whiten(system, process, m, self.sample_noise(tensors, system, i))
                 for i, m in enumerate(self.training.measurements)
             ]
         ).tempered(self.power)
-
-    def pins(self) -> dict[int, Tensor]:
-        """The pinned values by number of the prior."""
-        names = [prior.name for prior in self.priors]
-        return {names.index(name): value for name, value in self.pinned.items()}
 
     @cached_property
     def fixed_rows(self) -> WhitenedRows:

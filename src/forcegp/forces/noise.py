@@ -35,7 +35,7 @@ from forcegp.forces.observations import NoiseStd
 from forcegp.forces.priors.base import NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
-from forcegp.forces.quantities import States, linearize_field
+from forcegp.forces.quantities import AffineMap, States, linearize_field
 from forcegp.robot.model import RobotModel
 
 
@@ -188,6 +188,44 @@ def unknown_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
     if GROWTH not in tensors:
         return variance
     return variance + (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
+
+
+ForceNoise = Callable[[States], Tensor]
+"""Variance of the white noise on the joint force at states, `(n, nq)`."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampleNoise:
+    """Noise of the samples of one measurement, a sum of independent terms: (diag σ² + Σ_k N_k N_kᵀ)/w.
+
+    Attributes:
+        std: σ of each component, `(d,)` or `(n, d)`.
+        force: Σ_τ, which reaches the values as the joint force does.
+        state: G Σ_x½ `(n, d, 2 nq)`, the factor of what noise of the state gives the values.
+        weight: w of each sample `(n,)`; `None` for one.
+    """
+
+    std: Tensor
+    force: ForceNoise | None = None
+    state: Tensor | None = None
+    weight: Tensor | None = None
+
+    def factors(self, at: States, z: AffineMap) -> list[Tensor]:
+        """The terms N_k `(n, d, ·)` beside σ, at the states of the samples, of the quantity measured."""
+        # N = (G Σ_x½, B_Q Σ_τ½)
+        terms = [] if self.state is None else [self.state]
+        return terms if self.force is None else [*terms, z.B_Q * self.force(at).sqrt()[:, None, :]]
+
+    def covariance(self, at: States, z: AffineMap) -> Tensor:
+        """Σ_y + B_Q Σ_τ B_Qᵀ + G Σ_x Gᵀ of each sample `(n, d, d)`, without its weight."""
+        white = torch.diag_embed(self.std.square().expand_as(z.o))
+        return sum((N @ N.mT for N in self.factors(at, z)), start=white)
+
+    def __getitem__(self, rows: Tensor) -> SampleNoise:
+        """The noise of some of the samples."""
+        std = self.std if self.std.ndim == 1 else self.std[rows]
+        state, weight = (None if x is None else x[rows] for x in (self.state, self.weight))
+        return SampleNoise(std, self.force, state, weight)
 
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]

@@ -5,19 +5,20 @@ Each force function drawn from the posterior is a deterministic force field that
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.forces.coulomb import CoulombFriction, coupled, with_coulomb
-from forcegp.forces.priors.base import CONTACT, ForceMean, ForcePrior, prior_rows
+from forcegp.forces.coulomb import with_coulomb
+from forcegp.forces.priors.base import CONTACT, ForcePrior
+from forcegp.forces.process import ForceProcess
 from forcegp.forces.quantities import AffineMap, States
 from forcegp.gp.exact import ExactPosterior
-from forcegp.gp.features import Features, Standardization
+from forcegp.gp.features import Features
 from forcegp.gp.pathwise import FunctionSamples
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.structured_covariance import Block
@@ -31,24 +32,21 @@ class ForcePosterior:
     """Latent forces conditioned on data; independent of the constraint under which it is read.
 
     Attributes:
-        priors, scales: the force priors and the standardization of their inputs.
-        mean: prior mean of Q.
+        process: the forces before the data.
         latent: the conditioned processes.
-        pinned: by number of the prior, value `(components,)` of a constant latent force that the robot
-            contains: it has mean zero, and only its uncertainty remains.
-        coulomb: friction of contacts that is proportional to the multiplier.
     """
 
-    priors: tuple[ForcePrior, ...]
-    scales: tuple[Standardization, ...]
-    mean: ForceMean
+    process: ForceProcess
     latent: LatentPosterior
-    pinned: Mapping[int, Tensor] = field(default_factory=dict)
-    coulomb: tuple[CoulombFriction, ...] = ()
+
+    @property
+    def priors(self) -> tuple[ForcePrior, ...]:
+        """The force priors."""
+        return self.process.priors
 
     def shift(self, p: int, features: Features) -> Tensor | float:
         """What samples of the latent force of prior p must be moved by to have the mean that is predicted."""
-        if not self.pinned:
+        if not self.process.pinned:
             return 0.0
         return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
 
@@ -56,28 +54,22 @@ class ForcePosterior:
     def means(self) -> LatentPosterior:
         """The processes that means are read from: those given the forces that the robot contains."""
         means = self.latent
-        for p, value in self.pinned.items():
+        for p, value in self.process.pinned.items():
             means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
         return means
 
-    def features_of(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        """Standardized kernel inputs of prior p at states."""
-        return self.scales[p].apply(self.priors[p].features(system, at))
-
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Posterior mean of Q̄ = Σ E f + m, `(n, nq)`: the force field of a rollout."""
-        force = self.unknown_force(system, at, range(len(self.priors))) + self.mean(system, at)
-        return with_coulomb(system, at, force, self.coulomb) if self.coulomb else force
+        force = self.unknown_force(system, at, range(len(self.priors))) + self.process.mean(system, at)
+        return with_coulomb(system, at, force, self.process.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
         """Posterior mean of Σ E f over some priors, `(n, nq)`, without Coulomb friction of contacts."""
         # Σ_p E_p μ_p
-        means = self.means
-        pairs = [(p, self.priors[p]) for p in priors if means.measured[p]]
-        parts = [(p, prior.features(system, at), prior.operator(system, at)) for p, prior in pairs]
         force: Tensor | float = 0.0
-        for p, x, E in parts:
-            force = force + (E @ means.latent_mean(p, self.scales[p].apply(x))[..., None])[..., 0]
+        for p in (p for p in priors if self.means.measured[p]):
+            mean = self.means.latent_mean(p, self.process.features(p, system, at))
+            force = force + (self.priors[p].operator(system, at) @ mean[..., None])[..., 0]
         return force
 
     def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
@@ -89,8 +81,7 @@ class ForcePosterior:
             z: the quantity, without Coulomb friction of contacts.
         """
         # W = B E, target o + B m (eqs. 12 and 15)
-        z = coupled(system, at, z, self.coulomb) if self.coulomb else z
-        return prior_rows(self.priors, self.scales, self.mean, system, at, z)
+        return self.process.rows(system, at, self.process.coupled(system, at, z))
 
     def read(self, system: ConstrainedSystem, at: States, z: AffineMap) -> tuple[Tensor, Tensor]:
         """Posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, without measurement noise."""
@@ -139,16 +130,16 @@ class ForceSamples:
             Q and Q_z `(samples, n, nq)`, or `(n, nq)` where `sample` is given [N m, N].
         """
         # Q = m + Σ E f over joint forces, Q_z = Σ E f over contact forces (eq. 18)
-        Q = self.posterior.mean(system, at)
+        Q = self.posterior.process.mean(system, at)
         Q = Q if sample is not None else Q.expand(self.count, *Q.shape)
         Q_z = torch.zeros_like(Q)
         for p, prior in enumerate(self.posterior.priors):
-            features = self.posterior.features_of(p, system, at)
+            features = self.posterior.process.features(p, system, at)
             latent = self.functions.latent(p, features, sample) + self.posterior.shift(p, features)
             force = (prior.operator(system, at) @ latent[..., None])[..., 0]
             Q, Q_z = (Q, Q_z + force) if prior.target == CONTACT else (Q + force, Q_z)
         # Q_z ← Q̄ − Q, with Coulomb friction in Q̄
-        return Q, with_coulomb(system, at, Q + Q_z, self.posterior.coulomb) - Q
+        return Q, with_coulomb(system, at, Q + Q_z, self.posterior.process.coulomb) - Q
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Q̄ = Q + Q_z of one sample per trajectory, the force field of a rollout.
@@ -162,8 +153,8 @@ class ForceSamples:
         """
         # Q̄ = m + Σ E f
         priors = range(len(self.posterior.priors))
-        Q_bar = self.posterior.mean(system, at) + self.unknown_force(system, at, priors)
-        return with_coulomb(system, at, Q_bar, self.posterior.coulomb)
+        Q_bar = self.posterior.process.mean(system, at) + self.unknown_force(system, at, priors)
+        return with_coulomb(system, at, Q_bar, self.posterior.process.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
         """Σ E f over some priors, without Coulomb friction of contacts."""
@@ -172,7 +163,7 @@ class ForceSamples:
         step = max(1, CHUNK_STATES // max(runs, 1))
         chunks = [range(i, min(i + step, self.count)) for i in range(0, self.count, step)]
         for p in priors:
-            prior, features = self.posterior.priors[p], self.posterior.features_of(p, system, at)
+            prior, features = self.posterior.priors[p], self.posterior.process.features(p, system, at)
             force = torch.cat(
                 [
                     self.functions.by_runs(

@@ -13,7 +13,7 @@ quantity.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,15 +22,12 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Equations
-from forcegp.forces.coulomb import CoulombFriction, coupled
 from forcegp.forces.measurements import Measurement
-from forcegp.forces.priors.base import ForceMean, ForcePrior, prior_rows
-from forcegp.forces.quantities import States, affine_map
-from forcegp.gp.features import Features, Standardization
+from forcegp.forces.noise import SampleNoise
+from forcegp.forces.process import ForceProcess
+from forcegp.forces.quantities import affine_map
+from forcegp.gp.features import Features
 from forcegp.gp.structured_covariance import Block
-
-ForceNoise = Callable[[States], Tensor]
-"""Variance of the white noise on the joint force at states, `(n, nq)`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,60 +169,38 @@ class _Rows:
 
 
 def whiten(
-    system: ConstrainedSystem,
-    priors: Sequence[ForcePrior],
-    scales: Sequence[Standardization],
-    mean: ForceMean,
-    measurement: Measurement,
-    noise_std: Tensor,
-    force_noise: ForceNoise | None = None,
-    offsets: Mapping[str, Tensor] | None = None,
-    coulomb: Sequence[CoulombFriction] = (),
-    state_factor: Tensor | None = None,
-    weight: Tensor | None = None,
+    system: ConstrainedSystem, process: ForceProcess, measurement: Measurement, noise: SampleNoise
 ) -> WhitenedRows:
     """Rows of one measurement with unit white noise, without noise-free directions.
 
     Args:
         system: robot and contacts.
-        priors, scales: the force priors and the standardization of their inputs.
-        mean: prior mean of Q.
+        process: the forces a priori.
         measurement: what was measured.
-        noise_std: `(d,)` or `(n, d)` standard deviation of each component.
-        force_noise: variance of the white noise on the joint force.
-        offsets: prior means of latent forces `(components,)`, by prior; zero where not named.
-        coulomb: friction of contacts that is proportional to the multiplier.
-        state_factor: factor `(n, d, 2 nq)` of the covariance that noise of the state gives the values.
-        weight: `(n,)` of each sample, which the variance of all its noise is divided by.
+        noise: of its samples.
     """
     # z = B_Q Q + B_z Q_z + o (eqs. 19 and 20)
-    at = measurement.at(system)
-    z = affine_map(system, at, measurement.quantity)
-    if coulomb:
-        z = coupled(system, at, z, coulomb)
-    # Noise of the state reaches the directions that the constraint fixes too, so their rows tell of it.
-    has_fixed = measurement.quantity == "qdd" and system.m > 0 and state_factor is None
-    std = noise_std.expand_as(measurement.values)
+    at, std = measurement.at(system), noise.std.expand_as(measurement.values)
+    z = process.coupled(system, at, affine_map(system, at, measurement.quantity))
     # W = B E and E[z] = o + B m, with the prior means of latent forces (eqs. 12 and 15)
-    rows = prior_rows(priors, scales, mean, system, at, z)
+    rows = process.rows(system, at, z)
     expected = rows.target
-    for prior, W in zip(priors, rows.operators, strict=True):
-        if offsets and prior.name in offsets:
-            expected = expected + W @ offsets[prior.name]
-    # N = (G Σ_x^½, B_Q Σ_τ^½)
-    noise = [] if state_factor is None else [state_factor]
-    if force_noise is not None:
-        noise.append(z.B_Q * force_noise(at).sqrt()[:, None, :])
+    for p, value in process.pinned.items():
+        expected = expected - rows.operators[p] @ value
     # (W, y − E[z], N)/σ
     everything = _Rows(
         rows.features,
         tuple(W.shape[-1] for W in rows.operators),
-        torch.cat([*rows.operators, (measurement.values - expected)[..., None], *noise], -1) / std[..., None],
+        torch.cat(
+            [*rows.operators, (measurement.values - expected)[..., None], *noise.factors(at, z)], dim=-1
+        )
+        / std[..., None],
     )
-    if not has_fixed:
-        block, log_determinant = everything.whitened(weight)
-        return WhitenedRows([block], lambda: log_determinant + _log_scale(std, weight))
-    return _without_fixed(everything, at.eom, measurement.values, std, weight)
+    # Noise of the state reaches the directions that the constraint fixes too, so their rows tell of it.
+    if measurement.quantity == "qdd" and system.m > 0 and noise.state is None:
+        return _without_fixed(everything, at.eom, measurement.values, std, noise.weight)
+    block, log_determinant = everything.whitened(noise.weight)
+    return WhitenedRows([block], lambda: log_determinant + _log_scale(std, noise.weight))
 
 
 def _without_fixed(

@@ -19,7 +19,6 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from forcegp.forces.coulomb import coupled
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.learn import Problem
 from forcegp.forces.posterior import ForcePosterior
@@ -63,26 +62,18 @@ def _weights(
     problem: Problem, posterior: ForcePosterior, values: Mapping[str, Tensor], i: int, degrees: float
 ) -> Tensor:
     """Weights of the samples of a measurement `(n,)`."""
-    m, std = problem.training.measurements[i], problem.noise_at(values, i)
-    system, force_noise, coulomb = problem.system_at(values), problem.force_noise(values), posterior.coulomb
-    factor, weights = problem.state_factor(system, i), []
+    m, system, weights = problem.training.measurements[i], problem.system_at(values), []
+    noise = problem.sample_noise(values, system, i)
     for first in range(0, len(m.q), CHUNK_STATES):
         rows = torch.arange(first, min(first + CHUNK_STATES, len(m.q)), device=m.q.device)
         part = m[rows]
         at = part.at(system)
         z = affine_map(system, at, m.quantity)
         mean, spread = posterior.read(system, at, z)
-        z = coupled(system, at, z, coulomb) if coulomb else z
-        # Σ_i = Σ_y + B_Q Σ_τ B_Qᵀ + G Σ_x Gᵀ
-        noise = torch.diag_embed((std if std.ndim == 1 else std[rows]).square().expand_as(part.values))
-        if force_noise is not None:
-            noise = noise + (z.B_Q * force_noise(at)[:, None, :]) @ z.B_Q.mT
-        if factor is not None:
-            noise = noise + factor[rows] @ factor[rows].mT
         # E[r rᵀ] = (y − E z)(y − E z)ᵀ + Cov z, E[rᵀ Σ_i⁻¹ r] = tr Σ_i⁻¹ E[r rᵀ]
         residual = part.values - mean
         square = residual[..., None] * residual[:, None, :] + spread
-        L = torch.linalg.cholesky(noise)
+        L = torch.linalg.cholesky(noise[rows].covariance(at, posterior.process.coupled(system, at, z)))
         distance = torch.cholesky_solve(square, L).diagonal(dim1=-2, dim2=-1).sum(-1)
         # w_i = (ν + d)/(ν + E[rᵀ Σ_i⁻¹ r])
         weights.append((degrees + part.values.shape[-1]) / (degrees + distance))

@@ -13,7 +13,6 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.coulomb import coupled
 from forcegp.forces.identifiability import doubts_of
 from forcegp.forces.inference import forces_and_constant, is_sparse, log_likelihood, lost_by_inducing
 from forcegp.forces.learn import Problem, typical
@@ -126,7 +125,7 @@ class StructuredFit(FittedModel):
             mean = self.posterior.read_mean(system, at, z)
         else:
             mean, spread = self.posterior.read(system, at, z)
-            z = coupled(system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
+            z = self.posterior.process.coupled(system, at, z)
             if STICK_NOISE in self.hyperparameters:
                 spread = spread + _carried(z, unknown_variance(self.hyperparameters, at))
             if noise:
@@ -335,7 +334,7 @@ class StructuredFit(FittedModel):
         """
         at, batch = states_at(self.system, q, qd, tau, active)
         z, parts = affine_maps(self.system, at, quantity)
-        z = coupled(self.system, at, z, self.posterior.coulomb) if self.posterior.coulomb else z
+        z = self.posterior.process.coupled(self.system, at, z)
         noise = self._noise_covariance(z, parts if sensor else {}).diagonal(dim1=-2, dim2=-1)
         return noise.reshape(*batch, z.o.shape[-1])
 

@@ -198,15 +198,14 @@ def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tens
 
 def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str, Tensor]) -> ForcePosterior:
     """The posterior with its weights or sums as they were."""
-    scales, params, coulomb = problem.training.scales, kernel_parameters(hyper), problem.coulomb(hyper)
-    priors = problem.priors_at(hyper)
+    params, process = kernel_parameters(hyper), problem.process_at(hyper)
     if "alpha" not in tensors:
         kept = _in_order(problem, _below(tensors, "sparse."))
         latent = posterior_of_tensors(problem.priors, params, kept)
-        return ForcePosterior(priors, scales, problem.mean, latent, problem.pins(), coulomb)
+        return ForcePosterior(process, latent)
     blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
     rows = sum(block.rows for block in blocks)
     if alpha.shape != (rows,):
         raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
     latent = ExactPosterior(problem.priors, params, blocks, alpha)
-    return ForcePosterior(priors, scales, problem.mean, latent, problem.pins(), coulomb)
+    return ForcePosterior(process, latent)

@@ -271,7 +271,8 @@ class ForceLaw(Law):
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
         force = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
-        mean, priors = (force.mean, force.priors) if isinstance(force, ForcePosterior) else (force, ())
+        known = force.process if isinstance(force, ForcePosterior) else None
+        mean, priors = (force, ()) if known is None else (known.mean, known.priors)
         robot = system.robot
         in_mean = isinstance(mean, AnalyticalMean) and "friction" in mean.terms
         declared = in_mean and bool(((robot.friction != 0.0) | (robot.stribeck != 0.0)).any())

@@ -8,18 +8,15 @@ A prior on any force, carried by an operator of the user.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from torch import Tensor
-from torch.linalg import vecdot
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.quantities import AffineMap, States
-from forcegp.gp.features import Standardization
+from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, SquaredExponential
-from forcegp.gp.structured_covariance import Block
 from forcegp.robot.model import RobotModel
 
 JOINT, CONTACT, CONSTRAINT = "joint", "contact", "constraint"
@@ -131,42 +128,6 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
                 got=", ".join(names),
             )
         prior.check(system)
-
-
-def prior_rows(
-    priors: Sequence[ForcePrior],
-    scales: Sequence[Standardization],
-    mean: ForceMean,
-    system: ConstrainedSystem,
-    at: States,
-    z: AffineMap,
-) -> Block:
-    """A quantity z = B_Q Q + B_z Q_z + o at states as rows of the force priors.
-
-    Args:
-        priors, scales: the force priors and the standardization of their inputs.
-        mean: prior mean m of Q.
-        system: robot and contacts.
-        at: n states.
-        z: the quantity.
-
-    Returns:
-        Kernel inputs and operators B(x) E(x) of each prior, with o(x) + B(x) m(x) as target.
-    """
-    # E[z] = o + B_Q m (eq. 15)
-    target = z.o + vecdot(z.B_Q, mean(system, at)[..., None, :])
-    by_target = {CONTACT: z.B_z, CONSTRAINT: z.B_N}
-    features, operators = [], []
-    for prior in priors:
-        # W = B E (eq. 12), with E the identity for a prior per joint
-        features.append(prior.features(system, at))
-        B = by_target.get(prior.target, z.B_Q)
-        if B is None:
-            operators.append(z.o.new_zeros(*z.o.shape, prior.outputs(system.robot)))
-        else:
-            operators.append(B if prior.per_joint else B @ prior.operator(system, at))
-    standard = (scale.apply(x) for scale, x in zip(scales, features, strict=True))
-    return Block(tuple(standard), tuple(operators), target)
 
 
 @dataclass(frozen=True)
