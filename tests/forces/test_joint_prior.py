@@ -8,10 +8,10 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
+from forcegp.forces.posterior import ForceProcess
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.contact import NormalForcePrior
 from forcegp.forces.priors.joint import AnalyticalMean, DisturbancePrior, JointForcePrior, JointFrictionPrior
-from forcegp.forces.process import ForceProcess
 from forcegp.forces.quantities import QUANTITIES, States, affine_map, states
 from forcegp.gp.features import Standardization
 from forces.cases import draw, mixed_contacts, two_contacts

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import forcegp
-from forcegp.forces import slopes
+from forcegp.forces import noise_learning
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import learned_slopes, state_jacobian
 from forcegp.forces.quantities import States, states
@@ -98,7 +98,7 @@ def error_of(model: StructuredFit, seed: int) -> float:
 def test_learned_slopes_are_better(mean: str, monkeypatch: pytest.MonkeyPatch) -> None:
     learned = [fitted(seed, mean) for seed in SEEDS]
     assert all(model.training.slopes is not None for model in learned)
-    monkeypatch.setattr(slopes, "ROUNDS", 0)
+    monkeypatch.setattr(noise_learning, "ROUNDS", 0)
     of_file = [fitted(seed, mean) for seed in SEEDS]
     assert all(model.training.slopes is None for model in of_file)
     one, two = (sum(map(error_of, models, SEEDS)) for models in (learned, of_file))
@@ -111,7 +111,7 @@ def test_slopes_without_evidence_are_not_kept(monkeypatch: pytest.MonkeyPatch) -
         assert G is not None
         return dataclasses.replace(training, slopes=(1000.0 * G,))
 
-    monkeypatch.setattr(slopes, "learned_slopes", wrong)
+    monkeypatch.setattr(noise_learning, "learned_slopes", wrong)
     assert fitted(1).training.slopes is None
 
 
@@ -139,7 +139,7 @@ def test_forces_without_slopes_are_told(monkeypatch: pytest.MonkeyPatch) -> None
     def no_tensors(*given: object) -> Training:
         raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
 
-    monkeypatch.setattr(slopes, "learned_slopes", no_tensors)
+    monkeypatch.setattr(noise_learning, "learned_slopes", no_tensors)
     model = fitted(1)
     assert model.training.slopes is None
     assert any("slopes of the learned forces" in warning for warning in model.result.warnings)

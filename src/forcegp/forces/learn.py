@@ -14,8 +14,8 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian, stick_variance
+from forcegp.forces.posterior import ForceProcess
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
-from forcegp.forces.process import ForceProcess
 from forcegp.forces.projection import WhitenedRows, combine, whiten
 from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Features, Standardization

@@ -15,7 +15,7 @@ Noise of the measured state, carried to measured quantities to first order.
 At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts z(x + δ) ≈ z(x) + G δ, so a sample's rows
 have the noise G Σ_x Gᵀ more, with G = ∂z/∂(q, q̇) (McHutchon and Rasmussen, *Gaussian process training with
 input noise*, 2011). G is that of the robot file's equations of motion under the measured torque, or, once
-forces have been learned, that of q̈ = L b + H F̄ with their posterior mean F̄ (`forces/slopes.py`).
+forces have been learned, that of q̈ = L b + H F̄ with their posterior mean F̄ (`forces/noise_learning.py`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Noise:
         state: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number or
             one per joint; `None` for none. It counts to first order (`forces/noise.py`).
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
-            impacts and other outliers; `None` for Gaussian noise (`forces/student_t.py`).
+            impacts and other outliers; `None` for Gaussian noise (`forces/noise_learning.py`).
 
     Example:
         >>> Noise(0.1, torque="learn").learns_torque

@@ -24,7 +24,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.noise import SampleNoise
-from forcegp.forces.process import ForceProcess
+from forcegp.forces.posterior import ForceProcess
 from forcegp.forces.quantities import affine_map
 from forcegp.gp.features import Features
 from forcegp.gp.structured_covariance import Block

@@ -305,6 +305,10 @@ class Search:
         )
         return min(candidates, key=lambda learned: learned.value)
 
+    def values(self, learned: Learned) -> Tensors:
+        """All hyperparameters, learned and held."""
+        return {**self.held, **learned.tensors}
+
     def objective(self, problem: Problem, tensors: Tensors) -> Tensor:
         """Negative log posterior: the likelihood of the rows, and weak priors around the start if any."""
         hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL + ".")}

@@ -34,12 +34,11 @@ from forcegp.forces.inference import (
 from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training, without_impacts
 from forcegp.forces.noise import REGION, TORQUE_NOISE
+from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
 from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.slopes import with_learned_slopes, without_slopes
 from forcegp.forces.start import Search, initial
-from forcegp.forces.student_t import left_out, weighted
 from forcegp.gp.likelihood import require_exact_fits
 from forcegp.gp.optimise import Learned, LearningOptions, Progress
 from forcegp.models.base import FitProgress
@@ -58,8 +57,6 @@ REST_SPEED = 0.01
 """A sample is at rest where no joint moves faster [rad/s, m/s]."""
 FEWEST_MOVING = 20
 """With fewer samples in motion, samples at rest are kept."""
-ROUNDS = 3
-"""Rounds of the weights of samples under heavy-tailed noise and of the hyperparameters with them."""
 FIRST_POWER = 0.25
 """Power of the likelihood before the correlation of its residuals is known."""
 
@@ -319,22 +316,17 @@ def solve(
         part = dataclasses.replace(part, power=FIRST_POWER)
     learned, learned_on = search.solve(part, progress, begin), part.training.samples
     warnings: list[str] = []
-    values = {**search.held, **learned.tensors}
     if part.state_std is not None and not is_sparse(
         spec.inference, part.priors, problem.training.all_samples
     ):
         part, learned, doubts = with_learned_slopes(part, search, learned, progress)
         warnings += doubts
-        values = {**search.held, **learned.tensors}
     if spec.noise.degrees_of_freedom is not None:
-        for _ in range(ROUNDS):
-            part = weighted(part, values, spec.noise.degrees_of_freedom)
-            learned = search.solve(part, progress, learned.tensors)
-            values = {**search.held, **learned.tensors}
+        part, learned = with_learned_weights(part, search, learned, spec.noise.degrees_of_freedom, progress)
     if correlated:
-        part = dataclasses.replace(part, power=likelihood_power(part, values))
+        part = dataclasses.replace(part, power=likelihood_power(part, search.values(learned)))
         learned = search.solve(part, progress, learned.tensors)
-        values = {**search.held, **learned.tensors}
+    values = search.values(learned)
     if calibrated:
         part = with_updated_robot(part, values)
         values |= calibrated_noise(part, values)
@@ -365,7 +357,8 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """The problem with the inference that its samples ask for, and their weights under heavy-tailed noise."""
     if is_sparse(spec.inference, problem.priors, problem.training.all_samples):
-        problem = without_slopes(problem)
+        # Sums over samples have the slopes of the robot file.
+        problem = dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))
         if is_finite(problem.priors):
             problem = without_inducing(problem)
         else:

@@ -1,0 +1,157 @@
+"""Noise that depends on the learned forces: slopes that carry noise of the state, and weights of samples.
+
+Both alternate with the hyperparameters.
+
+**Slopes.** The first fit propagates the noise of the state through the equations of motion of the robot file
+(`noise.py`), which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m.
+Following McHutchon and Rasmussen (*Gaussian process training with input noise*, 2011), take the slope of the
+posterior mean F̄ at each sample and learn again with
+
+    cov(y_i) = Σ_y + G_i Σ_x G_iᵀ,   G_i = ∂(L b + H F̄)/∂(q, q̇) + H ∂F̄/∂(q, q̇),
+
+where the first derivative is at fixed F̄; likewise for multipliers. The posterior mean can be worse than the
+robot file, for example far from other samples, so the slopes are kept only if the evidence of the training
+data, with the weak priors, increases.
+
+**Weights.** Impacts, dropped packets and shocks of a gear break the equations of motion for a few samples,
+and under a Gaussian likelihood these decide what is learned. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and
+w_i ~ Γ(ν/2, ν/2) the noise of sample i, d numbers that share one w_i, has a t distribution with ν degrees of
+freedom. Given the weights all is Gaussian, so inference stays exact. Expectation maximisation alternates
+learning with
+
+    w_i = (ν + d) / (ν + E[r_iᵀ Σ_i⁻¹ r_i]),
+
+r_i the residual under the posterior: samples far outside the noise count for next to nothing (Lange, Little
+and Taylor, *Robust statistical modeling using the t distribution*, 1989).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import NumericalError
+from forcegp.forces.inference import force_posterior
+from forcegp.forces.learn import Problem
+from forcegp.forces.noise import learned_slopes
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.quantities import affine_map
+from forcegp.forces.start import Search
+from forcegp.gp.optimise import Learned, Progress
+
+ROUNDS = 3
+"""Most rounds of slopes, or of weights, and hyperparameters."""
+GROWTH = 1.0
+"""Increase of the log evidence below which the rounds end."""
+STEPS = 5
+"""Steps of the weights at given hyperparameters; each needs one posterior."""
+CHUNK_STATES = 1024
+"""Samples whose residuals are computed at a time."""
+IGNORED = 0.1
+"""A sample of less weight is counted as left out."""
+
+
+def with_learned_slopes(
+    problem: Problem, search: Search, learned: Learned, progress: Progress | None = None
+) -> tuple[Problem, Learned, tuple[str, ...]]:
+    """The problem with the slopes of its learned forces, and what is learned with them.
+
+    Nothing changes if a force is a function of time, or if the slopes cannot be computed or learned with, as
+    those of a force that is not made of tensors; a warning says so.
+
+    Args:
+        problem: exact, with noise of the state and the slopes of the robot file.
+        search: what is learned and what is held.
+        learned: what was learned of the problem.
+        progress: called after each evaluation.
+
+    Returns:
+        The problem, what is learned, and warnings.
+    """
+    if any(prior.in_time for prior in problem.priors):
+        return problem, learned, ()
+    for _ in range(ROUNDS):
+        values = search.values(learned)
+        posterior, system = force_posterior(problem, values), problem.system_at(values)
+        try:
+            training = learned_slopes(problem.training, system, posterior)
+            updated = dataclasses.replace(problem, training=training)
+            relearned = search.solve(updated, progress, learned.tensors)
+        except (NumericalError, RuntimeError) as cause:
+            text = "the slopes of the learned forces, which noise of the state asks for, cannot be used"
+            return problem, learned, (f"{text}: {str(cause).splitlines()[0]}",)
+        growth = learned.value - relearned.value
+        if growth > 0.0:
+            problem, learned = updated, relearned
+        if not growth >= GROWTH:
+            break
+    return problem, learned, ()
+
+
+def with_learned_weights(
+    problem: Problem, search: Search, learned: Learned, degrees: float, progress: Progress | None = None
+) -> tuple[Problem, Learned]:
+    """The problem with the weights of its samples, and what is learned with them.
+
+    Args:
+        problem: samples, robot and noise.
+        search: what is learned and what is held.
+        learned: what was learned of the problem.
+        degrees: ν.
+        progress: called after each evaluation.
+    """
+    for _ in range(ROUNDS):
+        problem = weighted(problem, search.values(learned), degrees)
+        learned = search.solve(problem, progress, learned.tensors)
+    return problem, learned
+
+
+@torch.no_grad()
+def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> Problem:
+    """The problem with the weights of its samples after `STEPS` steps, from those that it has.
+
+    Args:
+        problem: samples, robot and noise.
+        values: hyperparameters.
+        degrees: ν.
+    """
+    for _ in range(STEPS):
+        posterior = force_posterior(problem, values)
+        weights = tuple(
+            _weights(problem, posterior, values, i, degrees)
+            for i in range(len(problem.training.measurements))
+        )
+        problem = dataclasses.replace(
+            problem, training=dataclasses.replace(problem.training, weights=weights)
+        )
+    return problem
+
+
+def left_out(problem: Problem) -> int:
+    """Number of samples that count for next to nothing."""
+    return sum(int((w < IGNORED).sum()) for w in problem.training.weights or ())
+
+
+def _weights(
+    problem: Problem, posterior: ForcePosterior, values: Mapping[str, Tensor], i: int, degrees: float
+) -> Tensor:
+    """Weights of the samples of a measurement `(n,)`."""
+    m, system, weights = problem.training.measurements[i], problem.system_at(values), []
+    noise = problem.sample_noise(values, system, i)
+    for first in range(0, len(m.q), CHUNK_STATES):
+        rows = torch.arange(first, min(first + CHUNK_STATES, len(m.q)), device=m.q.device)
+        part = m[rows]
+        at = part.at(system)
+        z = affine_map(system, at, m.quantity)
+        mean, spread = posterior.read(system, at, z)
+        # E[r rᵀ] = (y − E z)(y − E z)ᵀ + Cov z, E[rᵀ Σ_i⁻¹ r] = tr Σ_i⁻¹ E[r rᵀ]
+        residual = part.values - mean
+        square = residual[..., None] * residual[:, None, :] + spread
+        L = torch.linalg.cholesky(noise[rows].covariance(at, posterior.process.coupled(system, at, z)))
+        distance = torch.cholesky_solve(square, L).diagonal(dim1=-2, dim2=-1).sum(-1)
+        # w_i = (ν + d)/(ν + E[rᵀ Σ_i⁻¹ r])
+        weights.append((degrees + part.values.shape[-1]) / (degrees + distance))
+    return torch.cat(weights)
