@@ -25,7 +25,7 @@ from forcegp.forces.noise import initial_torque_noise
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, ForcePrior
 from forcegp.forces.projection import WhitenedRows
 from forcegp.gp.kernels import Parameters
-from forcegp.gp.optimise import FIRST_STEP, Bounds, Learned, LearningOptions, Objective, Progress, minimise
+from forcegp.gp.optimise import Bounds, Learned, LearningOptions, Objective, Progress, minimise
 from forcegp.gp.structured_covariance import Block
 
 LIMITS = {
@@ -349,11 +349,7 @@ class Search:
             progress(evaluations, value + constant, best)
 
         report = None if progress is None else whole
-        # The entries of a mixing matrix are not logarithms. With Coulomb friction, either rule ends in the
-        # better optimum on some logs (benchmarks/notes/inference.md), so its first step is not limited.
-        free = problem.has_coulomb or any(_kind(key) == MIXING for key in hyper)
-        step = math.inf if free else FIRST_STEP
-        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report, step)
+        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report)
         history = [value + constant for value in learned.history]
         doubts = doubts_at_bounds(learned.tensors, bounds)
         return dataclasses.replace(learned, value=learned.value + constant, history=history, doubts=doubts)
