@@ -44,8 +44,8 @@ def read_mjcf(root: Element, path: Path) -> Tree:
     document, coupled, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):
         model = _compile(document, str(path))
-    names = _names(model, "body", model.nbody)
-    joint_names = _names(model, "jnt", model.njnt)
+    names = [model.body(i).name or f"body_{i}" for i in range(model.nbody)]
+    joint_names = [model.joint(i).name or f"joint_{i}" for i in range(model.njnt)]
     links = [Link(names[0])]
     joints: list[Joint] = []
     for b in range(1, model.nbody):
@@ -60,7 +60,11 @@ def read_mjcf(root: Element, path: Path) -> Tree:
         label=str(path),
         links=tuple(links),
         joints=tuple(joints),
-        sites=_sites(model, names),
+        sites=tuple(
+            Site(name, names[model.site_bodyid[i]], _pose(model.site_pos[i], model.site_quat[i]))
+            for i in range(model.nsite)
+            if (name := model.site(i).name)
+        ),
         remarks=tuple(remarks),
     )
 
@@ -101,13 +105,6 @@ def _compile(document: Element, label: str) -> Any:
         kind = InertiaError if re.search(r"mass|inertia", text) else RobotFileError
         message = f"{label}: MuJoCo's compiler rejects the file"
         raise kind(message, expected="a valid MJCF model", got=text) from error
-
-
-def _names(model: Any, kind: str, count: int) -> list[str]:
-    """Names of the bodies or joints; those without one get `body_<number>` or `joint_<number>`."""
-    objects = {"body": mujoco.mjtObj.mjOBJ_BODY, "jnt": mujoco.mjtObj.mjOBJ_JOINT}
-    word = "body" if kind == "body" else "joint"
-    return [mujoco.mj_id2name(model, objects[kind], i) or f"{word}_{i}" for i in range(count)]
 
 
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
@@ -179,7 +176,7 @@ def _joint(
         armature=float(model.dof_armature[dof]),
         lower=float(limits[0]),
         upper=float(limits[1]),
-        effort=_effort(model, j),
+        effort_limit=_effort(model, j),
         refused=refused,
         follows=follows,
     )
@@ -188,14 +185,9 @@ def _joint(
 def _effort(model: Any, j: int) -> float:
     """Largest force that the joint and its actuators allow; the control range of a motor limits it too."""
     effort = float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
-    drives = [
-        a
-        for a in range(model.nu)
-        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[a, 0] == j
-    ]
-    if not drives:
-        return effort
-    return min(effort, sum(_drive_effort(model, a) for a in drives))
+    of_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    drives = np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == j))
+    return min(effort, sum(_drive_effort(model, a) for a in drives.tolist())) if len(drives) else effort
 
 
 def _drive_effort(model: Any, a: int) -> float:
@@ -205,13 +197,3 @@ def _drive_effort(model: Any, a: int) -> float:
     if model.actuator_ctrllimited[a] and model.actuator(a).name.startswith("motor"):
         limit = min(limit, float(np.abs(model.actuator_ctrlrange[a]).max()))
     return gear * limit if limit < np.inf else np.inf
-
-
-def _sites(model: Any, names: list[str]) -> tuple[Site, ...]:
-    sites = []
-    for s in range(model.nsite):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
-        if name:
-            body = names[model.site_bodyid[s]]
-            sites.append(Site(name, body, _pose(model.site_pos[s], model.site_quat[s])))
-    return tuple(sites)

@@ -56,8 +56,8 @@ class Joint:
     armature: float = 0.0
     lower: float = -np.inf
     upper: float = np.inf
-    velocity: float = np.inf
-    effort: float = np.inf
+    velocity_limit: float = np.inf
+    effort_limit: float = np.inf
     refused: str = ""
     follows: tuple[str, float, float] | None = None
 
