@@ -71,9 +71,7 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 
 def skew(v: Vector3) -> Rotation:
     """The matrix [v]× with [v]× w = v × w."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    return batchlast.skew(v.movedim(-1, 0)).movedim((0, 1), (-2, -1))
 
 
 def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
@@ -144,9 +142,8 @@ def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
         ShapeError: q does not fit the robot.
     """
     robot.check_state(q=q)
-    levels, E = robot.levels, robot.ancestors
-    T = _chain(robot, levels, q)
-    R, p = T[:, :3], sum_over(E, T[:, 3])
+    T = _chain(robot, robot.levels, q)
+    R, p = T[:, :3], sum_over(robot.ancestors, T[:, 3])
     z = batchlast.apply(R, robot.axis.T[..., None])
     if "prismatic" not in robot.joint_types:
         return LinkPoses(q.shape[:-1], R, p, z, batchlast.cross(p, z))
@@ -168,10 +165,8 @@ def _frame_in_base(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Ten
     """Rotation `(3, 3, B)` and position `(3, B)` of a frame relative to the base origin, world axes."""
     parent, R, p = robot.frame_parents[index], robot.frame_rotation[index], robot.frame_position[index]
     if parent == BASE:
-        B = poses.p.shape[-1]
-        return (robot.base_rotation @ R)[..., None].expand(3, 3, B), (robot.base_rotation @ p)[
-            :, None
-        ].expand(3, B)
+        B, base = poses.p.shape[-1], robot.base_rotation
+        return (base @ R)[..., None].expand(3, 3, B), (base @ p)[:, None].expand(3, B)
     link = poses.R[:, :, parent]
     return batchlast.product(link, R[..., None]), poses.p[:, parent] + batchlast.apply(link, p[:, None])
 
@@ -250,13 +245,6 @@ def point_jacobian(
 ) -> PointJacobian:
     """J with ṗ = J q̇ for a point fixed in a frame, `(*batch, 3, nq)`, world axes.
 
-    Example:
-        >>> import torch, forcegp
-        >>> robot = forcegp.load_robot("double_pendulum")
-        >>> q = torch.zeros(5, 2, dtype=torch.float64)
-        >>> point_jacobian(robot, q, robot.frame_names[-1]).shape
-        torch.Size([5, 3, 2])
-
     Raises:
         UnknownNameError: no such frame.
         ShapeError: q does not fit the robot.
@@ -298,13 +286,6 @@ def point_velocity(
 ) -> Vector3:
     """ṗ = J q̇ of a point fixed in a frame, `(*batch, 3)` [m/s], world axes."""
     return (point_jacobian(robot, q, frame, point) @ qd[..., None])[..., 0]
-
-
-def point_bias_acceleration(
-    robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
-) -> Vector3:
-    """J̇ q̇, the acceleration of a point fixed in a frame at q̈ = 0, `(*batch, 3)` [m/s²], world axes."""
-    return frame_bias_acceleration(robot, q, qd, frame, point)[..., 3:]
 
 
 def frame_bias_acceleration(
