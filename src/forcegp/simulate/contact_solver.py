@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
-from forcegp.errors import ForceGPError, UnsupportedRobotError
+from forcegp.errors import ForceGPError, UnsupportedRobotError, optional_module
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.simulate.config import ContactSolver
-from forcegp.simulate.mujoco import full_mass_matrix, import_mujoco
+from forcegp.simulate.engines import NEEDS_MUJOCO, MuJoCoWorld
 from forcegp.simulate.urdf import link_name, write_urdf
-from forcegp.types import JointVector
 
 CYLINDER_LENGTH = 100.0
 """Half length of the cylinder that stands for an infinite one [m]."""
@@ -56,7 +54,7 @@ class _Pair:
     body: int
 
 
-class ContactSolverEngine:
+class ContactSolverEngine(MuJoCoWorld):
     """A robot in a MuJoCo world with solid surfaces and rounded tips, moved by motor torques alone.
 
     Args:
@@ -71,40 +69,21 @@ class ContactSolverEngine:
     """
 
     def __init__(self, system: ConstrainedSystem, dt: float, solver: ContactSolver) -> None:
-        self._mujoco = mujoco = import_mujoco()
-        self._system, robot = system, system.robot
-        self._model = model = self._compile(system, solver)
+        mujoco, robot = optional_module("mujoco", NEEDS_MUJOCO), system.robot
         self._substeps = solver.substeps(dt)
-        model.opt.timestep = dt / self._substeps
-        model.opt.gravity[:] = robot.gravity.numpy()
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        model.opt.tolerance = SOLVED
-        self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
-        model.dof_armature[self._dof] = robot.armature.numpy()
-        model.dof_damping[self._dof] = robot.damping.numpy() + _per_joint(robot, solver, "joint_damping")
-        model.dof_frictionloss[self._dof] = robot.friction.numpy() + _per_joint(
-            robot, solver, "joint_friction"
-        )
+        super().__init__(robot, _compile(mujoco, system, solver), dt / self._substeps)
+        options = self._model.opt
+        options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        options.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        options.tolerance = SOLVED
+        damping, friction = (_per_joint(robot, solver, name) for name in ("joint_damping", "joint_friction"))
+        self._model.dof_damping[self._dof] = robot.damping.numpy() + damping
+        self._model.dof_frictionloss[self._dof] = robot.friction.numpy() + friction
         self._pairs = [self._pair(i) for i in range(len(system.contacts))]
-        self._no_contact = np.zeros((0, 2, robot.nq)), np.zeros((0, 2, 3))
-        self._data = mujoco.MjData(model)
 
     @property
     def name(self) -> str:
-        """Name and version, for the record."""
-        return f"mujoco {self._mujoco.__version__}, contact solver"
-
-    def reset(self, q: JointVector, qd: JointVector) -> None:
-        """Put the robot at q `(nq,)` moving at qd `(nq,)`."""
-        self._data.qpos[self._dof] = q.numpy()
-        self._data.qvel[self._dof] = qd.numpy()
-
-    def state(self) -> tuple[JointVector, JointVector]:
-        """The present q and qd, `(nq,)` each [rad, rad/s]."""
-        dtype = self._system.robot.dtype
-        q, qd = self._data.qpos[self._dof], self._data.qvel[self._dof]
-        return torch.tensor(q, dtype=dtype), torch.tensor(qd, dtype=dtype)
+        return f"{super().name}, contact solver"
 
     def forces(self, torque: np.ndarray) -> SolvedForces:
         """Acceleration and forces at the present state under a motor torque `(nq,)` [N m].
@@ -117,7 +96,8 @@ class ContactSolverEngine:
         self._mujoco.mj_forward(self._model, data)
         qdd, later = self._of_the_step()
         contacts = [self._contact_force(pair) for pair in self._pairs]
-        Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else self._no_contact
+        none = np.zeros((0, 2, len(dof))), np.zeros((0, 2, 3))
+        Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else none
         Q_I, Q_z = Q.sum(0)
         whole = data.qfrc_applied + data.qfrc_passive + data.qfrc_constraint - data.qfrc_bias
         return SolvedForces(
@@ -133,17 +113,13 @@ class ContactSolverEngine:
     def _of_the_step(self) -> tuple[np.ndarray, np.ndarray]:
         """q̈ with which the next step changes the velocity, and −h D q̈, by which friction differs then."""
         model, data = self._model, self._data
-        M = full_mass_matrix(model, data)
-        hD = model.opt.timestep * model.dof_damping
+        M, hD = self._mass_matrix(data), model.opt.timestep * model.dof_damping
         qdd = np.linalg.solve(M + np.diag(hD), M @ data.qacc)
         return qdd, -hD * qdd
 
     def step(self) -> None:
         """Advance by the sampling period under the torque last given to `forces`."""
         self._mujoco.mj_step(self._model, self._data, self._substeps)
-
-    def close(self) -> None:
-        """Release the engine's resources: MuJoCo holds none."""
 
     def _contact_force(self, pair: _Pair) -> tuple[np.ndarray, np.ndarray]:
         """Normal and friction force on the tip of one pair, generalized `(2, nq)` and Cartesian `(2, 3)`."""
@@ -164,33 +140,34 @@ class ContactSolverEngine:
                 Q[part] += (jacobian.T @ force)[self._dof]
         return Q, F
 
-    def _compile(self, system: ConstrainedSystem, solver: ContactSolver) -> Any:
-        """The robot with a tip and a surface for each contact; only these pairs can touch."""
-        mujoco, robot = self._mujoco, system.robot
-        spec = mujoco.MjSpec.from_string(write_urdf(robot))
-        for i, contact in enumerate(system.contacts):
-            if not isinstance(contact, SurfaceContact):
-                raise ForceGPError(
-                    f"the contact solver has no geometry for the constraint {contact.name!r}",
-                    expected="contacts of a point with a surface",
-                    hint='use contact = "rigid"',
-                )
-            body, position, radius = _tip(robot, contact, solver.tip_radius)
-            ghost = {"contype": 0, "conaffinity": 0, "mass": 0.0}
-            link = spec.worldbody if body == BASE else spec.body(link_name(robot, body))
-            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-            link.add_geom(name=f"tip_{i}", type=sphere, size=[radius, 0, 0], pos=position, **ghost)
-            spec.worldbody.add_geom(name=f"surface_{i}", **_shape(mujoco, contact), **ghost)
-            pair = spec.add_pair(geomname1=f"surface_{i}", geomname2=f"tip_{i}")
-            pair.condim = 3
-            pair.friction = [solver.friction, solver.friction, 0.0, 0.0, 0.0]
-            pair.solref = [solver.stiffness_time, 1.0]
-            pair.solimp = IMPEDANCE
-        return spec.compile()
-
     def _pair(self, i: int) -> _Pair:
         surface, tip = (self._model.geom(f"{part}_{i}").id for part in ("surface", "tip"))
         return _Pair(surface, tip, int(self._model.geom_bodyid[tip]))
+
+
+def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> Any:
+    """The robot with a tip and a surface for each contact; only these pairs can touch."""
+    robot = system.robot
+    spec = mujoco.MjSpec.from_string(write_urdf(robot))
+    for i, contact in enumerate(system.contacts):
+        if not isinstance(contact, SurfaceContact):
+            raise ForceGPError(
+                f"the contact solver has no geometry for the constraint {contact.name!r}",
+                expected="contacts of a point with a surface",
+                hint='use contact = "rigid"',
+            )
+        body, position, radius = _tip(robot, contact, solver.tip_radius)
+        ghost = {"contype": 0, "conaffinity": 0, "mass": 0.0}
+        link = spec.worldbody if body == BASE else spec.body(link_name(robot, body))
+        sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+        link.add_geom(name=f"tip_{i}", type=sphere, size=[radius, 0, 0], pos=position, **ghost)
+        spec.worldbody.add_geom(name=f"surface_{i}", **_shape(mujoco, contact), **ghost)
+        pair = spec.add_pair(geomname1=f"surface_{i}", geomname2=f"tip_{i}")
+        pair.condim = 3
+        pair.friction = [solver.friction, solver.friction, 0.0, 0.0, 0.0]
+        pair.solref = [solver.stiffness_time, 1.0]
+        pair.solimp = IMPEDANCE
+    return spec.compile()
 
 
 def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarray:

@@ -1,7 +1,4 @@
-"""What a physics engine must offer to simulate a robot, and where to get one.
-
-`check_engine` compares it with our own equations of motion.
-"""
+"""What a physics engine must offer to simulate a robot, and how it compares with our equations of motion."""
 
 from __future__ import annotations
 
@@ -14,11 +11,7 @@ from torch import Tensor
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import MissingDependencyError, UnknownNameError
-from forcegp.robot.model import RobotModel
 from forcegp.types import JointMatrix, JointVector
-
-ENGINES = ("pybullet", "mujoco")
 
 
 @runtime_checkable
@@ -63,39 +56,6 @@ class Engine(Protocol):
     def close(self) -> None:
         """Release the engine's resources; it is not used afterwards."""
         ...
-
-
-def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
-    """An engine by name.
-
-    Args:
-        robot: the robot it holds.
-        dt: step [s].
-        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet where it is installed, else MuJoCo.
-
-    Example:
-        >>> import torch, forcegp
-        >>> robot = forcegp.load_robot("double_pendulum")
-        >>> engine = make_engine(robot, dt=0.001, name="mujoco")
-        >>> engine.mass_matrix(torch.zeros(2, dtype=torch.float64)).shape
-        torch.Size([2, 2])
-
-    Raises:
-        UnknownNameError: no such engine.
-        MissingDependencyError: the engine's package is not installed.
-    """
-    from forcegp.simulate.mujoco import MuJoCoEngine
-    from forcegp.simulate.pybullet import PyBulletEngine
-
-    makers = dict(zip(ENGINES, (PyBulletEngine, MuJoCoEngine), strict=True))
-    if name != "auto" and name not in makers:
-        raise UnknownNameError("engine", name, ["auto", *makers])
-    if name != "auto":
-        return makers[name](robot, dt)
-    try:
-        return PyBulletEngine(robot, dt)
-    except MissingDependencyError:
-        return MuJoCoEngine(robot, dt)
 
 
 CHUNK = 8192

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from forcegp import dynamics
 from forcegp.compiled.mechanics import CompiledMechanics
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.contact import Anchor, Constraint, MovingPoint
+from forcegp.constraints.contact import Anchor, MovingPoint
 from forcegp.constraints.gauss import RANK_TOLERANCE
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import POTRF, POTRS, ToolMotion, tool_motion
@@ -117,7 +117,7 @@ class Mechanics:
         """The equations of motion at a state `(nq,)`; `active` `(n_contacts,)` defaults to all."""
         M, Q_C, Q_G, *points = self._blocks(q, qd)
         frames = [points[i : i + POINT] for i in range(0, len(points), POINT)]
-        moving = [_moving_point(p, J, bias, qd) for _, p, J, bias in frames]
+        moving = [MovingPoint.of(*(torch.from_numpy(x) for x in (*frame[1:], qd))) for frame in frames]
         terms = [
             contact.terms_of([moving[k] for k in places])
             for contact, places in zip(self.contacts, self._places, strict=True)
@@ -141,23 +141,13 @@ class Mechanics:
             Q_C=Q_C,
             Q_D=Q_D,
             Q_K=Q_C + Q_G + Q_D,
-            contact_points=_contact_points(self.contacts, terms),
+            contact_points={
+                contact.name: TouchingPoint(*(getattr(at, name).numpy() for name in TouchingPoint._fields))
+                for contact, (*_, at) in zip(self.contacts, terms, strict=True)
+                if at is not None
+            },
             tool=ToolMotion(rotation, position, jacobian @ qd, jacobian, bias),
         )
-
-
-def _moving_point(position: Vector, jacobian: Vector, bias: Vector, qd: Vector) -> MovingPoint:
-    """The motion of a point as the constraints read it, in tensors."""
-    return MovingPoint.of(*(torch.from_numpy(x) for x in (position, jacobian, bias, qd)))
-
-
-def _contact_points(contacts: Sequence[Constraint], constraint_terms: Sequence) -> dict[str, TouchingPoint]:
-    named = ((contact.name, terms.point) for contact, terms in zip(contacts, constraint_terms, strict=True))
-    return {
-        name: TouchingPoint(*(x.numpy() for x in (at.position, at.velocity, at.jacobian, at.normal)))
-        for name, at in named
-        if at is not None
-    }
 
 
 def _blocks(system: ConstrainedSystem, anchors: Sequence[Anchor]) -> tuple[Blocks, bool]:

@@ -55,35 +55,27 @@ class RunLog:
 
         nq, m = system.robot.nq, system.m
         return RunLog(
-            q=columns(nq),
-            qd=columns(nq),
-            qdd=columns(nq),
-            tau=columns(nq),
-            Q=columns(nq),
-            Q_I=columns(nq),
-            Q_z=columns(nq),
-            multiplier=columns(m),
-            c=columns(m),
-            contact=columns(len(system.contacts), torch.bool),
+            *(columns(nq) for _ in range(7)),
+            *(columns(m) for _ in range(2)),
+            columns(len(system.contacts), torch.bool),
             saturated=torch.zeros(steps, dtype=torch.bool),
         )
 
-    def arrays(self) -> LogRows:
+    def arrays(self) -> dict[str, np.ndarray]:
         """The columns as arrays that share their memory, to write single rows."""
         names = (f.name for f in fields(self))
-        return LogRows({n: x.numpy() for n in names if isinstance(x := getattr(self, n), Tensor)})
+        return {n: x.numpy() for n in names if isinstance(x := getattr(self, n), Tensor)}
 
 
-class LogRows:
-    """The columns of a log, written row by row."""
+def write(rows: dict[str, np.ndarray], k: int, **values: object) -> None:
+    """Write values of row k, by column."""
+    for name, value in values.items():
+        rows[name][k] = value
 
-    def __init__(self, columns: dict[str, np.ndarray]) -> None:
-        self._columns = columns
 
-    def write(self, k: int, **values: object) -> None:
-        """Write values of row k, by column."""
-        for name, value in values.items():
-            self._columns[name][k] = value
+def noise(like: Tensor, generator: torch.Generator) -> Tensor:
+    """White noise of unit variance, drawn in double precision whatever the type."""
+    return torch.randn(like.shape, dtype=torch.float64, generator=generator).to(like.dtype)
 
 
 @dataclass(frozen=True)
@@ -183,7 +175,6 @@ def _dataset(
     generator: torch.Generator,
 ) -> Dataset:
     robot, names = system.robot, system.contact_names
-    noise = torch.randn(log.qdd.shape, dtype=torch.float64, generator=generator).to(robot.dtype)
     header = DataHeader(
         dt=config.dt,
         noise_std=config.noise_std,
@@ -199,7 +190,7 @@ def _dataset(
         t=plan.reference.t,
         q=log.measured.get("q", log.q),
         qd=log.measured.get("qd", log.qd),
-        qdd=log.qdd + config.noise_std * noise,
+        qdd=log.qdd + config.noise_std * noise(log.qdd, generator),
         tau=log.measured.get("tau", log.tau),
         joint_names=robot.joint_names,
         contact={name: log.contact[:, i] for i, name in enumerate(names)},
