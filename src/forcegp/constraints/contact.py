@@ -8,15 +8,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.linalg import vecdot
-from torch.nn.functional import normalize
 
 from forcegp import kinematics
+from forcegp.constraints.gauss import ContactPoint
 from forcegp.constraints.surface import Surface, check_point
 from forcegp.errors import ParameterError
 from forcegp.robot.model import RobotModel
@@ -50,34 +49,6 @@ class MovingPoint(NamedTuple):
         return cls(
             position, rate[..., 3:], bias[..., 3:], jacobian[..., 3:, :], rate[..., :3], jacobian[..., :3, :]
         )
-
-
-@dataclass(frozen=True, eq=False)
-class ContactPoint:
-    """The point of the robot that touches a surface; of a rounded tip, the material point that touches now.
-
-    Attributes:
-        position, velocity: `(*batch, 3)` in the world [m], [m/s].
-        jacobian: J_E `(*batch, 3, nq)`, world axes.
-        normal: ∇c `(*batch, 3)` at the point.
-    """
-
-    position: Tensor
-    velocity: Tensor
-    jacobian: Tensor
-    normal: Tensor
-
-    @cached_property
-    def unit_normal(self) -> Tensor:
-        """n `(*batch, 3)`, the direction of ∇c."""
-        return normalize(self.normal, dim=-1)
-
-    @cached_property
-    def sliding(self) -> tuple[Tensor, Tensor]:
-        """Jacobian (1 − n nᵀ) J_E `(*batch, 3, nq)` and velocity (1 − n nᵀ) ṗ `(*batch, 3)` along the
-        surface."""
-        n, J, v = self.unit_normal, self.jacobian, self.velocity
-        return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
 
 
 class ConstraintTerms(NamedTuple):

@@ -22,12 +22,9 @@ from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintVector, JointVector
 
 SQUARE, LINEAR = 20, 60
-"""Matrices over joints and constraint rows, and vectors over them, that the equations of one state hold at
-their peak; measured, and rounded up."""
+"""Matrices and vectors over joints and constraint rows that one state takes at the peak; measured."""
 CERTAIN = 0.25
 """Part of the bound below which no measured work stays."""
-ITEM = 8
-"""Bytes of a float64."""
 
 
 @dataclass(frozen=True)
@@ -110,12 +107,7 @@ class ConstrainedSystem:
     def _repr_html_(self) -> str:
         """A table of the constraints for notebooks."""
         rows = [
-            (
-                c.name,
-                type(c).__name__,
-                ", ".join(frame for frame, _ in c.anchors),
-                str(getattr(c, "surface", "–")),
-            )
+            (c.name, type(c).__name__, ", ".join(dict(c.anchors)), str(getattr(c, "surface", "–")))
             for c in self.contacts
         ]
         notes = [] if self.baumgarte is None else [str(self.baumgarte)]
@@ -139,16 +131,15 @@ class ConstrainedSystem:
         Raises:
             UnknownNameError: no such contact.
         """
-        for contact in self.contacts:
-            if contact.name == name:
-                return contact
-        raise UnknownNameError("contact", name, self.contact_names)
+        if name not in self.contact_names:
+            raise UnknownNameError("contact", name, self.contact_names)
+        return self.contacts[self.contact_names.index(name)]
 
     @property
     def state_bytes(self) -> int:
         """Upper bound on the memory that the equations of motion of one state take [bytes]."""
         width = self.robot.nq + self.m
-        return ITEM * (SQUARE * width**2 + LINEAR * width)
+        return 8 * (SQUARE * width**2 + LINEAR * width)
 
     def announce_states(self, states: int, copies: float, what: str) -> None:
         """Announce, or refuse, work on many states; see `announce_memory`.
@@ -276,24 +267,16 @@ class ConstrainedSystem:
         rows = [i for i, contact in enumerate(self.contacts) for _ in range(contact.rows)]
         return torch.tensor(rows, dtype=torch.int64, device=self.robot.device)
 
-    @cached_property
-    def _places(self) -> list[list[tuple[int, Tensor]]]:
-        """Frame and point of the anchors of each constraint."""
-        at = kinematics.as_point
-        return [
-            [(self.robot.frame_index(frame), at(self.robot, point)) for frame, point in contact.anchors]
-            for contact in self.contacts
-        ]
-
     def _terms(self, q: Tensor, qd: Tensor) -> tuple[LinkPoses, LinkMotion, list[ConstraintTerms]]:
         """Where the links are and how they move, and what the constraints say there."""
         poses = kinematics.link_poses(self.robot, q)
         motion = kinematics.link_motion(self.robot, poses, qd)
-        moving = [
-            [MovingPoint.of(*kinematics.point_motion(self.robot, poses, motion, *at), qd) for at in places]
-            for places in self._places
-        ]
-        terms = [contact.terms_of(points) for contact, points in zip(self.contacts, moving, strict=True)]
+
+        def moving(frame: str, point: Sequence[float]) -> MovingPoint:
+            at = self.robot.frame_index(frame), kinematics.as_point(self.robot, point)
+            return MovingPoint.of(*kinematics.point_motion(self.robot, poses, motion, *at), qd)
+
+        terms = [contact.terms_of([moving(*at) for at in contact.anchors]) for contact in self.contacts]
         return poses, motion, terms
 
     def _rows(

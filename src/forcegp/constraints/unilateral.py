@@ -17,12 +17,23 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints.contact import Constraint, SurfaceContact
-from forcegp.types import Array
+from forcegp.constraints.system import ConstrainedSystem
+from forcegp.errors import NumericalError
+from forcegp.types import ActiveContacts, Array, JointVector
 
 PULL = 1e-9
 """A contact pulls if λ is below minus this [N]; rounding must not open a contact that carries no load."""
 APPROACH = 1e-9
 """A contact is approached if ċ is below minus this [m/s]; after an impact ċ is zero up to rounding."""
+
+POSITION_TOLERANCE = 1e-12
+"""Largest constraint error that counts as none [m]; rounding of the kinematics of an arm leaves 1e-15."""
+ROUNDING = 100.0
+"""Constraint error, in units of the precision's ε, that rounding may leave; it counts in float32 only."""
+MAX_ITERATIONS = 30
+"""Newton doubles the digits in each iteration; a state off by a centimetre needs four."""
+MAX_STEP = 0.2
+"""Largest move of a joint in one iteration [rad, m]; light wrist joints are asked for more than they give."""
 
 
 @runtime_checkable
@@ -139,9 +150,42 @@ def project_velocity(eom: Any, qd: Array) -> Array:
     return qd - (eom.L @ (eom.A @ qd[..., None]))[..., 0]
 
 
-def impact_velocity(system: ContactSystem, q: Array, qd: Array, active: Array) -> Array:
-    """Velocity `(*batch, nq)` after an inelastic impact without friction on the active contacts."""
-    return project_velocity(system.equations(q, qd, active=active), qd)
+def project_state(
+    system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
+) -> tuple[JointVector, JointVector]:
+    """The state on the constraint manifold next to (q, q̇), in the metric of M.
+
+    Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces push;
+    q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy.
+
+    Args:
+        system: robot and contacts.
+        q, qd: `(*batch, nq)` joint positions and velocities.
+        active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+
+    Returns:
+        q with |c(q)| ≤ 1e−12 m (1e−5 m in float32) and q̇ with A q̇ = 0, for the active contacts.
+
+    Raises:
+        NumericalError: the iteration does not converge, as where the surface is out of reach.
+    """
+    rows = system.active_rows(active, q.shape[:-1])
+    tolerance = max(POSITION_TOLERANCE, ROUNDING * torch.finfo(q.dtype).eps)
+    error = 0.0
+    for _ in range(MAX_ITERATIONS):
+        eom = system.equations(q, qd, active)
+        c = torch.where(rows, eom.c, 0.0)
+        error = float(c.detach().abs().max()) if c.numel() else 0.0
+        if error <= tolerance:
+            return q, project_velocity(eom, qd)
+        move = (eom.L @ c[..., None])[..., 0]
+        q = q - move * (MAX_STEP / move.detach().abs().amax(-1, keepdim=True).clamp(min=MAX_STEP))
+    raise NumericalError(
+        "no state on the constraint manifold is found",
+        expected=f"a constraint error of at most {tolerance:g} m after {MAX_ITERATIONS} iterations",
+        got=f"{error:.3g} m",
+        hint="start nearer to the surface, and check that the arm can reach it",
+    )
 
 
 def sliding_friction(system: ContactSystem, eom: Any, active: Array, viscous_friction: float) -> Array:
@@ -175,7 +219,7 @@ def land(system: ContactSystem, q: Array, qd: Array, closed: Array) -> Landing:
     if not bool(new.any()):
         return Landing(closed, qd, eom, impact=False)
     closed = closed | new
-    qd = impact_velocity(system, q, qd, closed)
+    qd = project_velocity(system.equations(q, qd, active=closed), qd)
     return Landing(closed, qd, system.equations(q, qd, active=closed), impact=True)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -31,21 +31,6 @@ POTRF, POTRS = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
 POSE_ROWS, POSITION_ROWS = 6, 3
 SINGULAR = 1e-3
 """Below this smallest pivot of √(J Jᵀ) the task asks for joint speeds a thousand times its own."""
-
-
-@runtime_checkable
-class RobotForces(Protocol):
-    """What the controller reads from the equations of motion: M and Q_K = Q_C + Q_G + Q_D."""
-
-    @property
-    def M(self) -> Array:
-        """`(*batch, nq, nq)` mass matrix."""
-        ...
-
-    @property
-    def Q_K(self) -> Array:
-        """`(*batch, nq)` the force that the robot file knows, without actuation."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -211,7 +196,7 @@ def _package(like: Array) -> Any:
 
 def control_torque(
     tool: ToolMotion,
-    eom: RobotForces,
+    eom: Any,
     q: Array,
     qd: Array,
     target: Target,

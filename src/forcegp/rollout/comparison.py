@@ -18,8 +18,8 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.rollout.forward import RolloutOptions, rollout_model, share_of
+from forcegp.rollout.inputs import ForwardModel
 from forcegp.rollout.integrate import Progress
-from forcegp.rollout.law import ForwardModel
 from forcegp.rollout.trajectory import Bands, Rollout
 
 

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forcegp.constraints.unilateral import impact_velocity, pulling, reached, rows_of
+from forcegp.constraints.unilateral import project_velocity, pulling, reached, rows_of
 from forcegp.errors import ModelError
-from forcegp.rollout.law import ForwardModel, Instant, RolloutProblem, State, Step
+from forcegp.rollout.inputs import ForwardModel
+from forcegp.rollout.law import Instant, RolloutProblem, State, Step
 
 MAX_EVENTS = 8
 """Events within one step; a contact that bounces to rest within a step has infinitely many."""
@@ -55,7 +56,7 @@ def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
     landing = (crossed & active).any(-1)
     if not bool(landing.any()):
         return State(state.t, state.q, state.qd, active)
-    after = impact_velocity(problem.system, state.q, state.qd, active)
+    after = project_velocity(problem.system.equations(state.q, state.qd, active), state.qd)
     qd = torch.where(landing[:, None], after, state.qd)
     return State(state.t, state.q, qd, active)
 

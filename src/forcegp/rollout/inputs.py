@@ -1,11 +1,11 @@
-"""Motor torques of a rollout: an array over time, a log, a feedback law, or the task-space controller."""
+"""What a rollout is given: a model, and motor torques as an array, a log, a feedback law or a controller."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -15,12 +15,65 @@ from forcegp.control.plan import Plan
 from forcegp.control.task_space import Gains, Target, control_torque, tool_motion
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
+from forcegp.forces.dry_friction import ForceField
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
 """Part of a sampling period within which a time counts as a sampling time, against rounding."""
 EVEN = 0.02
 """Largest deviation of a step from the sampling period, relative to the period, in a log that is replayed."""
+
+
+@runtime_checkable
+class PredictedQuantity(Protocol):
+    """A predicted quantity."""
+
+    @property
+    def mean(self) -> Tensor:
+        """`(*batch, d)`."""
+
+    @property
+    def std(self) -> Tensor | None:
+        """`(*batch, d)` standard deviation, `None` without one."""
+
+
+@runtime_checkable
+class ForwardModel(Protocol):
+    """What a rollout asks of a model of the forward dynamics."""
+
+    @property
+    def kind(self) -> str:
+        """Name of the class of models."""
+
+    @property
+    def system(self) -> ConstrainedSystem:
+        """Robot and contacts that the model was made for."""
+
+    @property
+    def has_function_samples(self) -> bool:
+        """Whether `force_samples` draws functions from a posterior over forces."""
+
+    def force_field(self) -> ForceField | None:
+        """The mean impressed force, or `None` for a model of accelerations alone."""
+
+    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
+        """Force functions drawn from the posterior, on `(samples * k, nq)` states."""
+
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        """Root of the spectral density of the logged torques' noise `(nq,)` [N m √s], `None` for none."""
+
+    def predict(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str = "qdd",
+        *,
+        active: Tensor | None = None,
+        covariance: bool = True,
+    ) -> PredictedQuantity:
+        """Predict a quantity at states `(*batch, nq)`."""
 
 
 class Reached(NamedTuple):

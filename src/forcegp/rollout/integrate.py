@@ -1,16 +1,11 @@
 """Integration of a rollout over time: the methods for one step, and the loop over all steps.
 
 The methods are semi-implicit Euler, Runge-Kutta of order four, and SciPy's adaptive ones with error control.
-
-After a step the state may be projected onto the constraint manifold, c(q) = 0 and A q̇ = 0, in the metric of
-M. Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces
-push; q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy, and also the velocity
-after an inelastic impact without friction, M (q̇⁺ − q̇⁻) = AᵀΛ with A q̇⁺ = 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,62 +13,11 @@ import scipy
 import torch
 from torch import Tensor
 
-from forcegp.constraints.system import ConstrainedSystem
-from forcegp.constraints.unilateral import project_velocity
+from forcegp.constraints.unilateral import project_state
 from forcegp.errors import ForceGPError, ModelError, NumericalError
 from forcegp.rollout.events import ContactEvent, advance, settle
 from forcegp.rollout.law import REGULARIZATION, STILL, Instant, RolloutProblem, State, Step, compliance_of
 from forcegp.rollout.trajectory import Divergence, Rollout
-from forcegp.types import ActiveContacts, JointVector
-
-POSITION_TOLERANCE = 1e-12
-"""Largest constraint error that counts as none [m]; rounding of the kinematics of an arm leaves 1e-15."""
-ROUNDING = 100.0
-"""Constraint error, in units of the precision's ε, that rounding may leave; it counts in float32 only."""
-MAX_ITERATIONS = 30
-"""Newton doubles the digits in each iteration; a state off by a centimetre needs four."""
-MAX_STEP = 0.2
-"""Largest move of a joint in one iteration [rad, m]; light wrist joints are asked for more than they give."""
-
-
-def project_state(
-    system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
-) -> tuple[JointVector, JointVector]:
-    """The state on the constraint manifold next to (q, q̇).
-
-    Args:
-        system: robot and contacts.
-        q, qd: `(*batch, nq)` joint positions and velocities.
-        active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-
-    Returns:
-        q with |c(q)| ≤ 1e−12 m (1e−5 m in float32) and q̇ with A q̇ = 0, for the active contacts.
-
-    Raises:
-        NumericalError: the iteration does not converge, as where the surface is out of reach.
-    """
-    rows = system.active_rows(active, q.shape[:-1])
-    tolerance = max(POSITION_TOLERANCE, ROUNDING * torch.finfo(q.dtype).eps)
-    error = torch.zeros((), dtype=q.dtype)
-    for _ in range(MAX_ITERATIONS):
-        eom = system.equations(q, qd, active)
-        c = torch.where(rows, eom.c, 0.0)
-        error = _largest(c)
-        if float(error) <= tolerance:
-            return q, project_velocity(eom, qd)
-        move = (eom.L @ c[..., None])[..., 0]
-        q = q - move * (MAX_STEP / move.detach().abs().amax(-1, keepdim=True).clamp(min=MAX_STEP))
-    raise NumericalError(
-        "no state on the constraint manifold is found",
-        expected=f"a constraint error of at most {tolerance:g} m after {MAX_ITERATIONS} iterations",
-        got=f"{float(error):.3g} m",
-        hint="start nearer to the surface, and check that the arm can reach it",
-    )
-
-
-def _largest(c: Tensor) -> Tensor:
-    return c.detach().abs().max() if c.numel() else c.new_zeros(())
-
 
 Progress = Callable[[int, int], None]
 """Called with the number of steps done and the total number."""
@@ -112,7 +56,12 @@ def adaptive(method: str) -> Step:
     """
 
     def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
-        _refuse_gradients(first, method)
+        if first.qdd.requires_grad:
+            raise ModelError(
+                f"{method} has no gradients",
+                expected="one of semi_implicit_euler, rk4",
+                hint="or call it under torch.no_grad()",
+            )
         end, shape = state.t + h, (2, *state.q.shape)
 
         def rate(s: float, y: np.ndarray) -> np.ndarray:
@@ -131,15 +80,6 @@ def adaptive(method: str) -> Step:
         return State(end, q, qd, state.active)
 
     return step
-
-
-def _refuse_gradients(first: Instant, method: str) -> None:
-    if first.qdd.requires_grad:
-        raise ModelError(
-            f"{method} has no gradients",
-            expected="one of semi_implicit_euler, rk4",
-            hint="or call it under torch.no_grad()",
-        )
 
 
 METHODS: dict[str, Step] = {
@@ -297,21 +237,9 @@ def _result(problem: RolloutProblem, record: _Record, dt: float) -> Rollout:
             "the motion at the initial state cannot be computed", got=record.diverged[0].reason
         )
 
-    def over_time(values: list[Tensor]) -> Tensor:
-        return torch.stack(values, dim=1)
+    def over_time(values: Sequence[State] | Sequence[Instant], names: str) -> dict[str, Tensor]:
+        return {name: torch.stack([getattr(x, name) for x in values], dim=1) for name in names.split()}
 
     t = torch.arange(len(states), dtype=states[0].t.dtype, device=states[0].t.device) * dt
-    return Rollout(
-        system=problem.system,
-        t=t,
-        q=over_time([state.q for state in states]),
-        qd=over_time([state.qd for state in states]),
-        qdd=over_time([motion.qdd for motion in motions]),
-        tau=over_time([motion.tau for motion in motions]),
-        multiplier=over_time([motion.multiplier for motion in motions]),
-        c=over_time([motion.c for motion in motions]),
-        cd=over_time([motion.cd for motion in motions]),
-        active=over_time([state.active for state in states]),
-        events=tuple(record.events),
-        diverged=tuple(record.diverged),
-    )
+    columns = over_time(states, "q qd active") | over_time(motions, "qdd tau multiplier c cd")
+    return Rollout(problem.system, t, **columns, events=tuple(record.events), diverged=tuple(record.diverged))

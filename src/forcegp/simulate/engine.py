@@ -58,10 +58,6 @@ class Engine(Protocol):
         ...
 
 
-CHUNK = 8192
-"""States whose equations are held in memory at once."""
-
-
 @dataclass(frozen=True)
 class EngineCheck:
     """Largest differences between an engine and our library on random states.
@@ -133,29 +129,6 @@ def check_engine(
             constrained_acceleration=_largest(_step(engine, q, qd, held) - constrained),
             largest_acceleration=max(_largest(free), _largest(constrained)),
         )
-
-
-def acceleration_mismatch(
-    system: ConstrainedSystem,
-    q: JointVector,
-    qd: JointVector,
-    qdd: JointVector,
-    Q_bar: JointVector,
-    active: Tensor,
-) -> float:
-    """Largest difference between logged accelerations and L b + H Q̄ of our equations [rad/s²].
-
-    Args:
-        system: robot and contacts.
-        q, qd, qdd: `(n, nq)` logged motion, without noise.
-        Q_bar: `(n, nq)` impressed forces Q + Q_z.
-        active: `(n, n_contacts)` closed contacts.
-    """
-    worst = 0.0
-    for rows in torch.arange(len(q)).split(CHUNK):
-        ours = system.equations(q[rows], qd[rows], active=active[rows]).acceleration(Q_bar[rows])
-        worst = max(worst, _largest(ours - qdd[rows]))
-    return worst
 
 
 def _step(engine: Engine, q: Tensor, qd: Tensor, force: Tensor) -> Tensor:
