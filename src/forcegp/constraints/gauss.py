@@ -255,9 +255,9 @@ def linearize(
     with torch.no_grad():
         r_f = r_f - torch.cat([inverse.dq, inverse.dqd], dim=-1)
         # ∂q̈ = H r_f + L r_c, ∂λ = (A M⁻¹ Aᵀ)⁺ (r_c − A M⁻¹ r_f)
-        dqdd = (eom.H @ r_f + eom.L @ r_c).chunk(2, -1)
-        dmultiplier = (eom.constraint_inertia @ (r_c - eom.M_inv_At.mT @ r_f)).chunk(2, -1)
-        return Linearization(qdd, *dqdd, eom.H, multiplier, *dmultiplier, -eom.L.mT)
+        by_q, by_qd = (eom.H @ r_f + eom.L @ r_c).chunk(2, -1)
+        along_q, along_qd = (eom.constraint_inertia @ (r_c - eom.M_inv_At.mT @ r_f)).chunk(2, -1)
+        return Linearization(qdd, by_q, by_qd, eom.H, multiplier, along_q, along_qd, -eom.L.mT)
 
 
 def _residuals(

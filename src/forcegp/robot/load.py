@@ -60,7 +60,7 @@ def _build(checked: CheckedTree, world: Mapping[str, np.ndarray]) -> RobotModel:
     frames = _frames(tree, placed, remarks)
     for remark in remarks:
         warnings.warn(remark, RobotFileWarning, stacklevel=3)
-    moving, kinds = placed.moving, ("revolute", "prismatic")
+    moving = placed.moving
     poses = {"placement": np.stack(placed.placements), "frame": np.stack([T for _, _, T in frames])}
     speed = np.full(len(moving), FRICTION_VELOCITY)
     values = {
@@ -76,7 +76,7 @@ def _build(checked: CheckedTree, world: Mapping[str, np.ndarray]) -> RobotModel:
     return RobotModel(
         name=tree.name,
         joint_names=tuple(joint.name for joint in moving),
-        joint_types=tuple(kinds[joint.kind == "prismatic"] for joint in moving),
+        joint_types=tuple("prismatic" if joint.kind == "prismatic" else "revolute" for joint in moving),
         parents=tuple(placed.parents),
         frame_names=tuple(name for name, _, _ in frames),
         frame_parents=tuple(index for _, index, _ in frames),

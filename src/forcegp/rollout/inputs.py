@@ -31,10 +31,12 @@ class PredictedQuantity(Protocol):
     @property
     def mean(self) -> Tensor:
         """`(*batch, d)`."""
+        ...
 
     @property
     def std(self) -> Tensor | None:
         """`(*batch, d)` standard deviation, `None` without one."""
+        ...
 
 
 @runtime_checkable
@@ -44,24 +46,30 @@ class ForwardModel(Protocol):
     @property
     def kind(self) -> str:
         """Name of the class of models."""
+        ...
 
     @property
     def system(self) -> ConstrainedSystem:
         """Robot and contacts that the model was made for."""
+        ...
 
     @property
     def has_function_samples(self) -> bool:
         """Whether `force_samples` draws functions from a posterior over forces."""
+        ...
 
     def force_field(self) -> ForceField | None:
         """The mean impressed force, or `None` for a model of accelerations alone."""
+        ...
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         """Force functions drawn from the posterior, on `(samples * k, nq)` states."""
+        ...
 
     @property
     def torque_disturbance(self) -> Tensor | None:
         """Root of the spectral density of the logged torques' noise `(nq,)` [N m √s], `None` for none."""
+        ...
 
     def predict(
         self,
@@ -74,6 +82,7 @@ class ForwardModel(Protocol):
         covariance: bool = True,
     ) -> PredictedQuantity:
         """Predict a quantity at states `(*batch, nq)`."""
+        ...
 
 
 class Reached(NamedTuple):

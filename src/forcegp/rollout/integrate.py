@@ -242,4 +242,11 @@ def _result(problem: RolloutProblem, record: _Record, dt: float) -> Rollout:
 
     t = torch.arange(len(states), dtype=states[0].t.dtype, device=states[0].t.device) * dt
     columns = over_time(states, "q qd active") | over_time(motions, "qdd tau multiplier c cd")
-    return Rollout(problem.system, t, **columns, events=tuple(record.events), diverged=tuple(record.diverged))
+    return Rollout(
+        problem.system,
+        t,
+        **columns,
+        samples=None,
+        events=tuple(record.events),
+        diverged=tuple(record.diverged),
+    )

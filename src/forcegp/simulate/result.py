@@ -56,12 +56,9 @@ class RunLog:
             return torch.zeros(steps, width, dtype=dtype)
 
         nq, m = system.robot.nq, system.m
-        return RunLog(
-            *(columns(nq) for _ in range(7)),
-            *(columns(m) for _ in range(2)),
-            columns(len(system.contacts), torch.bool),
-            saturated=torch.zeros(steps, dtype=torch.bool),
-        )
+        q, qd, qdd, tau, Q, Q_I, Q_z = (columns(nq) for _ in range(7))
+        contact, saturated = columns(len(system.contacts), torch.bool), columns(1, torch.bool)[:, 0]
+        return RunLog(q, qd, qdd, tau, Q, Q_I, Q_z, columns(m), columns(m), contact, saturated)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The columns as arrays that share their memory, to write single rows."""
