@@ -103,11 +103,7 @@ def _inverse_derivatives(
 def inverse_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector
 ) -> InverseDynamicsDerivatives:
-    """Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈.
-
-    Args:
-        robot: the robot.
-        q, qd, qdd: `(*batch, nq)` joint positions, velocities, accelerations.
+    """Jacobians of `inverse_dynamics` by q, q̇ and q̈ at states `(*batch, nq)`.
 
     Raises:
         ShapeError: an argument does not fit the robot.
@@ -123,12 +119,7 @@ def inverse_dynamics_derivatives(
 def forward_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector
 ) -> ForwardDynamicsDerivatives:
-    """Jacobians of `forward_dynamics`: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹, at its q̈.
-
-    Args:
-        robot: the robot.
-        q, qd: `(*batch, nq)` joint positions and velocities.
-        force: `(*batch, nq)` generalized force [N m, N].
+    """Jacobians of `forward_dynamics` by q, q̇ and force: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹, at its q̈.
 
     Raises:
         ShapeError: an argument does not fit the robot.

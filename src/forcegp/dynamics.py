@@ -120,14 +120,7 @@ def equation_of_motion(
 
 
 def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
-    """Generalized mass matrix M(q), symmetric positive definite.
-
-    Args:
-        robot: the robot.
-        q: `(*batch, nq)` joint positions [rad, m].
-
-    Returns:
-        `(*batch, nq, nq)` [kg m², kg m, kg].
+    """Generalized mass matrix M(q) `(*batch, nq, nq)`, symmetric positive definite [kg m², kg m, kg].
 
     Example:
         >>> import torch, forcegp
@@ -168,14 +161,9 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
 def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None = None) -> JointVector:
     """Joint friction of the robot: viscous, Coulomb (smoothed at zero speed) and the Stribeck effect.
 
-    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]; see Armstrong-Hélouvry,
-    Dupont, Canudas de Wit, *A survey of models, analysis tools and compensation methods for the control of
-    machines with friction* (Automatica 30, 1994). It is smooth, so it can be integrated and differentiated.
-
-    Args:
-        robot: the robot.
-        qd: `(*batch, nq)` joint velocities.
-        slip: `(*batch, nq)` direction of sliding, in place of tanh(q̇/v_0).
+    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]; `slip` `(*batch, nq)` is a
+    direction of sliding in place of tanh(q̇/v_0). See Armstrong-Hélouvry, Dupont, Canudas de Wit, *A survey of
+    models, analysis tools and compensation methods for the control of machines with friction* (1994).
 
     Raises:
         ShapeError: qd does not fit the robot.
@@ -186,14 +174,7 @@ def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None =
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
-    """Force Q_D + Q_u that the motion needs: M q̈ − Q_C − Q_G (recursive Newton-Euler).
-
-    Args:
-        robot: the robot.
-        q, qd, qdd: `(*batch, nq)` joint positions, velocities, accelerations.
-
-    Returns:
-        `(*batch, nq)` [N m, N].
+    """Force Q_D + Q_u that the motion needs, M q̈ − Q_C − Q_G (Newton-Euler), `(*batch, nq)` [N m, N].
 
     Example:
         >>> import torch, forcegp
@@ -214,15 +195,12 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
 
 
 def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector) -> JointVector:
-    """Acceleration of free motion, q̈ = M⁻¹(force + Q_C + Q_G) (eq. 1).
+    """Acceleration of free motion `(*batch, nq)`, q̈ = M⁻¹(force + Q_C + Q_G) (eq. 1) [rad/s², m/s²].
 
     Args:
         robot: the robot.
         q, qd: `(*batch, nq)` joint positions and velocities.
         force: `(*batch, nq)` generalized force Q_D + Q_u (+ any other impressed force) [N m, N].
-
-    Returns:
-        q̈ `(*batch, nq)` [rad/s², m/s²].
 
     Example:
         >>> import torch, forcegp

@@ -31,16 +31,10 @@ PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", 
 
 
 def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> Regressor:
-    """Y with Y π = M q̈ − Q_C − Q_G for links without drives, π as in `parameter_vector`.
+    """Y `(*batch, nq, 10 nq)` with Y π = M q̈ − Q_C − Q_G without drives, π as in `parameter_vector`.
 
-    Inverse dynamics is linear in π, so column k of link i holds the forces of that link with the unit π_k.
-
-    Args:
-        robot: the robot; only its kinematics and gravity enter.
-        q, qd, qdd: `(*batch, nq)` joint positions, velocities, accelerations.
-
-    Returns:
-        `(*batch, nq, 10 nq)`.
+    Inverse dynamics is linear in π, so column k of link i holds the forces of that link with unit π_k. Only
+    the kinematics and the gravity of the robot enter.
 
     Example:
         >>> import torch, forcegp
@@ -111,12 +105,7 @@ class BaseParameters:
 def base_parameters(robot: RobotModel, samples: int = 100, seed: int = 0) -> BaseParameters:
     """Base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
 
-    Runs in double precision on the CPU, wherever the robot is.
-
-    Args:
-        robot: the robot; only its kinematics and gravity enter.
-        samples: number of random states.
-        seed: of the random states.
+    Runs in double precision on the CPU, wherever the robot is. Only its kinematics and gravity enter.
 
     Example:
         >>> import torch, forcegp

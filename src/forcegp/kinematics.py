@@ -132,11 +132,7 @@ def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -
 
 
 def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
-    """Poses of all links, R_i = R_parent R_i^local, and the joint screws in world axes.
-
-    Args:
-        robot: the robot.
-        q: `(*batch, nq)` joint positions [rad, m].
+    """Poses of all links, R_i = R_parent R_i^local, and the joint screws in world axes, at q `(*batch, nq)`.
 
     Raises:
         ShapeError: q does not fit the robot.
@@ -199,15 +195,7 @@ def as_point(robot: RobotModel, point: object) -> Vector3:
 
 
 def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation, Vector3]:
-    """Pose of a named frame in the world.
-
-    Args:
-        robot: the robot.
-        q: `(*batch, nq)` joint positions [rad, m].
-        frame: name of a link or fixed frame.
-
-    Returns:
-        Rotation `(*batch, 3, 3)` and position `(*batch, 3)` [m].
+    """Rotation `(*batch, 3, 3)` and position `(*batch, 3)` [m] of a named frame in the world.
 
     Example:
         >>> import torch, forcegp

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.compiled.program import Program
 from forcegp.errors import MissingDependencyError
-from forcegp.native.library import load_library
+from forcegp.native import load_library
 
 LANES_BYTES = 64
 """Width of the vectors of a CPU kernel; the compiler splits them where the machine's are narrower."""

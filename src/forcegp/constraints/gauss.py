@@ -5,13 +5,11 @@ Cholesky factor M = G Gᵀ and W = A G⁻ᵀ these are L = G⁻ᵀ W⁺ and (A M
 the singular values of W: those of A M⁻¹ Aᵀ are their squares, which in single precision leaves no room
 between redundant constraints and rounding.
 
-Differentiating M q̈ − Q_C − Q_G − Q_D − Aᵀλ = Q and A q̈ = b at fixed q̈ and λ leaves the residuals
-
-    r_f = ∂Q − ∂ID + ∂Q_D + ∂(Aᵀ)λ,    r_c = ∂b − ∂A q̈,
-
-from which ∂q̈ = H r_f + L r_c and ∂λ = (A M⁻¹ Aᵀ)⁺(r_c − A M⁻¹ r_f). The derivatives of inverse dynamics are
-in closed form; those of the few constraint rows come from autograd. The pseudo-inverse itself is not
-differentiated, so redundant constraints of constant rank do no harm.
+At fixed q̈ and λ, the derivatives of M q̈ − Q_C − Q_G − Q_D − Aᵀλ = Q and A q̈ = b leave the residuals
+r_f = ∂Q − ∂ID + ∂Q_D + ∂(Aᵀ)λ and r_c = ∂b − ∂A q̈, from which ∂q̈ = H r_f + L r_c and
+∂λ = (A M⁻¹ Aᵀ)⁺(r_c − A M⁻¹ r_f). The derivatives of inverse dynamics are in closed form; those of the few
+constraint rows come from autograd. The pseudo-inverse itself is not differentiated, so redundant constraints
+of constant rank do no harm.
 """
 
 from __future__ import annotations

@@ -115,30 +115,12 @@ def any_row(system: ContactSystem, rows: Array) -> Array:
 
 
 def pulling(system: ContactSystem, active: Array, multiplier: Array) -> Array:
-    """Closed contacts that would have to pull, λ < 0, and therefore open.
-
-    Args:
-        system: robot and contacts.
-        active: `(*batch, n_contacts)` bool, closed contacts.
-        multiplier: λ `(*batch, m)` [N].
-
-    Returns:
-        `(*batch, n_contacts)` bool.
-    """
+    """Closed contacts `(*batch, n_contacts)` that would have to pull, λ `(*batch, m)` < 0, and that open."""
     return any_row(system, multiplier < -PULL) & can_open(system, active) & active
 
 
 def reached(system: ContactSystem, active: Array, c: Array, cd: Array) -> Array:
-    """Open contacts that the robot has reached, c ≤ 0 while ċ < 0, and that therefore close.
-
-    Args:
-        system: robot and contacts.
-        active: `(*batch, n_contacts)` bool, closed contacts.
-        c, cd: `(*batch, m)` constraint error and its rate [m], [m/s].
-
-    Returns:
-        `(*batch, n_contacts)` bool.
-    """
+    """Open contacts `(*batch, n_contacts)` that the robot has reached, c ≤ 0 while ċ < 0, and that close."""
     return any_row(system, (c <= 0.0) & (cd < -APPROACH)) & can_open(system, active) & ~active
 
 
@@ -189,16 +171,9 @@ def project_state(
 
 
 def sliding_friction(system: ContactSystem, eom: Any, active: Array, viscous_friction: float) -> Array:
-    """Friction of the active contacts: Q_z = Σ J_Eᵀ F_z with F_z = −θ_v (I − n nᵀ) ṗ_E.
+    """Friction of the active contacts `(*batch, nq)`: Q_z = Σ J_Eᵀ F_z, F_z = −θ_v (I − n nᵀ) ṗ_E [N m, N].
 
-    Args:
-        system: robot and contacts.
-        eom: the equations of motion at the states.
-        active: `(*batch, n_contacts)` bool, closed contacts.
-        viscous_friction: θ_v [N s/m].
-
-    Returns:
-        `(*batch, nq)` [N m, N].
+    `active` is `(*batch, n_contacts)` bool, `viscous_friction` θ_v [N s/m].
     """
     Q_z = 0.0 * eom.Q_C
     for i, contact in enumerate(system.contacts):

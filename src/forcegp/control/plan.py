@@ -114,7 +114,7 @@ def inverse_kinematics(
     starts: Tensor,
     near: JointVector,
 ) -> JointVector:
-    """Joint positions that put a point of a frame at a pose, by damped least squares from many starts.
+    """Joint positions `(nq,)` that put a point of a frame at a pose, by damped least squares.
 
     Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move to `near` in the null space of J. An
     arm with fewer than six joints is asked for the position alone.
@@ -122,13 +122,9 @@ def inverse_kinematics(
     Args:
         robot: the robot.
         frame, point: the tool point, fixed in a frame.
-        position: `(3,)` wanted in the world [m].
-        rotation: `(3, 3)` wanted axes of the frame in the world.
+        position, rotation: `(3,)` [m] and `(3, 3)` wanted in the world.
         starts: `(k, nq)` where to start from.
         near: `(nq,)` of the solutions found, the one next to this is taken.
-
-    Returns:
-        `(nq,)` [rad, m].
 
     Raises:
         NumericalError: no start leads to the pose within the joint limits.
@@ -182,12 +178,9 @@ def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
 
 
 def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotation:
-    """Axes `(3, 3)` of a frame whose tool axis points into the surface, turned by π about the side axis.
+    """Axes `(3, 3)` of a frame whose `tool_axis` points into the surface, turned by π about the side axis.
 
-    Args:
-        normal: `(3,)` unit normal out of the surface.
-        ahead: `(3,)` unit tangent.
-        tool_axis: `(3,)` unit axis of the tool in its frame; the z axis for most arms.
+    `normal` and `ahead` are the unit normal out of the surface and a unit tangent, `(3,)` each.
     """
     z = torch.tensor([0.0, 0.0, 1.0], dtype=normal.dtype)
     down = torch.stack([-ahead, torch.linalg.cross(normal, ahead), -normal], dim=-1)
@@ -230,11 +223,7 @@ class Plan:
         return Target(*(values.numpy() for values in self.targets))
 
     def press(self, eom: Any) -> Any:
-        """Generalized force of a unit normal force on each of the tool's contacts `(*batch, nq)`, Σ Jᵀn/|n|.
-
-        Args:
-            eom: the equations of motion of a batch of states, or of one state in NumPy.
-        """
+        """Generalized unit normal force on each of the tool's contacts, summed, Σ Jᵀn/|n| `(*batch, nq)`."""
         total = 0.0 * eom.Q_C
         for name in self.contacts:
             at = eom.contact_points[name]
@@ -248,11 +237,6 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
 
     The tool's axis points from the origin of its frame to the middle of the contacts that the frame carries.
     An arm with fewer than six joints follows the position alone.
-
-    Args:
-        system: robot and contacts.
-        config: rectangle, times, forces.
-        generator: source of the random numbers.
 
     Raises:
         NumericalError: the rectangle's centre or the first waypoint is out of reach.

@@ -114,17 +114,9 @@ def tool_motion(
 
 
 def orientation_error(rotation: Array, target: Array) -> Array:
-    """e_O = ½ Σᵢ rᵢ × rᵢᵈ over the axes, sin(angle) times the axis that turns the first onto the second.
+    """e_O = ½ Σᵢ rᵢ × rᵢᵈ of axes `(*batch, 3, 3)`: sin(angle) times the axis of the turn, `(*batch, 3)`.
 
-    The sum is the vector of the skew part of R_d Rᵀ.
-
-    Args:
-        rotation, target: `(*batch, 3, 3)` axes of a frame.
-
-    Returns:
-        `(*batch, 3)`, world axes.
-
-    Source: Siciliano et al., eq. 3.98.
+    The sum is the vector of the skew part of R_d Rᵀ, in world axes (Siciliano et al., eq. 3.98).
     """
     E = target @ rotation.swapaxes(-1, -2)
     skew = E - E.swapaxes(-1, -2)
@@ -149,16 +141,13 @@ def task_acceleration(tool: ToolMotion, target: Target, gains: Gains) -> Array:
 def joint_acceleration(tool: ToolMotion, task: Array, posture: Array) -> Array:
     """y = J⁺(a − J̇q̇) + (I − J⁺J) y₀: the task's acceleration, and the posture's in its null space.
 
-    J are the rows of the tool's Jacobian that the arm can follow (`task_rows`). An arm with fewer joints than
+    J are the rows of the tool's Jacobian that the arm can follow (`task_rows`); an arm with fewer joints than
     these, such as a double pendulum, comes as close as it can.
 
     Args:
         tool: the tool at the state.
         task: a `(*batch, 6)` wanted acceleration of the tool.
         posture: y₀ `(*batch, nq)` wanted acceleration of the joints, as far as the task leaves it free.
-
-    Returns:
-        `(*batch, nq)` [rad/s², m/s²].
 
     Raises:
         NumericalError: the arm is singular, so that the task cannot be reached.
@@ -203,20 +192,16 @@ def control_torque(
     press: Array,
     gains: Gains,
 ) -> Array:
-    """Motor torque Q_u = M y − Q_K − Q_n F of task-space inverse dynamics control, before any limit.
+    """Motor torque Q_u = M y − Q_K − Q_n F `(*batch, nq)` of inverse dynamics control, not limited [N m].
 
     Args:
         tool: the tool at the state.
         eom: the equations of motion at the state; M and Q_K = Q_C + Q_G + Q_D are used.
         q, qd: `(*batch, nq)` the state.
         target: what is to be reached; F is its `push`.
-        press: Q_n `(*batch, nq)` generalized force of unit normal forces on the tool where it is, Jᵀn summed
-            over its contacts; along the normal of the reference, the push would drive the tool away from it
-            on a convex surface.
+        press: Q_n `(*batch, nq)`, Jᵀn of unit normal forces where the tool is, summed over its contacts;
+            along the normal of the reference, the push would drive the tool away on a convex surface.
         gains: feedback gains.
-
-    Returns:
-        `(*batch, nq)` [N m].
 
     Raises:
         NumericalError: the arm is singular.

@@ -25,7 +25,7 @@ from forcegp.errors import (
 )
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import CheckedTree, Inertial, Joint, Site, Tree, checked, joint_motion, lock_joints
+from forcegp.robot.tree import Inertial, Joint, Site, Tree, checked, joint_motion, lock_joints
 from forcegp.robot.urdf import read_urdf
 
 FRICTION_VELOCITY = 0.1
@@ -46,15 +46,14 @@ class _Placed:
     links: dict[str, tuple[int, np.ndarray]]
 
 
-def _build(checked: CheckedTree, world: Mapping[str, np.ndarray]) -> RobotModel:
+def _build(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
     """The robot that a tree describes, in double precision, with pose of the base and gravity as given.
 
     Raises:
         UnsupportedRobotError: the name of a frame is ambiguous.
         InertiaError: the robot can move without inertia.
     """
-    tree, remarks = checked.tree, list(checked.remarks)
-    placed = _place(checked.root, checked.joints)
+    remarks, placed = list(tree.remarks), _place(tree.joints)
     bodies = _merge(tree, placed)
     _check_mass_matrix(tree, placed, bodies)
     frames = _frames(tree, placed, remarks)
@@ -85,8 +84,8 @@ def _build(checked: CheckedTree, world: Mapping[str, np.ndarray]) -> RobotModel:
     )
 
 
-def _place(root: str, joints: tuple[Joint, ...]) -> _Placed:
-    placed = _Placed([], [], [], {root: (BASE, np.eye(4))})
+def _place(joints: tuple[Joint, ...]) -> _Placed:
+    placed = _Placed([], [], [], {joints[0].parent: (BASE, np.eye(4))})
     for joint in joints:
         index, T = placed.links[joint.parent]
         T = T @ joint.placement
@@ -241,8 +240,7 @@ def load_robot(
         "base_position": _vector(base_position, "base_position"),
         "gravity": _vector(gravity, "gravity"),
     }
-    tree = checked(lock_joints(_read(source), locked_joints or {}))
-    return _build(tree, world).to(device, dtype)
+    return _build(checked(lock_joints(_read(source), locked_joints or {})), world).to(device, dtype)
 
 
 def _read(source: str | Path) -> Tree:

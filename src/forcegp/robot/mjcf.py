@@ -28,13 +28,9 @@ _KINDS: dict[int, JointKind] = {
 
 
 def read_mjcf(root: Element, path: Path) -> Tree:
-    """Links and joints of an MJCF document: bodies are links, bodies and sites are frames.
+    """Links and joints of the `<mujoco>` document of a file: bodies are links, bodies and sites are frames.
 
     A body with several joints gets a massless link between each two of them.
-
-    Args:
-        root: its `<mujoco>` element.
-        path: the file, for messages and includes.
 
     Raises:
         RobotFileError: the document is not valid; errors of MuJoCo's compiler are quoted.

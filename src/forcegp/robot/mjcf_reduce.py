@@ -40,14 +40,9 @@ class Coupling(NamedTuple):
 
 
 def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling], list[str]]:
-    """The reduced document, the joints that equality constraints couple, and remarks.
+    """The reduced document of a file, coupling by name of the joint that an equality constrains, and remarks.
 
-    Args:
-        root: the `<mujoco>` element.
-        path: its file; includes are looked for beside it.
-
-    Returns:
-        The reduced `<mujoco>` element; coupling by joint name; remarks.
+    Included files are looked for beside `path`.
 
     Raises:
         RobotFileError: an include or a number is not valid.

@@ -87,11 +87,8 @@ class AnalyticalParameters(nn.Module):
     ) -> None:
         """Draw all coordinates uniformly from a window around the initial robot.
 
-        Args:
-            generator: the source of randomness.
-            relative: half width for logarithms: a parameter varies by a factor of up to e^{±relative}.
-            length: half width for centres of mass, shifts and lengths [m].
-            angle: half width for rotations [rad].
+        `relative` is the half width of logarithms, a factor of up to e^{±relative}; `length` of centres of
+        mass, shifts and lengths [m]; `angle` that of rotations [rad].
         """
         for quantity, x in self.coordinates.items():
             half = torch.full_like(x, relative)

@@ -97,22 +97,8 @@ def joint_motion(kind: JointKind, axis: np.ndarray, q: float) -> np.ndarray:
     return transform(scipy.spatial.transform.Rotation.from_rotvec(q * axis).as_matrix(), np.zeros(3))
 
 
-def unit_axis(axis: np.ndarray, where: str) -> np.ndarray:
-    """The axis, scaled to unit length.
-
-    Raises:
-        RobotFileError: its length is zero.
-    """
-    length = float(np.linalg.norm(axis))
-    if length < 1e-9:
-        raise RobotFileError(
-            f"{where} has an axis of length zero", expected="a direction such as 0 0 1", got=axis.tolist()
-        )
-    return axis / length
-
-
 def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
-    """The tree with some joints fixed at given positions [rad, m], and with them the joints that follow them.
+    """The tree with some joints, and those that follow them, fixed at positions [rad, m].
 
     Raises:
         UnknownNameError: a joint does not exist.
@@ -125,7 +111,12 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
         if not np.isfinite(q):
             raise RobotFileError(f"{tree.label}: joint {name!r} cannot be locked", expected="a number", got=q)
 
-    held = _with_followers(tree, locked)
+    # q = multiplier · leader + offset; a follower may lead another joint.
+    held = {name: float(q) for name, q in locked.items()}
+    for joint in tree.joints * len(tree.joints):
+        if joint.follows is not None and joint.follows[0] in held:
+            leader, multiplier, offset = joint.follows
+            held.setdefault(joint.name, multiplier * held[leader] + offset)
 
     def lock(joint: Joint) -> Joint:
         if joint.kind == "fixed" or joint.name not in held:
@@ -136,33 +127,12 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
     return replace(tree, joints=tuple(lock(joint) for joint in tree.joints))
 
 
-def _with_followers(tree: Tree, locked: Mapping[str, float]) -> dict[str, float]:
-    """Positions of locked joints and of those that mimic them, q = multiplier · leader + offset."""
-    held = {name: float(q) for name, q in locked.items()}
-    for _ in tree.joints:  # a follower may lead another joint
-        for joint in tree.joints:
-            if joint.follows is not None and joint.follows[0] in held:
-                leader, multiplier, offset = joint.follows
-                held.setdefault(joint.name, multiplier * held[leader] + offset)
-    return held
-
-
 MAX_JOINTS = 500
 ROUNDING = 1e-6
 """Relative error of principal moments that are printed with a few digits only."""
 
 
-@dataclass(frozen=True)
-class CheckedTree:
-    """A valid tree: its root link, its joints with parents before children, and remarks."""
-
-    tree: Tree
-    root: str
-    joints: tuple[Joint, ...]
-    remarks: tuple[str, ...]
-
-
-def checked(tree: Tree) -> CheckedTree:
+def checked(tree: Tree) -> Tree:
     """The tree, checked, with its joints in depth-first order, siblings in the order of the file.
 
     Raises:
@@ -192,7 +162,7 @@ def checked(tree: Tree) -> CheckedTree:
         )
     _check_kinds(tree)
     remarks = (*tree.remarks, *_check_inertia(tree, joints))
-    return CheckedTree(tree, root, tuple(joints), remarks)
+    return replace(tree, joints=tuple(joints), remarks=remarks)
 
 
 def _check_inertia(tree: Tree, joints: list[Joint]) -> list[str]:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
 from forcegp.robot.safety import parse_numbers, xacro_error
-from forcegp.robot.tree import Inertial, Joint, Link, Tree, transform, unit_axis
+from forcegp.robot.tree import Inertial, Joint, Link, Tree, transform
 
 _NUMBERS = {
     "origin": {"xyz": 3, "rpy": 3},
@@ -40,11 +40,7 @@ WORLD = "world"
 
 
 def read_urdf(root: Element, label: str) -> Tree:
-    """Links and joints of a URDF document.
-
-    Args:
-        root: its `<robot>` element.
-        label: the file name for messages.
+    """Links and joints of a URDF document from its `<robot>` element; `label` names the file in messages.
 
     Raises:
         RobotFileError: an element or a number is missing or not valid; the message names it.
@@ -155,13 +151,22 @@ def _joint(element: Element, label: str) -> Joint:
         name,
         "prismatic" if kind == "prismatic" else "revolute",
         *ends,
-        axis=unit_axis(axis.get("xyz", np.array([1.0, 0.0, 0.0])), where),
+        axis=_unit(axis.get("xyz", np.array([1.0, 0.0, 0.0])), where),
         damping=damping,
         friction=friction,
         **_limits(limit, kind, where),
         refused=f"mimics joint {mimic['joint']!r}" if mimic else "",
         follows=(mimic["joint"], mimic.get("multiplier", 1.0), mimic.get("offset", 0.0)) if mimic else None,
     )
+
+
+def _unit(axis: np.ndarray, where: str) -> np.ndarray:
+    length = float(np.linalg.norm(axis))
+    if length < 1e-9:
+        raise RobotFileError(
+            f"{where} has an axis of length zero", expected="a direction such as 0 0 1", got=axis.tolist()
+        )
+    return axis / length
 
 
 def _limits(limit: dict[str, Any], kind: str, where: str) -> dict[str, float]:

@@ -81,14 +81,7 @@ def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, I
 def advance(
     problem: RolloutProblem, step: Step, state: State, first: Instant, h: Tensor
 ) -> tuple[State, list[ContactEvent]]:
-    """One step of the batch, stopping each trajectory at its events on the way.
-
-    Args:
-        problem: what is integrated.
-        step: method of integration.
-        state, first: where the step begins, and the motion there.
-        h: `(n, 1)` length of the step [s].
-    """
+    """One step of the batch of length h `(n, 1)` [s], stopping each trajectory at its events on the way."""
     trial = step(problem, state, first, h)
     events: list[ContactEvent] = []
     for _ in range(MAX_EVENTS):

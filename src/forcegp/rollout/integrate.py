@@ -51,8 +51,7 @@ def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tens
 def adaptive(method: str) -> Step:
     """A step made of as many steps of a method of `scipy.integrate` as its error control asks for.
 
-    The whole batch shares the steps. Time runs from 0 to 1 within the step, so that trajectories whose
-    steps differ, as after an event, are solved together.
+    The whole batch shares the steps; time runs from 0 to 1 within the step, whose length may differ by row.
     """
 
     def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
@@ -127,20 +126,10 @@ def integrate(
     speed_limit: float,
     progress: Progress | None = None,
 ) -> Rollout:
-    """Integrate n trajectories; one that diverges is dropped while the others go on.
+    """Integrate n trajectories over steps of dt [s]; one that diverges is dropped while the others go on.
 
-    Args:
-        problem: right-hand side of the differential equation.
-        step: method of integration.
-        start: initial states.
-        dt: step, and period of the output [s].
-        steps: number of steps.
-        project: whether to project position and velocity onto the manifold after each step.
-        speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
-        progress: called after each step.
-
-    Returns:
-        The trajectories, batch `(n,)`; shorter than asked for if all diverged.
+    `project` moves position and velocity onto the manifold after each step; a joint faster than `speed_limit`
+    [rad/s, m/s] counts as diverged. The result, batch `(n,)`, is shorter than asked for if all diverged.
     """
     record, state, step = _Record(), start, _stopping(step)
     alive = torch.ones(len(start.q), dtype=torch.bool, device=start.q.device)

@@ -91,14 +91,12 @@ def compliance_of(G: Tensor) -> Tensor:
 
 
 def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Tensor) -> Stuck:
-    """The dry friction of joints over a step.
+    """The dry friction of joints over a step h `(n, 1)` [s] from velocities q̇ `(n, nq)`; 0 for an instant.
 
     Args:
         qdd: `(n, nq)` acceleration without it [rad/s², m/s²].
         G: `(n, nq, nq)` acceleration per dry friction, H or M⁻¹.
         limit: `(n, nq)` its largest size F ≥ 0 [N m, N].
-        qd: `(n, nq)` velocity at the start of the step [rad/s, m/s].
-        h: `(n, 1)` step; 0 for an instant [s].
 
     Raises:
         NumericalError: no friction solves the problem, since G is not positive definite.
@@ -256,13 +254,9 @@ class Instant(NamedTuple):
 
 @dataclass(frozen=True)
 class RolloutProblem:
-    """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system.
+    """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the stabilization of the rollout.
 
-    Args:
-        system: robot and contacts, with the stabilization of the rollout.
-        law, inputs: give the acceleration and the torque.
-        unilateral: whether contacts with a surface can open and close.
-        sticking: whether dry friction holds joints at rest, rather than being smooth.
+    `unilateral` lets contacts with a surface open and close, `sticking` dry friction hold joints.
     """
 
     system: ConstrainedSystem

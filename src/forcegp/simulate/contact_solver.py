@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,22 +44,10 @@ class SolvedForces(NamedTuple):
     F_z: np.ndarray
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """Geometry ids of a surface and of the tip that may touch it, and the tip's body."""
-
-    surface: int
-    tip: int
-    body: int
-
-
 class ContactSolverEngine(MuJoCoWorld):
     """A robot in a MuJoCo world with solid surfaces and rounded tips, moved by motor torques alone.
 
-    Args:
-        system: robot and contacts, each with a plane, a sphere or a cylinder.
-        dt: sampling period, during which a torque is held [s].
-        solver: friction and geometry.
+    Each contact needs a plane, a sphere or a cylinder; a torque is held for the sampling period dt [s].
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -79,7 +66,8 @@ class ContactSolverEngine(MuJoCoWorld):
         damping, friction = (_per_joint(robot, solver, name) for name in ("joint_damping", "joint_friction"))
         self._model.dof_damping[self._dof] = robot.damping.numpy() + damping
         self._model.dof_frictionloss[self._dof] = robot.friction.numpy() + friction
-        self._pairs = [self._pair(i) for i in range(len(system.contacts))]
+        geom = self._model.geom
+        self._pairs = [(geom(f"surface_{i}").id, geom(f"tip_{i}").id) for i in range(len(system.contacts))]
 
     @property
     def name(self) -> str:
@@ -95,7 +83,7 @@ class ContactSolverEngine(MuJoCoWorld):
         data.qfrc_applied[dof] = torque
         self._mujoco.mj_forward(self._model, data)
         qdd, later = self._of_the_step()
-        contacts = [self._contact_force(pair) for pair in self._pairs]
+        contacts = [self._contact_force(*pair) for pair in self._pairs]
         none = np.zeros((0, 2, len(dof))), np.zeros((0, 2, 3))
         Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else none
         Q_I, Q_z = Q.sum(0)
@@ -121,28 +109,24 @@ class ContactSolverEngine(MuJoCoWorld):
         """Advance by the sampling period under the torque last given to `forces`."""
         self._mujoco.mj_step(self._model, self._data, self._substeps)
 
-    def _contact_force(self, pair: _Pair) -> tuple[np.ndarray, np.ndarray]:
-        """Normal and friction force on the tip of one pair, generalized `(2, nq)` and Cartesian `(2, 3)`."""
+    def _contact_force(self, surface: int, tip: int) -> tuple[np.ndarray, np.ndarray]:
+        """Normal and friction force of a surface on a tip, generalized `(2, nq)` and Cartesian `(2, 3)`."""
         model, data = self._model, self._data
         Q, F = np.zeros((2, len(self._dof))), np.zeros((2, 3))
         wrench, jacobian = np.zeros(6), np.zeros((3, model.nv))
         for i in range(data.ncon):
             contact = data.contact[i]
-            if {contact.geom1, contact.geom2} != {pair.surface, pair.tip}:
+            if {contact.geom1, contact.geom2} != {surface, tip}:
                 continue
             # MuJoCo gives the force on its second geometry, in axes whose first is the normal towards it.
-            sign = 1.0 if contact.geom2 == pair.tip else -1.0
+            sign = 1.0 if contact.geom2 == tip else -1.0
             self._mujoco.mj_contactForce(model, data, i, wrench)
             axes = sign * contact.frame.reshape(3, 3)
-            self._mujoco.mj_jac(model, data, jacobian, None, contact.pos, pair.body)
+            self._mujoco.mj_jac(model, data, jacobian, None, contact.pos, int(model.geom_bodyid[tip]))
             for part, force in enumerate((wrench[0] * axes[0], wrench[1:3] @ axes[1:])):
                 F[part] += force
                 Q[part] += (jacobian.T @ force)[self._dof]
         return Q, F
-
-    def _pair(self, i: int) -> _Pair:
-        surface, tip = (self._model.geom(f"{part}_{i}").id for part in ("surface", "tip"))
-        return _Pair(surface, tip, int(self._model.geom_bodyid[tip]))
 
 
 def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> Any:

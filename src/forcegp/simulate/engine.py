@@ -93,16 +93,9 @@ class EngineCheck:
 def check_engine(
     system: ConstrainedSystem, engine: Engine, generator: torch.Generator, states: int = 50
 ) -> EngineCheck:
-    """Compare an engine with our library on random states.
+    """Largest differences between an engine and our library on random states of a system.
 
-    Args:
-        system: robot and contacts.
-        engine: holds the same robot.
-        generator: source of the states: angles in ±π, speeds and accelerations of some rad/s and rad/s².
-        states: how many.
-
-    Returns:
-        The largest differences.
+    Angles are in ±π, speeds and accelerations of some rad/s and rad/s².
     """
     robot = system.robot
 

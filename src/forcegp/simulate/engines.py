@@ -23,11 +23,7 @@ MAX_JOINT_VELOCITY = 1e6
 
 
 class PyBulletEngine(Engine):
-    """A robot in a PyBullet world of its own.
-
-    Args:
-        robot: the robot.
-        dt: step [s].
+    """A robot in a PyBullet world of its own, with a step dt [s].
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
@@ -121,13 +117,7 @@ class PyBulletEngine(Engine):
 
 
 class MuJoCoWorld:
-    """A robot in a compiled MuJoCo model, whose joints carry the robot's names.
-
-    Args:
-        robot: the robot; drive inertia and gravity are taken from it.
-        model: the compiled model.
-        dt: step [s].
-    """
+    """A robot in a compiled MuJoCo model with its joint names; gravity and drive inertia are the robot's."""
 
     def __init__(self, robot: RobotModel, model: Any, dt: float) -> None:
         self._mujoco, self._robot, self._model = optional_module("mujoco", NEEDS_MUJOCO), robot, model
@@ -169,11 +159,7 @@ class MuJoCoWorld:
 
 
 class MuJoCoEngine(MuJoCoWorld, Engine):
-    """A robot in a MuJoCo world of its own.
-
-    Args:
-        robot: the robot.
-        dt: step [s].
+    """A robot in a MuJoCo world of its own, with a step dt [s].
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
