@@ -251,7 +251,7 @@ def frame_jacobian(
 def point_motion(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, point: Tensor
 ) -> tuple[Vector3, FrameJacobian, Tensor]:
-    """World position, `frame_jacobian` and `frame_bias_acceleration` of a point, from links already known."""
+    """World position, `frame_jacobian` and bias [ω̇; p̈] at q̈ = 0 `(*batch, 6)` of a point, of known links."""
     x = _point(robot, poses, index, point)
     J, bias = _jacobian(robot, poses, index, x), _bias(robot, poses, motion, index, x)
     moving = (batch_first(part, poses.batch) for part in (x + robot.base_position[:, None], J, bias))
@@ -274,16 +274,6 @@ def point_velocity(
 ) -> Vector3:
     """ṗ = J q̇ of a point fixed in a frame, `(*batch, 3)` [m/s], world axes."""
     return (point_jacobian(robot, q, frame, point) @ qd[..., None])[..., 0]
-
-
-def frame_bias_acceleration(
-    robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
-) -> Tensor:
-    """[ω̇; p̈] at q̈ = 0 of a frame and a point fixed in it, `(*batch, 6)` [rad/s²], [m/s²]."""
-    q, qd = common_states(robot, q=q, qd=qd)
-    poses = link_poses(robot, q)
-    motion = link_motion(robot, poses, qd)
-    return point_motion(robot, poses, motion, robot.frame_index(frame), as_point(robot, point))[2]
 
 
 def _bias(robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, x: Tensor) -> Tensor:

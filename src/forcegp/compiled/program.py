@@ -1,7 +1,8 @@
 """The dynamics of one robot written out on scalars: the algorithms of `forcegp.dynamics`, link by link.
 
 The robot's parameters are numbers, so products with the zeros and ones of joint axes and placements vanish
-while the program is built. Poses, joint screws and inertias of the links are in world axes about the base origin.
+while the program is built. Poses, joint screws and inertias of the links are in world axes about the
+base origin.
 """
 
 from __future__ import annotations
@@ -154,8 +155,8 @@ def _momentum(mass: float, moment: np.ndarray, inertia: np.ndarray, w: np.ndarra
 
 def _composites(links: Links) -> list[_Inertia]:
     """Mass, first moment and inertia of each subtree."""
-    figures = (links.mass, links.moment, links.inertia)
-    return list(zip(*(links.composite(list(x)) for x in figures), strict=True))
+    parts = (links.mass, links.moment, links.inertia)
+    return list(zip(*(links.composite(list(x)) for x in parts), strict=True))
 
 
 def _motion(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> list[_Motion]:
@@ -213,6 +214,7 @@ def _solve(M: np.ndarray, rhs: np.ndarray) -> np.ndarray:
 
 
 def _forward_dynamics(links: Links) -> np.ndarray:
+    """M⁻¹(force + Q_C + Q_G)."""
     needed = _joint_force(links, links.vector("qd"), None, gravity=True)
     return _solve(_mass_matrix(links), np.array(links.vector("force"), dtype=object) - needed)
 
@@ -234,10 +236,8 @@ def _inverse_dynamics_derivatives(links: Links, qd: list, qdd: list) -> tuple[np
     n = len(motion)
     dq, dqd = (links.graph.constants(np.zeros((n, n))) for _ in range(2))
     screws = list(zip(links.z, links.l, strict=True))
-    rates = [
-        (cross(m.omega, z), cross(m.omega, l) + cross(m.v, z))
-        for m, (z, l) in zip(motion, screws, strict=True)
-    ]
+    moved = zip(motion, screws, strict=True)
+    rates = [(cross(m.omega, z), cross(m.omega, l) + cross(m.v, z)) for m, (z, l) in moved]
     for i in range(n):
         z, l = screws[i]
         row, weight = spin[i].T @ z + cross(momenta[i], l) * 2.0, _momentum(*composites[i], z, l)

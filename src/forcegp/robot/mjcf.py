@@ -9,6 +9,7 @@ import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, tostring
@@ -125,34 +126,25 @@ def _chain(
     anchor = np.zeros(3)
     for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
         step = transform(np.eye(3), model.jnt_pos[j] - anchor)
-        link = f"{names[b]}/{joint_names[j]}"
-        chain.append(_joint(model, j, joint_names[j], parent, link, placement @ step, coupled, label))
-        parent, placement, anchor = link, np.eye(4), model.jnt_pos[j].copy()
+        joint = _joint(model, j, joint_names[j], names[b], coupled.get(joint_names[j]), label)
+        chain.append(replace(joint, parent=parent, placement=placement @ step @ joint.placement))
+        parent, placement, anchor = joint.child, np.eye(4), model.jnt_pos[j].copy()
     last = transform(np.eye(3), -anchor)
     chain.append(Joint("", "fixed", parent, names[b], placement @ last))
     return chain
 
 
-def _joint(
-    model: Any,
-    j: int,
-    name: str,
-    parent: str,
-    child: str,
-    placement: np.ndarray,
-    coupled: dict[str, Coupling],
-    label: str,
-) -> Joint:
+def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, label: str) -> Joint:
+    """A joint of a body, placed where its position is zero; its links are not known yet."""
     kind, dof = _KINDS.get(int(model.jnt_type[j])), model.jnt_dofadr[j]
     if kind is None:
         word = "free (floating)" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE else "ball"
         raise UnsupportedRobotError(
-            f"{label}: joint {name!r} of link {child.split('/')[0]!r} is a {word} joint",
+            f"{label}: joint {name!r} of link {body!r} is a {word} joint",
             expected="hinge and slide joints",
             got=word,
             hint="remove the free joint to hold the robot by its base" if "free" in word else None,
         )
-    follows = coupled.get(name)
     relation = f"mimics joint {follows.leader!r}" if follows and follows.leader else "is held in place"
     refused = f"{relation} by an equality constraint" if follows else ""
     if model.jnt_stiffness[j] or model.jnt_stiffnesspoly[j].any() or model.dof_dampingpoly[dof].any():
@@ -163,9 +155,9 @@ def _joint(
     return Joint(
         name=name,
         kind=kind,
-        parent=parent,
-        child=child,
-        placement=placement @ joint_motion(kind, axis, -start),
+        parent="",
+        child=f"{body}/{name}",
+        placement=joint_motion(kind, axis, -start),
         axis=axis,
         damping=float(model.dof_damping[dof]),
         friction=float(model.dof_frictionloss[dof]),

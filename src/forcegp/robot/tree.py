@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -113,10 +114,10 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
 
     # q = multiplier · leader + offset; a follower may lead another joint.
     held = {name: float(q) for name, q in locked.items()}
-    for joint in tree.joints * len(tree.joints):
-        if joint.follows is not None and joint.follows[0] in held:
-            leader, multiplier, offset = joint.follows
-            held.setdefault(joint.name, multiplier * held[leader] + offset)
+    followers = [(joint.name, *joint.follows) for joint in tree.joints if joint.follows is not None]
+    for _, (name, leader, multiplier, offset) in product(followers, followers):
+        if leader in held:
+            held.setdefault(name, multiplier * held[leader] + offset)
 
     def lock(joint: Joint) -> Joint:
         if joint.kind == "fixed" or joint.name not in held:
@@ -290,16 +291,12 @@ def _lock(tree: Tree, refused: list[Joint]) -> dict[str, float]:
     lock: dict[str, float] = {}
     for joint in refused:
         if joint.follows is None or joint.follows[0] not in joints:
-            lock[joint.name] = _nearest_to_zero(joint)
+            lock[joint.name] = float(np.clip(0.0, joint.lower, joint.upper))
             continue
         leader, multiplier, offset = joint.follows
-        lock[leader] = _nearest_to_zero(joints[leader])
+        lock[leader] = float(np.clip(0.0, joints[leader].lower, joints[leader].upper))
         lock[joint.name] = multiplier * lock[leader] + offset
     return lock
-
-
-def _nearest_to_zero(joint: Joint) -> float:
-    return float(min(max(0.0, joint.lower), joint.upper))
 
 
 def _shown(names: list[str]) -> str:
