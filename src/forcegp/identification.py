@@ -190,12 +190,10 @@ def identify(
 
     Example:
         >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> robot = forcegp.load_robot("double_pendulum")
         >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-        >>> t = torch.arange(20, dtype=torch.float64)
-        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> found = identify(system.robot, q, qd, qdd, tau, friction=True)
+        >>> qdd = forcegp.dynamics.forward_dynamics(robot, q, qd, tau - 0.5 * qd)
+        >>> found = identify(robot, q, qd, qdd, tau, friction=True)
         >>> found.damping.shape
         (2,)
 

@@ -9,15 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.linalg import vecdot
 
 from forcegp import batchlast
 from forcegp.batchlast import batch_first, batch_last, sum_over, take
 from forcegp.errors import ShapeError
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.types import FrameJacobian, JointVector, PointJacobian, Rotation, Vector3
+
+Anchor = tuple[str, Sequence[float]]
+"""A frame, and a point in its coordinates [m]."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +68,28 @@ class LinkMotion:
     acceleration: Tensor
 
 
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Vector product over the last dimension, broadcasting."""
-    a, b = torch.broadcast_tensors(a, b)
-    return torch.linalg.cross(a, b)
+class PointMotion(NamedTuple):
+    """The motion of a point fixed in a frame of the robot, world axes; tensors, or arrays of one state.
+
+    Attributes:
+        rotation: `(*batch, 3, 3)` axes of the frame.
+        position: `(*batch, 3)` of the point [m].
+        twist: `(*batch, 6)` [ω; ṗ] [rad/s], [m/s].
+        jacobian: J `(*batch, 6, nq)` with [ω; ṗ] = J q̇.
+        bias: J̇ q̇ `(*batch, 6)`, the acceleration [ω̇; p̈] at q̈ = 0.
+    """
+
+    rotation: Any
+    position: Any
+    twist: Any
+    jacobian: Any
+    bias: Any
+
+    @classmethod
+    def of(cls, blocks: Sequence[Tensor], qd: Tensor) -> PointMotion:
+        """From rotation, position, J and J̇ q̇, as compiled kernels give them, and q̇."""
+        rotation, position, J, bias = blocks
+        return cls(rotation, position, vecdot(J, qd[..., None, :]), J, bias)
 
 
 def skew(v: Vector3) -> Rotation:
@@ -167,26 +190,10 @@ def _frame_in_base(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Ten
     return batchlast.product(link, R[..., None]), poses.p[:, parent] + batchlast.apply(link, p[:, None])
 
 
-def _movers(robot: RobotModel, index: int) -> Tensor:
-    """`(nq,)` 1 for the joints that move a frame."""
-    parent = robot.frame_parents[index]
-    return torch.zeros_like(robot.revolute) if parent == BASE else robot.ancestors[parent]
-
-
-def _point(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> Tensor:
-    """`point_of_poses` with the batch last, `(3, B)`."""
+def pose_of_frame(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Rotation, Vector3]:
+    """Axes of a frame `(*batch, 3, 3)` and its position relative to the base origin `(*batch, 3)` [m]."""
     rotation, position = _frame_in_base(robot, poses, index)
-    return position + batchlast.apply(rotation, point[:, None])
-
-
-def point_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> Vector3:
-    """Position relative to the base origin `(*batch, 3)` [m] of a point fixed in a frame, world axes."""
-    return batch_first(_point(robot, poses, index, point), poses.batch)
-
-
-def rotation_of_poses(robot: RobotModel, poses: LinkPoses, index: int) -> Rotation:
-    """Axes of a frame in the world `(*batch, 3, 3)`."""
-    return batch_first(_frame_in_base(robot, poses, index)[0], poses.batch)
+    return batch_first(rotation, poses.batch), batch_first(position, poses.batch)
 
 
 def as_point(robot: RobotModel, point: object) -> Vector3:
@@ -209,21 +216,12 @@ def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation,
         UnknownNameError: no such frame.
         ShapeError: q does not fit the robot.
     """
-    poses = link_poses(robot, q)
-    rotation, position = _frame_in_base(robot, poses, robot.frame_index(frame))
-    return batch_first(rotation, poses.batch), batch_first(position, poses.batch) + robot.base_position
+    rotation, position = pose_of_frame(robot, link_poses(robot, q), robot.frame_index(frame))
+    return rotation, position + robot.base_position
 
 
 def point_position(robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)) -> Vector3:
-    """World position `(*batch, 3)` [m] of a point fixed in a frame (coordinates in that frame).
-
-    Example:
-        >>> import torch, forcegp
-        >>> robot = forcegp.load_robot("double_pendulum")
-        >>> q = torch.zeros(5, 2, dtype=torch.float64)
-        >>> point_position(robot, q, robot.frame_names[-1], (0.0, 0.0, -0.5)).shape
-        torch.Size([5, 3])
-    """
+    """World position `(*batch, 3)` [m] of a point fixed in a frame (coordinates in that frame)."""
     R, p = frame_pose(robot, q, frame)
     return p + (R @ as_point(robot, point)[..., None])[..., 0]
 
@@ -231,42 +229,57 @@ def point_position(robot: RobotModel, q: JointVector, frame: str, point: object 
 def point_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> PointJacobian:
-    """J with ṗ = J q̇ for a point fixed in a frame, `(*batch, 3, nq)`, world axes.
-
-    Raises:
-        UnknownNameError: no such frame.
-        ShapeError: q does not fit the robot.
-    """
+    """J with ṗ = J q̇ for a point fixed in a frame, `(*batch, 3, nq)`, world axes; see `frame_jacobian`."""
     return frame_jacobian(robot, q, frame, point)[..., 3:, :]
 
 
 def frame_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> FrameJacobian:
-    """J with [ω; ṗ] = J q̇ for a frame and a point fixed in it, `(*batch, 6, nq)`, world axes."""
+    """J with [ω; ṗ] = J q̇ for a frame and a point fixed in it, `(*batch, 6, nq)`, world axes.
+
+    Raises:
+        UnknownNameError: no such frame.
+        ShapeError: q does not fit the robot.
+    """
     index = robot.frame_index(frame)
     return jacobian_of_poses(robot, link_poses(robot, q), index, as_point(robot, point))
 
 
 def point_motion(
-    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, point: Tensor
-) -> tuple[Vector3, FrameJacobian, Tensor]:
-    """World position, `frame_jacobian` and bias [ω̇; p̈] at q̈ = 0 `(*batch, 6)` of a point, of known links."""
-    x = _point(robot, poses, index, point)
+    robot: RobotModel,
+    poses: LinkPoses,
+    motion: LinkMotion,
+    qd: JointVector,
+    frame: str,
+    point: object = (0.0, 0.0, 0.0),
+) -> PointMotion:
+    """The motion of a point fixed in a frame, from links whose motion is known.
+
+    Raises:
+        UnknownNameError: no such frame.
+    """
+    index, local = robot.frame_index(frame), as_point(robot, point)
+    rotation, origin = _frame_in_base(robot, poses, index)
+    x = origin + batchlast.apply(rotation, local[:, None])
     J, bias = _jacobian(robot, poses, index, x), _bias(robot, poses, motion, index, x)
-    moving = (batch_first(part, poses.batch) for part in (x + robot.base_position[:, None], J, bias))
-    return tuple(moving)  # pyright: ignore[reportReturnType]
+    blocks = rotation, x + robot.base_position[:, None], J, bias
+    return PointMotion.of([batch_first(block, poses.batch) for block in blocks], qd)
 
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
     """`frame_jacobian` from poses already known."""
-    return batch_first(_jacobian(robot, poses, index, _point(robot, poses, index, point)), poses.batch)
+    rotation, origin = _frame_in_base(robot, poses, index)
+    x = origin + batchlast.apply(rotation, point[:, None])
+    return batch_first(_jacobian(robot, poses, index, x), poses.batch)
 
 
 def _jacobian(robot: RobotModel, poses: LinkPoses, index: int, x: Tensor) -> Tensor:
     """J `(6, nq, B)` of the point of a frame that is at x `(3, B)`."""
     linear = poses.linear + batchlast.cross(poses.angular, x[:, None])
-    return torch.cat([poses.angular, linear]) * _movers(robot, index)[:, None]
+    parent = robot.frame_parents[index]
+    moving = torch.zeros_like(robot.revolute) if parent == BASE else robot.ancestors[parent]
+    return torch.cat([poses.angular, linear]) * moving[:, None]
 
 
 def point_velocity(

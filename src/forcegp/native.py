@@ -57,11 +57,7 @@ def _machine() -> str:
 
 
 def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
-    """The shared library of a C++ source text, compiled unless the cache has it.
-
-    Args:
-        source: the text, with functions declared `extern "C"`.
-        level: of optimisation.
+    """The shared library of a C++ source text, with functions `extern "C"`, compiled unless the cache has it.
 
     Raises:
         MissingDependencyError: there is no compiler, it failed, or the cache cannot be written or trusted.

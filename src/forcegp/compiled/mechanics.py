@@ -21,11 +21,10 @@ from forcegp.compiled.program import (
     numbers,
 )
 from forcegp.compiled.source import cpu_kernel, cpu_source
+from forcegp.kinematics import Anchor
 from forcegp.robot.model import BASE, RobotModel
 
 Vector = NDArray[np.floating]
-Anchor = tuple[str, Sequence[float]]
-"""A frame, and a point in its coordinates [m]."""
 
 
 class CompiledMechanics:

@@ -110,12 +110,7 @@ def _shift(c: np.ndarray, h: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Program:
-    """A straight-line program: its graph and the entries of its result, in row-major order.
-
-    Attributes:
-        arguments: names of the joint-space arguments, in the order of the eager function.
-        shape: shape of the result without the batch.
-    """
+    """A straight-line program: its arguments as in the eager function, and its result in row-major order."""
 
     arguments: tuple[str, ...]
     shape: tuple[int, ...]

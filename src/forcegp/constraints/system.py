@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from forcegp import dynamics, kinematics
-from forcegp.constraints.contact import Constraint, ConstraintTerms, MovingPoint
+from forcegp.constraints.contact import Constraint, ConstraintTerms
 from forcegp.constraints.gauss import Equations, Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
 from forcegp.kinematics import LinkMotion, LinkPoses
@@ -142,12 +142,9 @@ class ConstrainedSystem:
         return 8 * (SQUARE * width**2 + LINEAR * width)
 
     def announce_states(self, states: int, copies: float, what: str) -> None:
-        """Announce, or refuse, work on many states; see `announce_memory`.
+        """Announce, or refuse, work on many states at once; see `announce_memory`.
 
-        Args:
-            states: how many are worked on at once.
-            copies: how many times the memory of the equations of motion a state takes at the peak.
-            what: the work, as the subject of a sentence.
+        `copies` is the peak in units of the memory of one state's equations of motion; `what` is the work.
 
         Raises:
             MemoryLimitError: it certainly needs more than is free.
@@ -229,16 +226,13 @@ class ConstrainedSystem:
     ) -> Linearization:
         """The constrained acceleration and the multiplier with their Jacobians by q, q̇ and force.
 
-        q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) with its exact derivatives. If Q depends on the state, as
-        learned forces do, add `dforce` times the derivative of Q.
+        q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) with its exact derivatives, detached from the graph.
+        If Q depends on the state, as learned forces do, add `dforce` times the derivative of Q.
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
             force: `(*batch, nq)` Q, the motor torques and all other forces that the robot file does not know.
             active: `(*batch, n_contacts)` bool, which contacts are closed in each sample; default all.
-
-        Returns:
-            q̈, λ and their Jacobians, detached from the autograd graph.
 
         Raises:
             ShapeError: an argument does not fit.
@@ -272,9 +266,8 @@ class ConstrainedSystem:
         poses = kinematics.link_poses(self.robot, q)
         motion = kinematics.link_motion(self.robot, poses, qd)
 
-        def moving(frame: str, point: Sequence[float]) -> MovingPoint:
-            at = self.robot.frame_index(frame), kinematics.as_point(self.robot, point)
-            return MovingPoint.of(*kinematics.point_motion(self.robot, poses, motion, *at), qd)
+        def moving(frame: str, point: Sequence[float]) -> kinematics.PointMotion:
+            return kinematics.point_motion(self.robot, poses, motion, qd, frame, point)
 
         terms = [contact.terms_of([moving(*at) for at in contact.anchors]) for contact in self.contacts]
         return poses, motion, terms

@@ -1,10 +1,8 @@
 """Contact with a surface, which pushes and never pulls: opening, closing, impact and sliding friction.
 
-The simulator and rollouts share this file. A closed contact opens where its multiplier would turn negative.
-An open contact closes where c ≤ 0 and ċ < 0, with an inelastic impact. Constraints without a surface, such as
-a connection of two points, hold in both directions and never change.
-
-The formulas take tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator.
+A closed contact opens where its multiplier would turn negative. An open contact closes where c ≤ 0 and ċ < 0,
+with an inelastic impact. Other constraints, such as a connection of two points, never change. The formulas
+take tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator.
 """
 
 from __future__ import annotations
@@ -135,18 +133,11 @@ def project_velocity(eom: Any, qd: Array) -> Array:
 def project_state(
     system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
 ) -> tuple[JointVector, JointVector]:
-    """The state on the constraint manifold next to (q, q̇), in the metric of M.
+    """The state on the constraint manifold next to (q, q̇) `(*batch, nq)`, in the metric of M.
 
     Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces push;
-    q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy.
-
-    Args:
-        system: robot and contacts.
-        q, qd: `(*batch, nq)` joint positions and velocities.
-        active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-
-    Returns:
-        q with |c(q)| ≤ 1e−12 m (1e−5 m in float32) and q̇ with A q̇ = 0, for the active contacts.
+    q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy. For the contacts that are
+    `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0.
 
     Raises:
         NumericalError: the iteration does not converge, as where the surface is out of reach.

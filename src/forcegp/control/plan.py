@@ -158,8 +158,8 @@ def _pose_error(
     rotation is −1 and not 3.
     """
     poses = kinematics.link_poses(robot, q)
-    reached = kinematics.rotation_of_poses(robot, poses, index)
-    shift = position - kinematics.point_of_poses(robot, poses, index, x) - robot.base_position
+    reached, origin = kinematics.pose_of_frame(robot, poses, index)
+    shift = position - (origin + reached @ x) - robot.base_position
     error = torch.cat([orientation_error(reached, rotation.expand_as(reached)), shift], dim=-1)
     J, rows = kinematics.jacobian_of_poses(robot, poses, index, x), task_rows(robot.nq)
     asked_for = rows.start > 0 or (reached * rotation).sum((-2, -1)) > 1.0

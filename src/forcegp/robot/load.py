@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
@@ -244,16 +243,11 @@ def load_robot(
 
 
 def _read(source: str | Path) -> Tree:
-    if str(source) in BUNDLED:
-        with as_file(files("forcegp.robot") / "bundled" / f"{source}.urdf") as path:
-            return _read_file(path)
     path = Path(source).expanduser()
-    if not path.suffix and path.name == str(source):
+    if str(source) in BUNDLED:
+        path = Path(__file__).parent / "bundled" / f"{source}.urdf"
+    elif not path.suffix and path.name == str(source):
         raise UnknownNameError("robot", source, (*BUNDLED, "path of a .urdf or .xml file"))
-    return _read_file(path)
-
-
-def _read_file(path: Path) -> Tree:
     root = parse_xml(read_bytes(path), str(path))
     if root.tag == "robot":
         return read_urdf(root, str(path))

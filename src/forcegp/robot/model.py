@@ -155,6 +155,12 @@ class RobotModel:
                 digest.update(value.detach().to("cpu", torch.float64).contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]
 
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """Names of the constants that require a gradient."""
+        values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        return tuple(name for name, x in values if isinstance(x, Tensor) and x.requires_grad)
+
     def frame_index(self, frame: str) -> int:
         """Index of a named frame.
 

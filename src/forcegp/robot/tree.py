@@ -1,7 +1,4 @@
-"""The tree of links and joints that URDF and MJCF files are read into, and its checks.
-
-Checked are names, a single root, supported joints and physical inertia.
-"""
+"""The tree of links and joints that URDF and MJCF files are read into, and its checks."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid link; `frame` says whether the robot keeps its frame."""
+    """A rigid link; the robot keeps its frame if `frame` is true."""
 
     name: str
     inertial: Inertial | None = None
@@ -137,9 +134,7 @@ def checked(tree: Tree) -> Tree:
     """The tree, checked, with its joints in depth-first order, siblings in the order of the file.
 
     Raises:
-        RobotFileError: the links and joints are not a single tree.
-        UnsupportedRobotError: a joint is of an unsupported type.
-        InertiaError: the inertia of a link is not physical.
+        RobotFileError, UnsupportedRobotError, InertiaError: not a tree, a joint, or an inertia is refused.
     """
     _check_names(tree)
     root = _root(tree)

@@ -151,18 +151,10 @@ def _listed(problem: RolloutProblem, state: State, crossed: Tensor) -> list[Cont
 def contact_loss_probability(
     model: ForwardModel, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
 ) -> Tensor:
-    """Probability that a contact would have to pull at a state, and therefore opens.
+    """Probability `(*batch, m)` that a contact would have to pull at states `(*batch, nq)`, and opens.
 
-    P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²). A contact that is open is lost already: its
-    probability is 1.
-
-    Args:
-        model: a model with a posterior over forces.
-        q, qd, tau: `(*batch, nq)` states.
-        active: `(*batch, n_contacts)` bool, closed contacts; default all.
-
-    Returns:
-        `(*batch, m)`, between 0 and 1.
+    P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²); 1 for a contact that is open already. `active`
+    `(*batch, n_contacts)` are the closed contacts; default all.
 
     Raises:
         ModelError: the model gives no variance of the multiplier.

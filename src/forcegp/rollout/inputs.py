@@ -12,10 +12,11 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.control.plan import Plan
-from forcegp.control.task_space import Gains, Target, control_torque, tool_motion
+from forcegp.control.task_space import Gains, Target, control_torque
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
 from forcegp.forces.dry_friction import ForceField
+from forcegp.kinematics import point_motion
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
@@ -126,13 +127,7 @@ Torque = Tensor | Dataset | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Sampled(Inputs):
-    """Torques over time, held or interpolated between samples; the last one is held.
-
-    Args:
-        values: `(n or 1, samples, nq)`.
-        dt: sampling period [s].
-        linear: interpolate linearly instead of holding each sample.
-    """
+    """Torques `(n or 1, samples, nq)` with a period dt [s], held or interpolated; the last one is held."""
 
     values: Tensor
     dt: float
@@ -171,13 +166,7 @@ class Feedback(Inputs):
 
 @dataclass(frozen=True)
 class Disturbed(Inputs):
-    """Inputs with noise, which is held for a period: logged torques are not quite those that acted.
-
-    Args:
-        inputs: torques without the noise.
-        noise: `(n, steps, nq)` [N m].
-        dt: how long each value is held [s].
-    """
+    """Inputs with noise `(n, steps, nq)` [N m], each value held for dt [s], as logged torques are noisy."""
 
     inputs: Inputs
     noise: Tensor
@@ -201,14 +190,10 @@ class Disturbed(Inputs):
 
 @dataclass(frozen=True)
 class TaskSpaceControl(Inputs):
-    """The simulator's task-space controller following a plan, with the analytical mechanics of a system.
+    """The simulator's task-space controller following a plan of period dt [s].
 
-    Args:
-        system: the mechanics that the controller assumes.
-        plan: the motion that it follows.
-        dt: sampling period of the plan [s].
-        gains: its gains.
-        limit: `(nq,)` torque limits [N m]; `None` for the robot's own.
+    It assumes the analytical mechanics of `system`; `limit` `(nq,)` are torque limits [N m], by default those
+    of the robot.
     """
 
     system: ConstrainedSystem
@@ -225,7 +210,7 @@ class TaskSpaceControl(Inputs):
         robot, eom, q, qd = self.system.robot, at.eom, at.q, at.qd
         if at.system.robot is not robot:
             eom = self.system.equations(q, qd)
-        tool = tool_motion(robot, eom.poses, eom.motion, qd, self.plan.frame, self.plan.point)
+        tool = point_motion(robot, eom.poses, eom.motion, qd, self.plan.frame, self.plan.point)
         k = torch.floor(t[:, 0] / self.dt + EDGE).long().clamp(max=len(self.plan.reference.t) - 1)
         target = Target(*(values[k] for values in self.plan.targets))
         command = control_torque(tool, eom, q, qd, target, self.plan.press(eom), self.gains)

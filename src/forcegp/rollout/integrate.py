@@ -146,7 +146,12 @@ def integrate(
             record.write(state, now, alive)
             if k == steps:
                 break
-            reached = _stepped(problem, step, state, now, torch.where(alive[:, None], h, 0.0), record, alive)
+            length = torch.where(alive[:, None], h, 0.0)
+            if problem.unilateral:
+                reached, events = advance(problem, step, state, now, length)
+                record.note(events, alive)
+            else:
+                reached = step(problem, state, now, length)
             if project:
                 q, qd = project_state(problem.system, reached.q, reached.qd, reached.active & alive[:, None])
                 reached = State(reached.t, q, qd, reached.active)
@@ -159,17 +164,6 @@ def integrate(
         if progress is not None:
             progress(k + 1, steps)
     return _result(problem, record, dt)
-
-
-def _stepped(
-    problem: RolloutProblem, step: Step, state: State, now: Instant, h: Tensor, record: _Record, alive: Tensor
-) -> State:
-    """The state one step later, with the contacts that open and close on the way."""
-    if not problem.unilateral:
-        return step(problem, state, now, h)
-    after, events = advance(problem, step, state, now, h)
-    record.note(events, alive)
-    return after
 
 
 def _stopping(step: Step) -> Step:

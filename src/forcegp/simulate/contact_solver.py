@@ -82,7 +82,8 @@ class ContactSolverEngine(MuJoCoWorld):
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque
         self._mujoco.mj_forward(self._model, data)
-        qdd, later = self._of_the_step()
+        M, hD = self._mass_matrix(data), self._model.opt.timestep * self._model.dof_damping
+        qdd = np.linalg.solve(M + np.diag(hD), M @ data.qacc)
         contacts = [self._contact_force(*pair) for pair in self._pairs]
         none = np.zeros((0, 2, len(dof))), np.zeros((0, 2, 3))
         Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else none
@@ -90,20 +91,13 @@ class ContactSolverEngine(MuJoCoWorld):
         whole = data.qfrc_applied + data.qfrc_passive + data.qfrc_constraint - data.qfrc_bias
         return SolvedForces(
             qdd=qdd[dof],
-            Q=(whole + later)[dof] - Q_I - Q_z,
+            Q=(whole - hD * qdd)[dof] - Q_I - Q_z,
             Q_I=Q_I,
             Q_z=Q_z,
             multiplier=np.linalg.norm(F[:, 0], axis=-1),
             F_I=F[:, 0],
             F_z=F[:, 1],
         )
-
-    def _of_the_step(self) -> tuple[np.ndarray, np.ndarray]:
-        """q̈ with which the next step changes the velocity, and −h D q̈, by which friction differs then."""
-        model, data = self._model, self._data
-        M, hD = self._mass_matrix(data), model.opt.timestep * model.dof_damping
-        qdd = np.linalg.solve(M + np.diag(hD), M @ data.qacc)
-        return qdd, -hD * qdd
 
     def step(self) -> None:
         """Advance by the sampling period under the torque last given to `forces`."""

@@ -11,7 +11,6 @@ from torch import Tensor
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.control.plan import Plan
-from forcegp.control.task_space import tool_motion
 from forcegp.control.trajectory import Reference
 from forcegp.data.dataset import Dataset
 from forcegp.data.fields import DataHeader
@@ -140,7 +139,7 @@ def make_result(
     robot = system.robot
     poses = kinematics.link_poses(robot, log.q)
     motion = kinematics.link_motion(robot, poses, log.qd)
-    tool = tool_motion(robot, poses, motion, log.qd, plan.frame, plan.point)
+    tool = kinematics.point_motion(robot, poses, motion, log.qd, plan.frame, plan.point)
     beyond = ((log.q < robot.lower) | (log.q > robot.upper)).any(-1)
     return SimulationResult(
         data=_dataset(system, config, plan, log, engine, generator),
