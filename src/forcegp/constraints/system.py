@@ -31,8 +31,8 @@ CERTAIN = 0.25
 class Baumgarte:
     """Makes the constraint error a damped oscillator, c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
 
-    Since c̈ = A q̈ − b, the stabilized right-hand side is b̃ = b − 2ωξ A q̇ − ω² c: the signs that the
-    paper prints in eq. (30) are the opposite ones, with which the error grows.
+    The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c; the signs that the paper prints in eq. (30)
+    are the opposite ones, with which the error grows.
 
     Args:
         natural_frequency: ω > 0 [rad/s].

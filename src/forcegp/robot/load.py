@@ -103,19 +103,16 @@ def _merge(tree: Tree, placed: _Placed) -> list[Inertial]:
     parts: list[list[Inertial]] = [[] for _ in placed.moving]
     for link in tree.links:
         index, T = placed.links[link.name]
-        if link.inertial is None or index == BASE:
-            continue
-        body, R = link.inertial, T[:3, :3]
-        parts[index].append(Inertial(body.mass, R @ body.com + T[:3, 3], R @ body.inertia @ R.T))
+        if link.inertial is not None and index != BASE:
+            body, R = link.inertial, T[:3, :3]
+            parts[index].append(Inertial(body.mass, R @ body.com + T[:3, 3], R @ body.inertia @ R.T))
     return [_sum(bodies) for bodies in parts]
 
 
 def _sum(bodies: list[Inertial]) -> Inertial:
-    mass = sum(body.mass for body in bodies)
-    if mass == 0.0:
-        return Inertial(0.0, np.zeros(3), sum((body.inertia for body in bodies), np.zeros((3, 3))))
-    com = sum((body.mass / mass * body.com for body in bodies), np.zeros(3))
-    inertia = np.zeros((3, 3))
+    mass, com, inertia = sum((body.mass for body in bodies), 0.0), np.zeros(3), np.zeros((3, 3))
+    for body in bodies:
+        com += body.mass / (mass or 1.0) * body.com
     for body in bodies:
         d = body.com - com
         inertia += body.inertia + body.mass * (d @ d * np.eye(3) - np.outer(d, d))

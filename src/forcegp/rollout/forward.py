@@ -130,9 +130,6 @@ def rollout(
         options: step, method, stabilization.
         progress: called after each step.
 
-    Returns:
-        The trajectories.
-
     Raises:
         DivergedError: a trajectory diverged; the error holds what was computed.
         ShapeError: an argument does not fit the robot.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -23,21 +23,6 @@ EDGE = 1e-6
 """Part of a sampling period within which a time counts as a sampling time, against rounding."""
 EVEN = 0.02
 """Largest deviation of a step from the sampling period, relative to the period, in a log that is replayed."""
-
-
-@runtime_checkable
-class PredictedQuantity(Protocol):
-    """A predicted quantity."""
-
-    @property
-    def mean(self) -> Tensor:
-        """`(*batch, d)`."""
-        ...
-
-    @property
-    def std(self) -> Tensor | None:
-        """`(*batch, d)` standard deviation, `None` without one."""
-        ...
 
 
 @runtime_checkable
@@ -81,8 +66,8 @@ class ForwardModel(Protocol):
         *,
         active: Tensor | None = None,
         covariance: bool = True,
-    ) -> PredictedQuantity:
-        """Predict a quantity at states `(*batch, nq)`."""
+    ) -> Any:
+        """`mean` and `std` `(*batch, d)` of a quantity at states `(*batch, nq)`; `std` may be `None`."""
         ...
 
 

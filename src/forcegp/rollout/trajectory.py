@@ -134,13 +134,9 @@ class Rollout:
             joints: which joints or contacts; default all.
             ax: matplotlib axes to draw on, one per panel; default a new figure.
 
-        Returns:
-            The axes, one per panel.
-
         Raises:
             UnknownNameError: no such quantity or joint.
-            ParameterError: several trajectories (choose one: `rollout[0].plot()`), or the number of axes is
-                not that of the panels.
+            ParameterError: several trajectories (choose one: `rollout[0].plot()`), or a wrong number of axes.
         """
         from forcegp.plots import MEASURED, PREDICTED, Curve, Panel, Timeline, axis_label, chosen, draw_panels
 

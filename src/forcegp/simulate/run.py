@@ -133,12 +133,10 @@ def simulate(
 ) -> SimulationResult:
     """Simulate a motion of the robot, in contact or free, and log it.
 
-    The engine moves the robot under Q_u + Q_D + Q_I + Q_z, where the motor torque Q_u comes from a
-    task-space controller, the normal force Q_I from the constrained equations of motion with their
-    Baumgarte terms, and Q_z is viscous friction at the contact (section 5 of the paper).
-
-    Surface contacts are unilateral: one opens when its multiplier would turn negative, and closes with an
-    inelastic impact. The run is computed on the CPU, where the data stay.
+    The engine moves the robot under Q_u + Q_D + Q_I + Q_z: the motor torque of a task-space controller, joint
+    friction, the normal force of the constrained equations of motion with their Baumgarte terms, and viscous
+    friction at the contact (section 5 of the paper). A contact opens when its multiplier would turn negative,
+    and closes with an inelastic impact. The run is computed on the CPU, where the data stay.
 
     Args:
         system: robot and contacts; without contacts the motion is free.
@@ -152,8 +150,7 @@ def simulate(
         >>> import forcegp
         >>> from forcegp.simulate import SimulationConfig
         >>> system = forcegp.load_scene("kuka_plane").system()
-        >>> result = simulate(system, SimulationConfig(duration=0.1, engine="mujoco"))
-        >>> len(result.data)
+        >>> len(simulate(system, SimulationConfig(duration=0.1, engine="mujoco")).data)
         24
 
     Raises:
