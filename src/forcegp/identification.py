@@ -193,8 +193,7 @@ def identify(
         >>> robot = forcegp.load_robot("double_pendulum")
         >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
         >>> qdd = forcegp.dynamics.forward_dynamics(robot, q, qd, tau - 0.5 * qd)
-        >>> found = identify(robot, q, qd, qdd, tau, friction=True)
-        >>> found.damping.shape
+        >>> identify(robot, q, qd, qdd, tau, friction=True).damping.shape
         (2,)
 
     Raises:

@@ -1,8 +1,8 @@
 """Poses, Jacobians and bias accelerations of a tree of joints, batched over states.
 
-Convention, stated once: spatial vectors are `[angular, linear]`, in world axes, about the origin of the
-base. With the joint screws s_j so expressed and the ancestor matrix E, the twist of link i is
-V_i = Σ_j E_ij s_j q̇_j, so only the poses need a recursion, over the depth of the tree.
+Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With the joint screws
+s_j so expressed and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses
+need a recursion, over the depth of the tree.
 """
 
 from __future__ import annotations
@@ -98,11 +98,7 @@ def skew(v: Vector3) -> Rotation:
 
 
 def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
-    """Joint-space arguments, checked and broadcast to one batch.
-
-    Raises:
-        ShapeError: one does not fit the robot, or their batches do not fit each other.
-    """
+    """Joint-space arguments, checked and broadcast to one batch; ShapeError if one does not fit."""
     robot.check_state(**states)
     if len({value.shape for value in states.values()}) == 1:
         return tuple(states.values())

@@ -139,11 +139,10 @@ def cache_directory() -> Path:
 
 
 def private_folder(folder: Path) -> Path:
-    """The folder, made for its owner alone where it does not exist.
+    """The folder, made for its owner alone where it does not exist (OSError if it cannot be made).
 
     Raises:
         MissingDependencyError: others own it or can write to it or replace it; names the folder at fault.
-        OSError: it cannot be made.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
@@ -215,11 +214,7 @@ def _trusted(path: Path) -> bool:
 
 
 def store(folder: Path, key: str, content: bytes) -> Path:
-    """Write a kernel.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a kernel; OSError if it cannot be written."""
     library = folder / f"{key}-{hashlib.sha256(content).hexdigest()}.so"
     with atomic_file(library, mode=0o600) as temporary:
         temporary.chmod(0o600)

@@ -70,13 +70,7 @@ extern "C" __global__ void kernel({parameters}, T* out, int batch) {{
 
 @dataclass(frozen=True)
 class Source:
-    """Source text and the arrays that its kernel reads.
-
-    Attributes:
-        text: the source.
-        arrays: names of the arrays, in the order of the kernel's arguments: an argument of the
-            quantity, or "sin" or "cos" of q.
-    """
+    """Source text, and the arrays that its kernel reads: arguments of the quantity, "sin" or "cos" of q."""
 
     text: str
     arrays: tuple[str, ...]

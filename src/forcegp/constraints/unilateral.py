@@ -197,14 +197,9 @@ def contact_forces(
     Q_u: Array,
     viscous_friction: float,
 ) -> ContactForces:
-    """Normal and friction force under the torque Q_u, after every contact that would have to pull has opened.
+    """Normal and friction force at a state `(nq,)` under the torque Q_u [N m], once no contact has to pull.
 
-    Args:
-        system: robot and contacts.
-        q, qd: `(nq,)` the state.
-        landing: the contacts closed so far, and the equations of motion with them.
-        Q_u: `(nq,)` motor torque [N m].
-        viscous_friction: θ_v [N s/m].
+    `landing` holds the closed contacts and their equations of motion, `viscous_friction` is θ_v [N s/m].
     """
     closed, eom = landing.closed, landing.eom
     # Q = Q_C + Q_G + Q_D + Q_u

@@ -114,17 +114,11 @@ def inverse_kinematics(
     starts: Tensor,
     near: JointVector,
 ) -> JointVector:
-    """Joint positions `(nq,)` that put a point of a frame at a pose, by damped least squares.
+    """Joint positions `(nq,)` that put a point of a frame at a pose, by damped least squares from `starts`.
 
-    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move to `near` in the null space of J. An
-    arm with fewer than six joints is asked for the position alone.
-
-    Args:
-        robot: the robot.
-        frame, point: the tool point, fixed in a frame.
-        position, rotation: `(3,)` [m] and `(3, 3)` wanted in the world.
-        starts: `(k, nq)` where to start from.
-        near: `(nq,)` of the solutions found, the one next to this is taken.
+    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move to `near` `(nq,)` in the null space of
+    J, and of the solutions from `starts` `(k, nq)` the one next to it is taken. The pose in the world is
+    `(3,)` [m] and `(3, 3)`; an arm with fewer than six joints is asked for the position alone.
 
     Raises:
         NumericalError: no start leads to the pose within the joint limits.

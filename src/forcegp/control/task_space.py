@@ -98,13 +98,8 @@ def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Array:
 def joint_acceleration(tool: PointMotion, task: Array, posture: Array) -> Array:
     """y = J⁺(a − J̇q̇) + (I − J⁺J) y₀: the task's acceleration, and the posture's in its null space.
 
-    J are the rows of the tool's Jacobian that the arm can follow (`task_rows`); an arm with fewer joints than
-    these, such as a double pendulum, comes as close as it can.
-
-    Args:
-        tool: the tool at the state.
-        task: a `(*batch, 6)` wanted acceleration of the tool.
-        posture: y₀ `(*batch, nq)` wanted acceleration of the joints, as far as the task leaves it free.
+    a `(*batch, 6)` is the task's and y₀ `(*batch, nq)` the posture's. J are the rows of the tool's Jacobian
+    that the arm can follow (`task_rows`); an arm with fewer joints than these comes as close as it can.
 
     Raises:
         NumericalError: the arm is singular, so that the task cannot be reached.

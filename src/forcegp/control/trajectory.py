@@ -36,7 +36,7 @@ class Trapezoid(NamedTuple):
     acceleration: Tensor
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Distance, speed and acceleration at time t since the start of the segment (held after its end)."""
+        """Distance, speed and acceleration at time t since the start of the segment, held after its end."""
         t = torch.minimum(t.clamp(min=0.0), self.travel_time)
         remaining = self.travel_time - t
         a, blend = self.acceleration, self.blend_time
@@ -77,8 +77,7 @@ class Chart:
     Args:
         center: `(3,)` origin, on the surface where there is one [m].
         axes: `(3, 3)` rows: directions of u, v, and the normal at the centre.
-        surface: the curved surface that u and v are laid onto; `None` where the chart is linear, on a
-            plane and in free space.
+        surface: the curved surface under u and v; `None` for a linear chart, on a plane and in free space.
     """
 
     center: Tensor

@@ -74,8 +74,8 @@ _HANDLER = threading.RLock()
 def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
     """Collect MuJoCo's warnings, which would otherwise go to a log file in the working folder.
 
-    The handler belongs to the whole process: one reader at a time replaces it, warnings of other threads
-    go on to theirs, and it is put back.
+    The handler belongs to the process: one reader at a time replaces it and puts it back, and warnings of
+    other threads go on to theirs.
     """
     thread = threading.get_ident()
     with _HANDLER:

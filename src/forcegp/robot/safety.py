@@ -49,11 +49,7 @@ class _BoundedBuilder(TreeBuilder):
 
 
 def read_bytes(path: Path) -> bytes:
-    """Content of a regular file of at most `MAX_BYTES`.
-
-    Raises:
-        RobotFileError: the file is missing, not a regular file, unreadable or too large.
-    """
+    """Content of a regular file of at most `MAX_BYTES`; RobotFileError if there is none."""
     try:
         if not path.is_file():
             kind = "a folder" if path.is_dir() else "something else" if path.exists() else "no such file"

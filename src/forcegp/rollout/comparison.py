@@ -120,10 +120,7 @@ class Comparison:
         return float(inside.to(self.q.dtype).mean())
 
     def inflation(self, model: str, level: float = LEVEL) -> float:
-        """Factor by which bands must grow to cover a share `level` of tip coordinates (`widening`).
-
-        It counts trajectories, which must not overlap; infinite with too few, such as below 9 for 0.9.
-        """
+        """Factor by which bands must grow to cover a share `level` of tip coordinates (`widening`)."""
         return widening(*self._tip_along(model, level), level)
 
     def _tip_along(self, model: str, level: float) -> tuple[Tensor, Bands]:

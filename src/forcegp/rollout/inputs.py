@@ -206,14 +206,11 @@ class TaskSpaceControl(Inputs):
 def inputs_of(
     tau: Torque, batch: torch.Size, rows: int, dt: float | None, interpolation: str = "hold"
 ) -> Inputs:
-    """Inputs from what a caller passes.
+    """Inputs from what a caller passes, for `rows` trajectories, a multiple of the batch of initial states.
 
-    Args:
-        tau: `(*batch, samples, nq)` or `(samples, nq)`, a log, a law of (t, q, q̇), or inputs.
-        batch: batch of the initial states.
-        rows: number of trajectories; a multiple of the batch.
-        dt: sampling period of an array [s]; a log has its own, and a single sample is a constant torque.
-        interpolation: `"hold"` or `"linear"`.
+    `tau` is `(*batch, samples, nq)` or `(samples, nq)` with a period dt [s], a log, which has its own period,
+    a law of (t, q, q̇), or inputs; a single sample is a constant torque. `interpolation` is `"hold"` or
+    `"linear"`.
 
     Raises:
         UnknownNameError: unknown interpolation.

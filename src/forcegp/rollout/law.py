@@ -93,10 +93,8 @@ def compliance_of(G: Tensor) -> Tensor:
 def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Tensor) -> Stuck:
     """The dry friction of joints over a step h `(n, 1)` [s] from velocities q̇ `(n, nq)`; 0 for an instant.
 
-    Args:
-        qdd: `(n, nq)` acceleration without it [rad/s², m/s²].
-        G: `(n, nq, nq)` acceleration per dry friction, H or M⁻¹.
-        limit: `(n, nq)` its largest size F ≥ 0 [N m, N].
+    `qdd` is the acceleration without it, `G` `(n, nq, nq)` acceleration per friction, H or M⁻¹, and `limit`
+    `(n, nq)` the largest size F ≥ 0 [N m, N].
 
     Raises:
         NumericalError: no friction solves the problem, since G is not positive definite.

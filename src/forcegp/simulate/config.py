@@ -52,11 +52,7 @@ class ContactSolver:
         check_setting("friction", 0.0 <= self.friction < float("inf"), NOT_NEGATIVE, self.friction)
 
     def substeps(self, dt: float) -> int:
-        """Steps of the engine in a sampling period.
-
-        Raises:
-            ParameterError: it is not a multiple of `step`.
-        """
+        """Steps of the engine in a sampling period dt [s]; ParameterError unless a multiple of `step`."""
         if self.step is None:
             return math.ceil(dt / LONGEST_STEP - WHOLE)
         steps = dt / self.step

@@ -27,8 +27,7 @@ class RunLog:
     Attributes:
         q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)`; qdd is the engine's acceleration, without noise.
         multiplier, c: `(n, m)`.
-        contact: `(n, n_contacts)` bool.
-        saturated: `(n,)` bool, a torque limit was hit.
+        contact, saturated: `(n, n_contacts)` and `(n,)` bool; whether a torque limit was hit.
         contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, where an engine of its own computed them [N].
         measured: what sensors say instead of `q`, `qd`, `tau`, where they are not perfect.
     """
