@@ -22,12 +22,12 @@ import torch
 from results_page import table, write_section
 from torch import Tensor
 
+from forcegp.constraints import project_state
 from forcegp.control.plan import make_plan
 from forcegp.data import Dataset, select_points
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.rollout import RolloutOptions, TaskSpaceControl
-from forcegp.rollout.integrate import project_state
 from forcegp.scene import load_scene
 from forcegp.simulate import SimulationConfig, SimulationResult, simulate
 

@@ -32,6 +32,7 @@ from real_models import rigid, structured
 from torch import Tensor
 
 import forcegp
+from forcegp.errors import optional_module
 from forcegp.evaluation.least_squares import identify_rigid
 from forcegp.forces.inertia import latent_precision, one_row
 from forcegp.forces.priors.inertial import InertialPrior
@@ -39,7 +40,6 @@ from forcegp.identification import regressor
 from forcegp.logs import parse_mapping
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.model import RobotModel
-from forcegp.simulate.mujoco import import_mujoco
 from forcegp.simulate.urdf import write_urdf
 
 ARMS = ("franka_panda", "kuka_iiwa14", "ur5")
@@ -138,7 +138,7 @@ class Arm:
     """
 
     def __init__(self, robot: RobotModel, wrong: Imperfections, random: np.random.Generator) -> None:
-        self.mujoco = mujoco = import_mujoco()
+        self.mujoco = mujoco = optional_module("mujoco", "This benchmark")
         self.robot, self.wrong, self.random = robot, wrong, random
         self.file = mujoco.MjModel.from_xml_string(write_urdf(robot))
         self.file.opt.gravity[:] = robot.gravity.numpy()

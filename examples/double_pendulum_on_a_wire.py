@@ -11,7 +11,7 @@ import sys
 import torch
 
 import forcegp
-from forcegp.rollout.integrate import project_state
+from forcegp.constraints import project_state
 
 figure = next((x for x in sys.argv[1:] if x.endswith(".png")), "double_pendulum_on_a_wire.png")
 torch.manual_seed(0)

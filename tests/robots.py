@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 import forcegp
+from forcegp import dynamics, kinematics
 from forcegp.errors import RobotFileWarning
 from forcegp.robot.load import BUNDLED
 from forcegp.robot.model import RobotModel
@@ -103,3 +104,16 @@ def random_states(robot: RobotModel, count: int, seed: int = 0) -> tuple[torch.T
     random = np.random.default_rng(seed)
     ranges = (np.pi, 2.0, 3.0, 20.0)
     return tuple(torch.as_tensor(random.uniform(-r, r, (count, robot.nq))) for r in ranges)
+
+
+def kinetic_energy(robot: RobotModel, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
+    """½ q̇ᵀ M q̇, `(*batch,)` [J]."""
+    M = dynamics.mass_matrix(robot, q)
+    return 0.5 * torch.einsum("...i,...ij,...j->...", qd, M, qd)
+
+
+def potential_energy(robot: RobotModel, q: torch.Tensor) -> torch.Tensor:
+    """−Σ m g·c, relative to the base origin, `(*batch,)` [J]; its gradient is −Q_G."""
+    poses = kinematics.link_poses(robot, q)
+    moment = dynamics.link_inertia(robot, poses).moment.sum(1)
+    return -torch.einsum("kb,k->b", moment, robot.gravity).reshape(poses.batch)

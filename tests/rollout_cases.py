@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 import forcegp
-from forcegp.constraints import Baumgarte, ConstrainedSystem, Plane, SurfaceContact
+from forcegp.constraints import Baumgarte, ConstrainedSystem, Plane, SurfaceContact, project_state
 from forcegp.control.plan import make_plan
 from forcegp.data import Dataset
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.rollout import ForceLaw
-from forcegp.rollout.integrate import project_state
 from forcegp.simulate import SimulationConfig, SimulationResult, make_engine, simulate
 from forcegp.simulate.result import make_result
 from forcegp.simulate.run import _follow as follow

@@ -13,7 +13,7 @@ from forcegp import dynamics
 from forcegp.errors import ShapeError
 from forcegp.robot.model import RobotModel
 from random_robots import Mirror, random_robot
-from robots import random_states
+from robots import kinetic_energy, potential_energy, random_states
 
 SEEDS = range(8)
 EXACT = 1e-10  # of the largest entry: double precision over some hundred operations, with a wide margin
@@ -76,7 +76,7 @@ def test_energy_grows_by_the_power_of_the_force(seed: int) -> None:
     qdd = dynamics.forward_dynamics(robot, q, qd, force)
 
     def energy(q: Tensor, qd: Tensor) -> Tensor:
-        return dynamics.kinetic_energy(robot, q, qd) + dynamics.potential_energy(robot, q)
+        return kinetic_energy(robot, q, qd) + potential_energy(robot, q)
 
     power = jvp(energy, (q, qd), (qd, qdd))[1]
     assert relative(power, (qd * force).sum(-1)) < 1e-9  # a difference of larger terms
@@ -88,9 +88,9 @@ def test_bias_force_is_lagranges(seed: int) -> None:
     robot = random_robot(seed)
     q, qd = (x[0] for x in random_states(robot, 1, seed)[:2])
     Mdot = jvp(lambda q: dynamics.mass_matrix(robot, q), (q,), (qd,))[1]
-    lagrange = -Mdot @ qd + jacrev(lambda q: dynamics.kinetic_energy(robot, q, qd))(q)
+    lagrange = -Mdot @ qd + jacrev(lambda q: kinetic_energy(robot, q, qd))(q)
     assert relative(dynamics.bias_force(robot, q, qd), lagrange) < EXACT
-    slope = jacrev(lambda q: dynamics.potential_energy(robot, q))(q)
+    slope = jacrev(lambda q: potential_energy(robot, q))(q)
     assert relative(dynamics.gravity_force(robot, q), -slope) < EXACT
 
 
@@ -185,7 +185,7 @@ def test_batches_of_any_shape(batch: tuple[int, ...]) -> None:
     assert result.shape == (*batch, robot.nq)
     flat = dynamics.forward_dynamics(robot, *(x.reshape(-1, robot.nq) for x in (q, qd, f)))
     assert torch.equal(result.reshape(-1, robot.nq), flat)
-    for energy in (dynamics.potential_energy(robot, q), dynamics.kinetic_energy(robot, q, qd)):
+    for energy in (potential_energy(robot, q), kinetic_energy(robot, q, qd)):
         assert energy.shape == batch
 
 

@@ -63,10 +63,8 @@ def _inverse_derivatives(
     ∂τ_i/∂q_j = S_i·(2B Ṡ_j + I S̈_j) for j that moves i, S_i·(2B Ṡ_j + I S̈_j + S_j ×* F) of subtree j
     for i that moves j; ∂τ/∂q̇ has S and 2 Ṡ in place of Ṡ and S̈, and no F.
     """
-    E, Et = robot.ancestors, robot.ancestors.mT
-    z, l, omega, v = poses.angular, poses.linear, motion.omega, motion.velocity
-    alpha = motion.alpha + sum_over(E, z * qdd)
-    a = motion.acceleration + sum_over(E, l * qdd) - robot.gravity[:, None, None]
+    Et, z, l, omega, v = robot.ancestors.mT, poses.angular, poses.linear, motion.omega, motion.velocity
+    alpha, a = dynamics.accelerations(robot, poses, motion, qdd)
     torque, force = dynamics.link_force(links, motion, alpha, a)
 
     N, momentum = (sum_over(Et, x) for x in _gyration(links, omega, v))
@@ -105,11 +103,7 @@ def _inverse_derivatives(
 def inverse_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector
 ) -> InverseDynamicsDerivatives:
-    """Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈.
-
-    Args:
-        robot: the robot.
-        q, qd, qdd: `(*batch, nq)` joint positions, velocities, accelerations.
+    """Jacobians of `inverse_dynamics` by q, q̇ and q̈ at states `(*batch, nq)`.
 
     Raises:
         ShapeError: an argument does not fit the robot.
@@ -118,19 +112,14 @@ def inverse_dynamics_derivatives(
     poses = link_poses(robot, q)
     links, motion = dynamics.link_inertia(robot, poses), link_motion(robot, poses, qd)
     dq, dqd = _inverse_derivatives(robot, poses, links, motion, batch_last(qdd, 1))
-    M = dynamics.mass_matrix_of_poses(robot, poses, links)
-    return InverseDynamicsDerivatives(batch_first(dq, poses.batch), batch_first(dqd, poses.batch), M)
+    M = dynamics.mass_matrix_of(robot, poses, links)
+    return InverseDynamicsDerivatives(*(batch_first(x, poses.batch) for x in (dq, dqd, M)))
 
 
 def forward_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector
 ) -> ForwardDynamicsDerivatives:
-    """Jacobians of `forward_dynamics`: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹, at its q̈.
-
-    Args:
-        robot: the robot.
-        q, qd: `(*batch, nq)` joint positions and velocities.
-        force: `(*batch, nq)` generalized force [N m, N].
+    """Jacobians of `forward_dynamics` by q, q̇ and force: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹, at its q̈.
 
     Raises:
         ShapeError: an argument does not fit the robot.
@@ -143,8 +132,5 @@ def forward_dynamics_derivatives(
     inverse = batchlast.solve_spd(M, eye.expand_as(M))
     qdd = apply(inverse, batch_last(force, 1) - needed)
     dq, dqd = _inverse_derivatives(robot, poses, links, motion, qdd)
-    return ForwardDynamicsDerivatives(
-        batch_first(-batchlast.product(inverse, dq), poses.batch),
-        batch_first(-batchlast.product(inverse, dqd), poses.batch),
-        batch_first(inverse, poses.batch),
-    )
+    jacobians = -batchlast.product(inverse, dq), -batchlast.product(inverse, dqd), inverse
+    return ForwardDynamicsDerivatives(*(batch_first(x, poses.batch) for x in jacobians))

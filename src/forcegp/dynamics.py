@@ -46,8 +46,8 @@ def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
     return LinkInertia(mass, moment, torch.addcmul(inertia, eye, dot(c, moment)))
 
 
-def _mass_matrix(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
-    """`mass_matrix_of_poses` with the batch last, `(nq, nq, B)`."""
+def mass_matrix_of(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
+    """M_ij = s_iᵀ I^c_j s_j for i an ancestor of j, composite I^c = Eᵀ I, plus the drives, `(nq, nq, B)`."""
     E, S, L = robot.ancestors, poses.angular, poses.linear
     whole = LinkInertia(E.mT @ links.mass, sum_over(E.mT, links.moment), sum_over(E.mT, links.inertia))
     angular, linear = momentum(whole, S, L)
@@ -55,11 +55,6 @@ def _mass_matrix(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Ten
     strictly = torch.tril(E, -1)
     upper = torch.addcmul(torch.diag(robot.armature)[..., None], M, E.mT[..., None])
     return torch.addcmul(upper, M.transpose(0, 1), strictly[..., None])
-
-
-def mass_matrix_of_poses(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> JointMatrix:
-    """M_ij = s_iᵀ I^c_j s_j for i an ancestor of j, composite inertias I^c = Eᵀ I, plus the drives."""
-    return batch_first(_mass_matrix(robot, poses, links), poses.batch)
 
 
 def _gravity_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
@@ -92,8 +87,7 @@ def _joint_force(robot: RobotModel, poses: LinkPoses, torque: Tensor, force: Ten
 
 def _bias_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion) -> Tensor:
     """Q_C with the batch last, `(nq, B)`."""
-    torque, force = link_force(links, motion, motion.alpha, motion.acceleration)
-    return -_joint_force(robot, poses, torque, force)
+    return -_joint_force(robot, poses, *link_force(links, motion, motion.alpha, motion.acceleration))
 
 
 def known_terms(
@@ -101,9 +95,18 @@ def known_terms(
 ) -> tuple[JointMatrix, JointVector, JointVector, JointVector]:
     """M, Q_C, Q_G and Q_D, all that the robot file knows, from links whose motion is known."""
     links, Q_D = link_inertia(robot, poses), damping_force(robot, qd)
-    M, Q_C = _mass_matrix(robot, poses, links), _bias_force(robot, poses, links, motion)
+    M, Q_C = mass_matrix_of(robot, poses, links), _bias_force(robot, poses, links, motion)
     Q_G = _gravity_force(robot, poses, links)
     return *(batch_first(x, poses.batch) for x in (M, Q_C, Q_G)), Q_D  # pyright: ignore[reportReturnType]
+
+
+def accelerations(
+    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qdd: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Spatial accelerations `(3, nq, B)` of the links at q̈ `(nq, B)`; gravity enters as one of the base."""
+    E = robot.ancestors
+    linear = motion.acceleration + sum_over(E, poses.linear * qdd) - robot.gravity[:, None, None]
+    return motion.alpha + sum_over(E, poses.angular * qdd), linear
 
 
 def equation_of_motion(
@@ -113,18 +116,11 @@ def equation_of_motion(
     # Gravity enters as an acceleration of the base, so one pass gives both forces.
     lifted = motion.acceleration - robot.gravity[:, None, None]
     torque, force = link_force(links, motion, motion.alpha, lifted)
-    return _mass_matrix(robot, poses, links), _joint_force(robot, poses, torque, force)
+    return mass_matrix_of(robot, poses, links), _joint_force(robot, poses, torque, force)
 
 
 def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
-    """Generalized mass matrix M(q), symmetric positive definite.
-
-    Args:
-        robot: the robot.
-        q: `(*batch, nq)` joint positions [rad, m].
-
-    Returns:
-        `(*batch, nq, nq)` [kg m², kg m, kg].
+    """Generalized mass matrix M(q) `(*batch, nq, nq)`, symmetric positive definite [kg m², kg m, kg].
 
     Example:
         >>> import torch, forcegp
@@ -137,18 +133,11 @@ def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
         ShapeError: q does not fit the robot.
     """
     poses = link_poses(robot, q)
-    return mass_matrix_of_poses(robot, poses, link_inertia(robot, poses))
+    return batch_first(mass_matrix_of(robot, poses, link_inertia(robot, poses)), poses.batch)
 
 
 def gravity_force(robot: RobotModel, q: JointVector) -> JointVector:
     """Generalized gravity force Q_G(q), `(*batch, nq)` [N m, N].
-
-    Example:
-        >>> import torch, forcegp
-        >>> robot = forcegp.load_robot("double_pendulum")
-        >>> q = torch.zeros(5, 2, dtype=torch.float64)
-        >>> gravity_force(robot, q).shape
-        torch.Size([5, 2])
 
     Raises:
         ShapeError: q does not fit the robot.
@@ -159,13 +148,6 @@ def gravity_force(robot: RobotModel, q: JointVector) -> JointVector:
 
 def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVector:
     """Generalized Coriolis and centrifugal force Q_C(q, q̇) on the right-hand side, `(*batch, nq)` [N m, N].
-
-    Example:
-        >>> import torch, forcegp
-        >>> robot = forcegp.load_robot("double_pendulum")
-        >>> q = torch.zeros(5, 2, dtype=torch.float64)
-        >>> bias_force(robot, q, torch.ones_like(q)).shape
-        torch.Size([5, 2])
 
     Raises:
         ShapeError: q or qd does not fit the robot.
@@ -179,21 +161,9 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
 def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None = None) -> JointVector:
     """Joint friction of the robot: viscous, Coulomb (smoothed at zero speed) and the Stribeck effect.
 
-    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]; see Armstrong-Hélouvry,
-    Dupont, Canudas de Wit, *A survey of models, analysis tools and compensation methods for the control of
-    machines with friction* (Automatica 30, 1994). It is smooth, so it can be integrated and differentiated.
-
-    Args:
-        robot: the robot.
-        qd: `(*batch, nq)` joint velocities.
-        slip: `(*batch, nq)` direction of sliding, in place of tanh(q̇/v_0).
-
-    Example:
-        >>> import torch, forcegp
-        >>> robot = forcegp.load_robot("double_pendulum")
-        >>> q = torch.zeros(5, 2, dtype=torch.float64)
-        >>> damping_force(robot, torch.ones_like(q)).shape
-        torch.Size([5, 2])
+    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]; `slip` `(*batch, nq)` is a
+    direction of sliding in place of tanh(q̇/v_0). See Armstrong-Hélouvry, Dupont, Canudas de Wit, *A survey of
+    models, analysis tools and compensation methods for the control of machines with friction* (1994).
 
     Raises:
         ShapeError: qd does not fit the robot.
@@ -204,14 +174,7 @@ def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None =
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
-    """Force Q_D + Q_u that the motion needs: M q̈ − Q_C − Q_G (recursive Newton-Euler).
-
-    Args:
-        robot: the robot.
-        q, qd, qdd: `(*batch, nq)` joint positions, velocities, accelerations.
-
-    Returns:
-        `(*batch, nq)` [N m, N].
+    """Force Q_D + Q_u that the motion needs, M q̈ − Q_C − Q_G (Newton-Euler), `(*batch, nq)` [N m, N].
 
     Example:
         >>> import torch, forcegp
@@ -226,25 +189,18 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
     """
     q, qd, qdd = common_states(robot, q=q, qd=qd, qdd=qdd)
     poses = link_poses(robot, q)
-    motion = link_motion(robot, poses, qd)
-    E, a = robot.ancestors, batch_last(qdd, 1)
-    alpha = motion.alpha + sum_over(E, poses.angular * a)
-    acceleration = motion.acceleration + sum_over(E, poses.linear * a) - robot.gravity[:, None, None]
-    torque, force = link_force(link_inertia(robot, poses), motion, alpha, acceleration)
-    drive = robot.armature[:, None] * a
-    return batch_first(_joint_force(robot, poses, torque, force) + drive, poses.batch)
+    motion, a = link_motion(robot, poses, qd), batch_last(qdd, 1)
+    wrench = link_force(link_inertia(robot, poses), motion, *accelerations(robot, poses, motion, a))
+    return batch_first(_joint_force(robot, poses, *wrench) + robot.armature[:, None] * a, poses.batch)
 
 
 def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector) -> JointVector:
-    """Acceleration of free motion, q̈ = M⁻¹(force + Q_C + Q_G) (eq. 1).
+    """Acceleration of free motion `(*batch, nq)`, q̈ = M⁻¹(force + Q_C + Q_G) (eq. 1) [rad/s², m/s²].
 
     Args:
         robot: the robot.
         q, qd: `(*batch, nq)` joint positions and velocities.
         force: `(*batch, nq)` generalized force Q_D + Q_u (+ any other impressed force) [N m, N].
-
-    Returns:
-        q̈ `(*batch, nq)` [rad/s², m/s²].
 
     Example:
         >>> import torch, forcegp
@@ -262,16 +218,3 @@ def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: 
     M, needed = equation_of_motion(robot, poses, link_inertia(robot, poses), link_motion(robot, poses, qd))
     Q = batch_last(force, 1) - needed
     return batch_first(batchlast.solve_spd(M, Q.unsqueeze(1)).squeeze(1), poses.batch)
-
-
-def kinetic_energy(robot: RobotModel, q: JointVector, qd: JointVector) -> Tensor:
-    """½ q̇ᵀ M q̇, `(*batch,)` [J]."""
-    q, qd = common_states(robot, q=q, qd=qd)
-    return 0.5 * (qd * (mass_matrix(robot, q) @ qd[..., None])[..., 0]).sum(-1)
-
-
-def potential_energy(robot: RobotModel, q: JointVector) -> Tensor:
-    """−Σ m g·c, relative to the base origin, `(*batch,)` [J]; its gradient is −Q_G."""
-    poses = link_poses(robot, q)
-    moment = link_inertia(robot, poses).moment.sum(1)
-    return batch_first(-dot(moment, robot.gravity[:, None]), poses.batch)

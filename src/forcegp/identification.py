@@ -16,9 +16,10 @@ from jaxtyping import Float
 from scipy.linalg import qr, solve_triangular
 from torch import Tensor
 
-from forcegp.batchlast import batch_first
+from forcegp.batchlast import apply, batch_first, batch_last, dot, product
+from forcegp.dynamics import LinkInertia, accelerations, link_force
 from forcegp.errors import DataError
-from forcegp.kinematics import cross, link_motion, link_poses, skew
+from forcegp.kinematics import LinkPoses, common_states, link_motion, link_poses
 from forcegp.robot.inertia import inertial_parameters
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointVector
@@ -29,26 +30,11 @@ RANK = 1e-9
 PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 
 
-def _inertia_columns(w: Tensor) -> Tensor:
-    """L(w) with I w = L(w) (I_xx, I_xy, I_xz, I_yy, I_yz, I_zz), `(..., 3, 6)`."""
-    x, y, z = w.unbind(-1)
-    o = torch.zeros_like(x)
-    rows = ((x, y, z, o, o, o), (o, x, o, y, z, o), (o, o, x, o, y, z))
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
 def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> Regressor:
-    """Y with Y π = M q̈ − Q_C − Q_G for links without drives, π as in `parameter_vector`.
+    """Y `(*batch, nq, 10 nq)` with Y π = M q̈ − Q_C − Q_G without drives, π as in `parameter_vector`.
 
-    In link axes at the link origin, with acceleration a less gravity and h = m c:
-    f = m a + (α× + ω×ω×) h,  n = h × a + I α + ω × I ω.
-
-    Args:
-        robot: the robot; only its kinematics and gravity enter.
-        q, qd, qdd: `(*batch, nq)` joint positions, velocities, accelerations.
-
-    Returns:
-        `(*batch, nq, 10 nq)`.
+    Inverse dynamics is linear in π, so column k of link i holds the forces of that link with unit π_k. Only
+    the kinematics and the gravity of the robot enter.
 
     Example:
         >>> import torch, forcegp
@@ -61,29 +47,30 @@ def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVect
     Raises:
         ShapeError: an argument does not fit the robot.
     """
-    robot.check_state(qd=qd, qdd=qdd)
+    q, qd, qdd = common_states(robot, q=q, qd=qd, qdd=qdd)
     poses = link_poses(robot, q)
-    batch, E = poses.batch, robot.ancestors
     motion = link_motion(robot, poses, qd)
-    R, p = poses.rotation, poses.position
-    angular, linear = (batch_first(x, batch).mT for x in (poses.angular, poses.linear))
-    omega, velocity, alpha, acceleration = (
-        batch_first(x, batch).mT for x in (motion.omega, motion.velocity, motion.alpha, motion.acceleration)
-    )
-    alpha = alpha + E @ (angular * qdd[..., None])
-    acceleration = acceleration + E @ (linear * qdd[..., None]) - robot.gravity
-    at_link = acceleration + cross(alpha, p) + cross(omega, velocity + cross(omega, p))
-    w, dw, a = ((R.mT @ x[..., None])[..., 0] for x in (omega, alpha, at_link))
-    W = skew(w)
-    force = torch.cat([a[..., None], skew(dw) + W @ W, torch.zeros_like(_inertia_columns(w))], dim=-1)
-    torque = torch.cat(
-        [torch.zeros_like(a)[..., None], -skew(a), _inertia_columns(dw) + W @ _inertia_columns(w)], dim=-1
-    )
-    force = R @ force
-    torque = R @ torque + skew(p) @ force
-    Y = torch.einsum("...jc,...icp->...jip", angular, torque)
-    Y = Y + torch.einsum("...jc,...icp->...jip", linear, force)
-    return (Y * E.mT[..., None]).flatten(-2)
+    alpha, acceleration = accelerations(robot, poses, motion, batch_last(qdd, 1))
+    columns = []
+    for unit in torch.eye(len(PARAMETER_NAMES), dtype=robot.dtype, device=robot.device):
+        torque, force = link_force(_links_of(poses, unit), motion, alpha, acceleration)
+        # s_jᵀ [n_i; f_i] of joint j and link i
+        turning = dot(poses.angular.unsqueeze(2), torque.unsqueeze(1))
+        columns.append(turning + dot(poses.linear.unsqueeze(2), force.unsqueeze(1)))
+    Y = torch.stack(columns, dim=2) * robot.ancestors.mT[..., None, None]
+    return batch_first(Y.flatten(1, 2), poses.batch)
+
+
+def _links_of(poses: LinkPoses, parameters: Tensor) -> LinkInertia:
+    """All links with the same π `(10,)` about the link origin, moved to the base origin."""
+    rows = torch.tensor([[4, 5, 6], [5, 7, 8], [6, 8, 9]], device=parameters.device)
+    R, p, mass = poses.R, poses.p, parameters[0].expand(poses.p.shape[1], 1)
+    # I_o = R I Rᵀ + (2 p·h + m p·p) 1 − p hᵀ − h pᵀ − m p pᵀ with h = R m c
+    h, moved = apply(R, parameters[1:4, None, None]), mass * p
+    eye = torch.eye(3, dtype=p.dtype, device=p.device)[..., None, None]
+    inertia = product(product(R, parameters[rows][..., None, None]), R.transpose(0, 1))
+    inertia = inertia + eye * dot(p, 2.0 * h + moved) - p[:, None] * (h + moved) - h[:, None] * p
+    return LinkInertia(mass, h + moved, inertia)
 
 
 def parameter_vector(robot: RobotModel) -> Float[Tensor, " p"]:
@@ -118,12 +105,7 @@ class BaseParameters:
 def base_parameters(robot: RobotModel, samples: int = 100, seed: int = 0) -> BaseParameters:
     """Base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
 
-    Runs in double precision on the CPU, wherever the robot is.
-
-    Args:
-        robot: the robot; only its kinematics and gravity enter.
-        samples: number of random states.
-        seed: of the random states.
+    Runs in double precision on the CPU, wherever the robot is. Only its kinematics and gravity enter.
 
     Example:
         >>> import torch, forcegp
@@ -208,13 +190,10 @@ def identify(
 
     Example:
         >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+        >>> robot = forcegp.load_robot("double_pendulum")
         >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-        >>> t = torch.arange(20, dtype=torch.float64)
-        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> found = identify(system.robot, q, qd, qdd, tau, friction=True)
-        >>> found.damping.shape
+        >>> qdd = forcegp.dynamics.forward_dynamics(robot, q, qd, tau - 0.5 * qd)
+        >>> identify(robot, q, qd, qdd, tau, friction=True).damping.shape
         (2,)
 
     Raises:

@@ -1,23 +1,28 @@
 """Poses, Jacobians and bias accelerations of a tree of joints, batched over states.
 
-Convention, stated once: spatial vectors are `[angular, linear]`, in world axes, about the origin of the
-base. With the joint screws s_j so expressed and the ancestor matrix E, the twist of link i is
-V_i = Σ_j E_ij s_j q̇_j, so only the poses need a recursion, over the depth of the tree.
+Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With the joint screws
+s_j so expressed and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses
+need a recursion, over the depth of the tree.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.linalg import vecdot
 
 from forcegp import batchlast
 from forcegp.batchlast import batch_first, batch_last, sum_over, take
 from forcegp.errors import ShapeError
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.types import FrameJacobian, JointVector, PointJacobian, Rotation, Vector3
+
+Anchor = tuple[str, Sequence[float]]
+"""A frame, and a point in its coordinates [m]."""
 
 
 @dataclass(frozen=True)
@@ -63,25 +68,37 @@ class LinkMotion:
     acceleration: Tensor
 
 
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Vector product over the last dimension, broadcasting."""
-    a, b = torch.broadcast_tensors(a, b)
-    return torch.linalg.cross(a, b)
+class PointMotion(NamedTuple):
+    """The motion of a point fixed in a frame of the robot, world axes; tensors, or arrays of one state.
+
+    Attributes:
+        rotation: `(*batch, 3, 3)` axes of the frame.
+        position: `(*batch, 3)` of the point [m].
+        twist: `(*batch, 6)` [ω; ṗ] [rad/s], [m/s].
+        jacobian: J `(*batch, 6, nq)` with [ω; ṗ] = J q̇.
+        bias: J̇ q̇ `(*batch, 6)`, the acceleration [ω̇; p̈] at q̈ = 0.
+    """
+
+    rotation: Any
+    position: Any
+    twist: Any
+    jacobian: Any
+    bias: Any
+
+    @classmethod
+    def of(cls, blocks: Sequence[Tensor], qd: Tensor) -> PointMotion:
+        """From rotation, position, J and J̇ q̇, as compiled kernels give them, and q̇."""
+        rotation, position, J, bias = blocks
+        return cls(rotation, position, vecdot(J, qd[..., None, :]), J, bias)
 
 
 def skew(v: Vector3) -> Rotation:
     """The matrix [v]× with [v]× w = v × w."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    return batchlast.skew(v.movedim(-1, 0)).movedim((0, 1), (-2, -1))
 
 
 def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
-    """Joint-space arguments, checked and broadcast to one batch.
-
-    Raises:
-        ShapeError: one does not fit the robot, or their batches do not fit each other.
-    """
+    """Joint-space arguments, checked and broadcast to one batch; ShapeError if one does not fit."""
     robot.check_state(**states)
     if len({value.shape for value in states.values()}) == 1:
         return tuple(states.values())
@@ -134,19 +151,14 @@ def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -
 
 
 def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
-    """Poses of all links, R_i = R_parent R_i^local, and the joint screws in world axes.
-
-    Args:
-        robot: the robot.
-        q: `(*batch, nq)` joint positions [rad, m].
+    """Poses of all links, R_i = R_parent R_i^local, and the joint screws in world axes, at q `(*batch, nq)`.
 
     Raises:
         ShapeError: q does not fit the robot.
     """
     robot.check_state(q=q)
-    levels, E = robot.levels, robot.ancestors
-    T = _chain(robot, levels, q)
-    R, p = T[:, :3], sum_over(E, T[:, 3])
+    T = _chain(robot, robot.levels, q)
+    R, p = T[:, :3], sum_over(robot.ancestors, T[:, 3])
     z = batchlast.apply(R, robot.axis.T[..., None])
     if "prismatic" not in robot.joint_types:
         return LinkPoses(q.shape[:-1], R, p, z, batchlast.cross(p, z))
@@ -168,34 +180,16 @@ def _frame_in_base(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Ten
     """Rotation `(3, 3, B)` and position `(3, B)` of a frame relative to the base origin, world axes."""
     parent, R, p = robot.frame_parents[index], robot.frame_rotation[index], robot.frame_position[index]
     if parent == BASE:
-        B = poses.p.shape[-1]
-        return (robot.base_rotation @ R)[..., None].expand(3, 3, B), (robot.base_rotation @ p)[
-            :, None
-        ].expand(3, B)
+        B, base = poses.p.shape[-1], robot.base_rotation
+        return (base @ R)[..., None].expand(3, 3, B), (base @ p)[:, None].expand(3, B)
     link = poses.R[:, :, parent]
     return batchlast.product(link, R[..., None]), poses.p[:, parent] + batchlast.apply(link, p[:, None])
 
 
-def _movers(robot: RobotModel, index: int) -> Tensor:
-    """`(nq,)` 1 for the joints that move a frame."""
-    parent = robot.frame_parents[index]
-    return torch.zeros_like(robot.revolute) if parent == BASE else robot.ancestors[parent]
-
-
-def _point(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> Tensor:
-    """`point_of_poses` with the batch last, `(3, B)`."""
+def pose_of_frame(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Rotation, Vector3]:
+    """Axes of a frame `(*batch, 3, 3)` and its position relative to the base origin `(*batch, 3)` [m]."""
     rotation, position = _frame_in_base(robot, poses, index)
-    return position + batchlast.apply(rotation, point[:, None])
-
-
-def point_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> Vector3:
-    """Position relative to the base origin `(*batch, 3)` [m] of a point fixed in a frame, world axes."""
-    return batch_first(_point(robot, poses, index, point), poses.batch)
-
-
-def rotation_of_poses(robot: RobotModel, poses: LinkPoses, index: int) -> Rotation:
-    """Axes of a frame in the world `(*batch, 3, 3)`."""
-    return batch_first(_frame_in_base(robot, poses, index)[0], poses.batch)
+    return batch_first(rotation, poses.batch), batch_first(position, poses.batch)
 
 
 def as_point(robot: RobotModel, point: object) -> Vector3:
@@ -204,15 +198,7 @@ def as_point(robot: RobotModel, point: object) -> Vector3:
 
 
 def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation, Vector3]:
-    """Pose of a named frame in the world.
-
-    Args:
-        robot: the robot.
-        q: `(*batch, nq)` joint positions [rad, m].
-        frame: name of a link or fixed frame.
-
-    Returns:
-        Rotation `(*batch, 3, 3)` and position `(*batch, 3)` [m].
+    """Rotation `(*batch, 3, 3)` and position `(*batch, 3)` [m] of a named frame in the world.
 
     Example:
         >>> import torch, forcegp
@@ -226,21 +212,12 @@ def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation,
         UnknownNameError: no such frame.
         ShapeError: q does not fit the robot.
     """
-    poses = link_poses(robot, q)
-    rotation, position = _frame_in_base(robot, poses, robot.frame_index(frame))
-    return batch_first(rotation, poses.batch), batch_first(position, poses.batch) + robot.base_position
+    rotation, position = pose_of_frame(robot, link_poses(robot, q), robot.frame_index(frame))
+    return rotation, position + robot.base_position
 
 
 def point_position(robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)) -> Vector3:
-    """World position `(*batch, 3)` [m] of a point fixed in a frame (coordinates in that frame).
-
-    Example:
-        >>> import torch, forcegp
-        >>> robot = forcegp.load_robot("double_pendulum")
-        >>> q = torch.zeros(5, 2, dtype=torch.float64)
-        >>> point_position(robot, q, robot.frame_names[-1], (0.0, 0.0, -0.5)).shape
-        torch.Size([5, 3])
-    """
+    """World position `(*batch, 3)` [m] of a point fixed in a frame (coordinates in that frame)."""
     R, p = frame_pose(robot, q, frame)
     return p + (R @ as_point(robot, point)[..., None])[..., 0]
 
@@ -248,49 +225,57 @@ def point_position(robot: RobotModel, q: JointVector, frame: str, point: object 
 def point_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> PointJacobian:
-    """J with ṗ = J q̇ for a point fixed in a frame, `(*batch, 3, nq)`, world axes.
-
-    Example:
-        >>> import torch, forcegp
-        >>> robot = forcegp.load_robot("double_pendulum")
-        >>> q = torch.zeros(5, 2, dtype=torch.float64)
-        >>> point_jacobian(robot, q, robot.frame_names[-1]).shape
-        torch.Size([5, 3, 2])
-
-    Raises:
-        UnknownNameError: no such frame.
-        ShapeError: q does not fit the robot.
-    """
+    """J with ṗ = J q̇ for a point fixed in a frame, `(*batch, 3, nq)`, world axes; see `frame_jacobian`."""
     return frame_jacobian(robot, q, frame, point)[..., 3:, :]
 
 
 def frame_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> FrameJacobian:
-    """J with [ω; ṗ] = J q̇ for a frame and a point fixed in it, `(*batch, 6, nq)`, world axes."""
+    """J with [ω; ṗ] = J q̇ for a frame and a point fixed in it, `(*batch, 6, nq)`, world axes.
+
+    Raises:
+        UnknownNameError: no such frame.
+        ShapeError: q does not fit the robot.
+    """
     index = robot.frame_index(frame)
     return jacobian_of_poses(robot, link_poses(robot, q), index, as_point(robot, point))
 
 
 def point_motion(
-    robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, point: Tensor
-) -> tuple[Vector3, FrameJacobian, Tensor]:
-    """World position, `frame_jacobian` and `frame_bias_acceleration` of a point, from links already known."""
-    x = _point(robot, poses, index, point)
+    robot: RobotModel,
+    poses: LinkPoses,
+    motion: LinkMotion,
+    qd: JointVector,
+    frame: str,
+    point: object = (0.0, 0.0, 0.0),
+) -> PointMotion:
+    """The motion of a point fixed in a frame, from links whose motion is known.
+
+    Raises:
+        UnknownNameError: no such frame.
+    """
+    index, local = robot.frame_index(frame), as_point(robot, point)
+    rotation, origin = _frame_in_base(robot, poses, index)
+    x = origin + batchlast.apply(rotation, local[:, None])
     J, bias = _jacobian(robot, poses, index, x), _bias(robot, poses, motion, index, x)
-    moving = (batch_first(part, poses.batch) for part in (x + robot.base_position[:, None], J, bias))
-    return tuple(moving)  # pyright: ignore[reportReturnType]
+    blocks = rotation, x + robot.base_position[:, None], J, bias
+    return PointMotion.of([batch_first(block, poses.batch) for block in blocks], qd)
 
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
     """`frame_jacobian` from poses already known."""
-    return batch_first(_jacobian(robot, poses, index, _point(robot, poses, index, point)), poses.batch)
+    rotation, origin = _frame_in_base(robot, poses, index)
+    x = origin + batchlast.apply(rotation, point[:, None])
+    return batch_first(_jacobian(robot, poses, index, x), poses.batch)
 
 
 def _jacobian(robot: RobotModel, poses: LinkPoses, index: int, x: Tensor) -> Tensor:
     """J `(6, nq, B)` of the point of a frame that is at x `(3, B)`."""
     linear = poses.linear + batchlast.cross(poses.angular, x[:, None])
-    return torch.cat([poses.angular, linear]) * _movers(robot, index)[:, None]
+    parent = robot.frame_parents[index]
+    moving = torch.zeros_like(robot.revolute) if parent == BASE else robot.ancestors[parent]
+    return torch.cat([poses.angular, linear]) * moving[:, None]
 
 
 def point_velocity(
@@ -298,23 +283,6 @@ def point_velocity(
 ) -> Vector3:
     """ṗ = J q̇ of a point fixed in a frame, `(*batch, 3)` [m/s], world axes."""
     return (point_jacobian(robot, q, frame, point) @ qd[..., None])[..., 0]
-
-
-def point_bias_acceleration(
-    robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
-) -> Vector3:
-    """J̇ q̇, the acceleration of a point fixed in a frame at q̈ = 0, `(*batch, 3)` [m/s²], world axes."""
-    return frame_bias_acceleration(robot, q, qd, frame, point)[..., 3:]
-
-
-def frame_bias_acceleration(
-    robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
-) -> Tensor:
-    """[ω̇; p̈] at q̈ = 0 of a frame and a point fixed in it, `(*batch, 6)` [rad/s²], [m/s²]."""
-    q, qd = common_states(robot, q=q, qd=qd)
-    poses = link_poses(robot, q)
-    motion = link_motion(robot, poses, qd)
-    return point_motion(robot, poses, motion, robot.frame_index(frame), as_point(robot, point))[2]
 
 
 def _bias(robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, x: Tensor) -> Tensor:

@@ -10,11 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from forcegp import dynamics
+from forcegp import dynamics, native
 from forcegp.compiled import compile_dynamics
 from forcegp.errors import MissingDependencyError
-from forcegp.native import cache
-from forcegp.native import library as native
 from forcegp.temporary import NEW
 from random_robots import random_robot
 from robots import random_states
@@ -116,9 +114,9 @@ def test_a_private_group_may_write_above(
     tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tmp_path.chmod(0o775)
-    monkeypatch.setattr(cache, "_is_alone_in", lambda group: group == tmp_path.stat().st_gid)
+    monkeypatch.setattr(native, "_is_alone_in", lambda group: group == tmp_path.stat().st_gid)
     compiled()
-    monkeypatch.setattr(cache, "_is_alone_in", lambda group: False)
+    monkeypatch.setattr(native, "_is_alone_in", lambda group: False)
     with pytest.raises(MissingDependencyError, match="others could put code there"):
         compiled()
 
@@ -184,7 +182,7 @@ def test_what_is_damaged_is_built_anew(damage: str, folder: Path, compilations: 
     torch.testing.assert_close(compiled(), dynamics.gravity_force(ROBOT, Q))
     assert compilations == [1]
     [kernel] = folder.iterdir()
-    assert cache._trusted(kernel)
+    assert native._trusted(kernel)
 
 
 def test_a_kernel_that_does_not_load_is_built_anew(
@@ -194,7 +192,7 @@ def test_a_kernel_that_does_not_load_is_built_anew(
     [kernel] = folder.iterdir()
     key = kernel.name.partition("-")[0]
     kernel.unlink()
-    cache.store(folder, key, b"\x7fELF of another machine")
+    native.store(folder, key, b"\x7fELF of another machine")
     compiled()
     assert compilations == [1]
 
@@ -214,8 +212,8 @@ def test_a_truncated_kernel_does_not_kill_the_process(folder: Path) -> None:
     [kernel] = folder.iterdir()
     kernel.write_bytes(kernel.read_bytes()[:4096])
     code = (
-        "from pathlib import Path\nfrom forcegp.native import cache\n"
-        f"print(cache.find(Path({str(folder)!r}), {kernel.name.partition('-')[0]!r}))"
+        "from pathlib import Path\nfrom forcegp import native\n"
+        f"print(native.find(Path({str(folder)!r}), {kernel.name.partition('-')[0]!r}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "None"), done.stderr

@@ -12,13 +12,12 @@ import torch
 from torch.func import jacfwd, jacrev, vmap
 
 import forcegp
-from forcegp import derivatives, dynamics
+from forcegp import derivatives, dynamics, native
 from forcegp.compiled import compile_dynamics
 from forcegp.compiled.program import QUANTITIES, trace
 from forcegp.compiled.source import cuda_source
 from forcegp.errors import MissingDependencyError, ModelError, ShapeError, UnknownNameError
-from forcegp.native import cache as cache_module
-from forcegp.native.library import find_compiler
+from forcegp.native import find_compiler
 from forcegp.robot.model import RobotModel
 from random_robots import random_robot
 from robots import random_states
@@ -166,7 +165,7 @@ def test_a_user_without_a_home_is_one_clear_error(monkeypatch: pytest.MonkeyPatc
     def no_home() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
-    monkeypatch.setattr(cache_module, "cache_directory", no_home)
+    monkeypatch.setattr(native, "cache_directory", no_home)
     with pytest.raises(MissingDependencyError, match=r"home directory(.|\n)*FORCEGP_CACHE"):
         compile_dynamics(random_robot(7))
 

@@ -10,9 +10,8 @@ from torch import Tensor
 
 import forcegp
 from constraints.cases import CONSTRAINTS, SEEDS, chain, random_state, system_of
-from forcegp.constraints import Baumgarte, ConstrainedSystem, Equations, Plane, SurfaceContact
+from forcegp.constraints import Baumgarte, ConstrainedSystem, Equations, Plane, SurfaceContact, project_state
 from forcegp.errors import ForceGPError, ShapeError, UnknownNameError
-from forcegp.rollout.integrate import project_state
 
 LAW = 1e-10
 """Identities between products of four matrices with a mass matrix of condition up to 1e4, relative."""

@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from forcegp.constraints.unilateral import project_velocity
+from forcegp.constraints.unilateral import POSITION_TOLERANCE, project_state, project_velocity
 from forcegp.errors import NumericalError
-from forcegp.rollout.integrate import POSITION_TOLERANCE, project_state
 from rollout_cases import arm, on_manifold
 
 ROUNDING = 1e-12

@@ -8,6 +8,7 @@ import torch
 import forcegp
 from forcegp import Baumgarte, ConstrainedSystem, Plane, PointConnection, SurfaceContact, dynamics, kinematics
 from forcegp.constraints.unilateral import contact_forces, land, sliding_friction
+from robots import kinetic_energy
 
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
 SOLVED = 1e-10
@@ -42,7 +43,7 @@ def test_an_impact_stops_the_tip_and_takes_energy_by_a_normal_impulse() -> None:
     strength = torch.linalg.lstsq(A.mT, impulse[:, None]).solution
     torch.testing.assert_close((A.mT @ strength)[:, 0], impulse, atol=SOLVED, rtol=0.0)
     assert float(strength) > 0.0
-    before, after = (dynamics.kinetic_energy(ROBOT, Q, v) for v in (qd, landing.qd))
+    before, after = (kinetic_energy(ROBOT, Q, v) for v in (qd, landing.qd))
     assert 0.0 < float(after) < float(before)
     torch.testing.assert_close(landing.eom.cd.abs(), torch.zeros(1).double(), atol=SOLVED, rtol=0.0)
 

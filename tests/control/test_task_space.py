@@ -11,14 +11,13 @@ from forcegp import Baumgarte, ConstrainedSystem, Plane, SurfaceContact, dynamic
 from forcegp.control.task_space import (
     Gains,
     Target,
-    ToolMotion,
     control_torque,
     joint_acceleration,
     orientation_error,
     task_acceleration,
-    tool_motion,
 )
 from forcegp.errors import NumericalError
+from forcegp.kinematics import PointMotion, point_motion
 
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
 SOLVED = 1e-9
@@ -31,9 +30,9 @@ def _draw(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def _tool(q: torch.Tensor, qd: torch.Tensor, system: ConstrainedSystem = FREE) -> ToolMotion:
+def _tool(q: torch.Tensor, qd: torch.Tensor, system: ConstrainedSystem = FREE) -> PointMotion:
     eom = system.equations(q, qd)
-    return tool_motion(ROBOT, eom.poses, eom.motion, qd, FRAME, POINT)
+    return point_motion(ROBOT, eom.poses, eom.motion, qd, FRAME, POINT)
 
 
 def _rotation(vector: torch.Tensor) -> torch.Tensor:
@@ -108,7 +107,7 @@ def test_an_arm_with_few_joints_follows_the_position_in_its_plane() -> None:
     q[:, 1] = q[:, 1].abs() + 0.3
     poses = kinematics.link_poses(pendulum, q)
     motion = kinematics.link_motion(pendulum, poses, qd)
-    tool = tool_motion(pendulum, poses, motion, qd, "tip", (0.0, 0.0, 0.0))
+    tool = point_motion(pendulum, poses, motion, qd, "tip", (0.0, 0.0, 0.0))
     task = _draw(10, 6, seed=2)
     y = joint_acceleration(tool, task, _draw(10, 2, seed=3))
     reached = (tool.jacobian @ y[..., None])[..., 0] + tool.bias

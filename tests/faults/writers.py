@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 
 import forcegp
+from forcegp import native
 from forcegp.data import Dataset
 from forcegp.files import write_text, written_folder
 from forcegp.models.base import FittedModel
-from forcegp.native import cache
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from logs import random_log
 from random_data import table_system
@@ -89,11 +89,11 @@ def write_checkpoint(path: Path, version: int) -> None:
 
 
 def write_kernel(path: Path, version: int) -> None:
-    cache.store(cache.private_folder(path), f"key{version}", b"library" * version)
+    native.store(native.private_folder(path), f"key{version}", b"library" * version)
 
 
 def read_kernel(path: Path) -> int:
-    found = [version for version in (1, 2) if cache.find(cache.private_folder(path), f"key{version}")]
+    found = [version for version in (1, 2) if native.find(native.private_folder(path), f"key{version}")]
     return max(found, default=0)
 
 

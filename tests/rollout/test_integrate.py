@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import forcegp
-from forcegp import dynamics
 from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.rollout import RolloutOptions, rollout
+from robots import kinetic_energy, potential_energy
 from rollout_cases import ANALYTICAL, arm, on_manifold, simulated
 
 SLOPE_TOLERANCE = 0.25
@@ -62,8 +62,8 @@ def test_frictionless_sliding_conserves_energy(method: str) -> None:
     found = rollout(
         ANALYTICAL, system, q0, qd0, torch.zeros(1, 7, dtype=torch.float64), 0.15, options=options
     )
-    energy = dynamics.kinetic_energy(robot, found.q, found.qd) + dynamics.potential_energy(robot, found.q)
-    moved = dynamics.kinetic_energy(robot, found.q, found.qd)
+    energy = kinetic_energy(robot, found.q, found.qd) + potential_energy(robot, found.q)
+    moved = kinetic_energy(robot, found.q, found.qd)
     assert float(moved.max() - moved.min()) > 0.1, "the motion exchanges energy"
     assert float((energy - energy[0]).abs().max()) < 1e-5, "fourth order at 500 Hz leaves microjoules"
 

@@ -139,7 +139,7 @@ def test_a_block_in_contact_slides_to_rest_in_closed_form(tmp_path: Path) -> Non
 
 def test_an_arm_pressed_on_a_table_holds_still() -> None:
     """Seven joints stick in contact, where only six can move: the arm rests, and the table carries it."""
-    from forcegp.rollout.integrate import project_state
+    from forcegp.constraints import project_state
     from rollout_cases import arm, simulated
 
     system = arm()

@@ -14,7 +14,7 @@ from forcegp import ConstrainedSystem, Plane, SurfaceContact, dynamics
 from forcegp.errors import UnknownNameError, UnsupportedRobotError
 from forcegp.robot.model import RobotModel
 from forcegp.simulate import Engine, check_engine, make_engine
-from forcegp.simulate.engine import ENGINES
+from forcegp.simulate.engines import MAKERS as ENGINES
 from forcegp.simulate.urdf import write_urdf
 from robots import ARMS
 

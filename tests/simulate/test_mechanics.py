@@ -9,7 +9,8 @@ import torch
 from forcegp import Baumgarte, ConstrainedSystem, Plane, PointConnection, Sphere, SurfaceContact, load_robot
 from forcegp.constraints.unilateral import contact_forces, land, sliding_friction
 from forcegp.control.plan import make_plan
-from forcegp.control.task_space import control_torque, tool_motion
+from forcegp.control.task_space import control_torque
+from forcegp.kinematics import point_motion
 from forcegp.simulate import SimulationConfig
 from forcegp.simulate.mechanics import Mechanics
 
@@ -51,7 +52,7 @@ def test_equations_of_one_state_are_those_of_a_batch(
         np.testing.assert_allclose(getattr(one, field), getattr(eom, field).numpy(), rtol=0.0, atol=SOLVED)
     expected = eom.multiplier(torch.from_numpy(force)).numpy()
     np.testing.assert_allclose(one.multiplier(force), expected, rtol=SOLVED, atol=1e-8)
-    tool = tool_motion(ROBOT, eom.poses, eom.motion, state[1], FRAME, POINT)
+    tool = point_motion(ROBOT, eom.poses, eom.motion, state[1], FRAME, POINT)
     for mine, theirs in zip(one.tool, tool, strict=True):
         np.testing.assert_allclose(mine, theirs.numpy(), rtol=0.0, atol=SOLVED)
     friction = sliding_friction(system, eom, torch.from_numpy(active), 2.0).numpy()
@@ -68,7 +69,7 @@ def test_contact_mechanics_and_control_agree_in_both_kinds_of_arrays() -> None:
     eom = system.equations(q, qd)
     target = plan.targets._replace(**{k: v[3] for k, v in plan.targets._asdict().items()})
     one = mechanics.equations(q.numpy(), qd.numpy())
-    tool = tool_motion(ROBOT, eom.poses, eom.motion, qd, plan.frame, plan.point)
+    tool = point_motion(ROBOT, eom.poses, eom.motion, qd, plan.frame, plan.point)
     ours = control_torque(tool, eom, q, qd, target, plan.press(eom), config.gains)
     arrays = type(target)(*(x.numpy() for x in target))
     theirs = control_torque(one.tool, one, q.numpy(), qd.numpy(), arrays, plan.press(one), config.gains)

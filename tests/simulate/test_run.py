@@ -178,7 +178,7 @@ def test_a_rectangle_out_of_reach_is_named() -> None:
 
 
 def test_an_interrupt_ends_the_run_and_closes_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    from forcegp.simulate.mujoco import MuJoCoEngine
+    from forcegp.simulate.engines import MuJoCoEngine
 
     closed = []
     monkeypatch.setattr(MuJoCoEngine, "close", lambda engine: closed.append(engine.dt))

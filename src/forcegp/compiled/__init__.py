@@ -6,7 +6,6 @@ compiler and take robots that are being learned; these are for many evaluations 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from functools import cached_property
@@ -133,9 +132,8 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
     """Compile a function of `forcegp.dynamics` (or its derivatives) for one robot.
 
     The first call on a machine runs its C++ compiler (about a second for an arm, ten for a hand, minutes for
-    a hundred joints); later ones, in any process, read
-    the kernel from the cache (`$FORCEGP_CACHE`, or `forcegp` in the user's cache folder). On a CUDA robot
-    the kernel is compiled by NVRTC in each process.
+    a hundred joints); later ones, in any process, read the kernel from the cache (`$FORCEGP_CACHE`, or
+    `forcegp` in the user's cache folder). On a CUDA robot NVRTC compiles the kernel in each process.
 
     Args:
         robot: the robot; its parameters become constants.
@@ -155,20 +153,15 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
 
     Raises:
         UnknownNameError: no such quantity.
-        ModelError: a figure of the robot is being learned, or its precision has no kernel.
+        ModelError: a parameter of the robot is being learned, or its precision has no kernel.
         MissingDependencyError: there is no compiler.
     """
     if quantity not in QUANTITIES:
         raise UnknownNameError("quantity to compile", quantity, QUANTITIES)
-    learned = [
-        field.name
-        for field in dataclasses.fields(robot)
-        if isinstance(value := getattr(robot, field.name), Tensor) and value.requires_grad
-    ]
-    if learned:
+    if robot.learned:
         raise ModelError(
             "a robot whose figures require a gradient cannot be compiled, as they become constants",
-            got=", ".join(learned),
+            got=", ".join(robot.learned),
             hint="use forcegp.dynamics while learning, and compile a robot with detached figures afterwards",
         )
     if robot.dtype not in (torch.float64, torch.float32):

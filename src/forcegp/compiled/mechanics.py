@@ -21,23 +21,17 @@ from forcegp.compiled.program import (
     numbers,
 )
 from forcegp.compiled.source import cpu_kernel, cpu_source
+from forcegp.kinematics import Anchor
 from forcegp.robot.model import BASE, RobotModel
 
 Vector = NDArray[np.floating]
-Anchor = tuple[str, Sequence[float]]
-"""A frame, and a point in its coordinates [m]."""
 
 
 class CompiledMechanics:
-    """Mechanics of one robot, as a compiled function of (q, q̇).
+    """Mechanics of one robot on the CPU and of some of its points, as a compiled function of (q, q̇).
 
     A call returns M, Q_C and Q_G, then for each point: axes of its frame `(3, 3)` and position in the world,
-    Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and bias acceleration J̇ q̇ `(6,)`. `batch` does so for tensors of
-    states.
-
-    Args:
-        robot: the robot, on the CPU; its parameters become constants.
-        points: the points wanted.
+    Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and bias acceleration J̇ q̇ `(6,)`. `batch` does so for tensors.
 
     Raises:
         MissingDependencyError: there is no C++ compiler.

@@ -1,9 +1,8 @@
 """The dynamics of one robot written out on scalars: the algorithms of `forcegp.dynamics`, link by link.
 
 The robot's parameters are numbers, so products with the zeros and ones of joint axes and placements vanish
-while the program is built.
-
-Poses, joint screws and inertias of the links are in world axes about the base origin.
+while the program is built. Poses, joint screws and inertias of the links are in world axes about the
+base origin.
 """
 
 from __future__ import annotations
@@ -45,12 +44,9 @@ class Links:
         self.gravity, self.armature = graph.constants(numbers(robot.gravity)), numbers(robot.armature)
         self.mass = numbers(robot.mass)
         self.R, self.p, self.z, self.l, self.c, self.I = [], [], [], [], [], []
+        base = graph.constants(numbers(robot.base_rotation)), graph.constants(np.zeros(3))
         for i, parent in enumerate(robot.parents):
-            R, p = (
-                (graph.constants(numbers(robot.base_rotation)), graph.constants(np.zeros(3)))
-                if parent == BASE
-                else (self.R[parent], self.p[parent])
-            )
+            R, p = base if parent == BASE else (self.R[parent], self.p[parent])
             turn, shift = self._joint(robot, i)
             self.R.append(R @ turn)
             self.p.append(p + R @ shift)
@@ -65,11 +61,8 @@ class Links:
 
     def _joint(self, robot: RobotModel, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Pose of a link in its parent link (Rodrigues' formula about a constant axis)."""
-        graph, a = self.graph, numbers(robot.axis[i])
-        P, shift = (
-            numbers(robot.placement_rotation[i]),
-            graph.constants(numbers(robot.placement_position[i])),
-        )
+        graph, a, P = self.graph, numbers(robot.axis[i]), numbers(robot.placement_rotation[i])
+        shift = graph.constants(numbers(robot.placement_position[i]))
         if robot.joint_types[i] == "prismatic":
             return graph.constants(P), shift + graph.constants(P @ a) * graph.input("q", i)
         along = np.outer(P @ a, a)
@@ -117,12 +110,7 @@ def _shift(c: np.ndarray, h: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Program:
-    """A straight-line program: its graph and the entries of its result, in row-major order.
-
-    Attributes:
-        arguments: names of the joint-space arguments, in the order of the eager function.
-        shape: shape of the result without the batch.
-    """
+    """A straight-line program: its arguments as in the eager function, and its result in row-major order."""
 
     arguments: tuple[str, ...]
     shape: tuple[int, ...]
@@ -147,7 +135,8 @@ def _mass_matrix(links: Links) -> np.ndarray:
     """M_ij = s_iᵀ I^c_j s_j with the composite inertias (composite rigid-body algorithm)."""
     n = len(links.parents)
     M = links.graph.constants(np.zeros((n, n)))
-    for j, (angular, linear) in enumerate(_screw_momenta(links)):
+    for j, composite in enumerate(_composites(links)):
+        angular, linear = _momentum(*composite, links.z[j], links.l[j])
         for i in links.ancestors(j):
             M[i, j] = M[j, i] = links.z[i] @ angular + links.l[i] @ linear
         M[j, j] = M[j, j] + links.armature[j]
@@ -161,13 +150,8 @@ def _momentum(mass: float, moment: np.ndarray, inertia: np.ndarray, w: np.ndarra
 
 def _composites(links: Links) -> list[_Inertia]:
     """Mass, first moment and inertia of each subtree."""
-    figures = (links.mass, links.moment, links.inertia)
-    return list(zip(*(links.composite(list(x)) for x in figures), strict=True))
-
-
-def _screw_momenta(links: Links) -> list[tuple]:
-    """I^c_j s_j of each joint."""
-    return [_momentum(*I, z, l) for I, z, l in zip(_composites(links), links.z, links.l, strict=True)]
+    parts = (links.mass, links.moment, links.inertia)
+    return list(zip(*(links.composite(list(x)) for x in parts), strict=True))
 
 
 def _motion(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> list[_Motion]:
@@ -225,6 +209,7 @@ def _solve(M: np.ndarray, rhs: np.ndarray) -> np.ndarray:
 
 
 def _forward_dynamics(links: Links) -> np.ndarray:
+    """M⁻¹(force + Q_C + Q_G)."""
     needed = _joint_force(links, links.vector("qd"), None, gravity=True)
     return _solve(_mass_matrix(links), np.array(links.vector("force"), dtype=object) - needed)
 
@@ -240,13 +225,14 @@ def _inverse_dynamics_derivatives(links: Links, qd: list, qdd: list) -> tuple[np
         momenta.append(v * m - cross(h, omega))
     spin, momenta, composites = links.composite(spin), links.composite(momenta), _composites(links)
 
+    def pair(force: tuple, motion: tuple) -> Scalar:
+        return force[0] @ motion[0] + force[1] @ motion[1]
+
     n = len(motion)
     dq, dqd = (links.graph.constants(np.zeros((n, n))) for _ in range(2))
     screws = list(zip(links.z, links.l, strict=True))
-    rates = [
-        (cross(m.omega, z), cross(m.omega, l) + cross(m.v, z))
-        for m, (z, l) in zip(motion, screws, strict=True)
-    ]
+    moved = zip(motion, screws, strict=True)
+    rates = [(cross(m.omega, z), cross(m.omega, l) + cross(m.v, z)) for m, (z, l) in moved]
     for i in range(n):
         z, l = screws[i]
         row, weight = spin[i].T @ z + cross(momenta[i], l) * 2.0, _momentum(*composites[i], z, l)
@@ -254,16 +240,12 @@ def _inverse_dynamics_derivatives(links: Links, qd: list, qdd: list) -> tuple[np
         carried = cross(z, torques[i]) + cross(l, forces[i]), cross(z, forces[i])
         for j in links.ancestors(i):
             bend = _bend(motion[j], screws[j], rates[j])
-            dq[i, j] = row @ rates[j][0] + _pair(weight, bend)
-            dqd[i, j] = row @ screws[j][0] + _pair(weight, rates[j]) * 2.0
+            dq[i, j] = row @ rates[j][0] + pair(weight, bend)
+            dqd[i, j] = row @ screws[j][0] + pair(weight, rates[j]) * 2.0
             if j != i:
-                dq[j, i] = _pair(screws[j], column_q) + _pair(screws[j], carried)
-                dqd[j, i] = _pair(screws[j], column_v)
+                dq[j, i] = pair(screws[j], column_q) + pair(screws[j], carried)
+                dqd[j, i] = pair(screws[j], column_v)
     return dq, dqd
-
-
-def _pair(force: tuple, motion: tuple) -> Scalar:
-    return force[0] @ motion[0] + force[1] @ motion[1]
 
 
 def _bend(motion: _Motion, screw: tuple, rate: tuple) -> tuple[np.ndarray, np.ndarray]:

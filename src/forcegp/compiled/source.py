@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.compiled.program import Program
 from forcegp.errors import MissingDependencyError
-from forcegp.native.library import load_library
+from forcegp.native import load_library
 
 LANES_BYTES = 64
 """Width of the vectors of a CPU kernel; the compiler splits them where the machine's are narrower."""
@@ -70,13 +70,7 @@ extern "C" __global__ void kernel({parameters}, T* out, int batch) {{
 
 @dataclass(frozen=True)
 class Source:
-    """Source text and the arrays that its kernel reads.
-
-    Attributes:
-        text: the source.
-        arrays: names of the arrays, in the order of the kernel's arguments: an argument of the
-            quantity, or "sin" or "cos" of q.
-    """
+    """Source text, and the arrays that its kernel reads: arguments of the quantity, "sin" or "cos" of q."""
 
     text: str
     arrays: tuple[str, ...]

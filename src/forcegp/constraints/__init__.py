@@ -4,6 +4,7 @@ from forcegp.constraints.contact import Constraint, PointConnection, SurfaceCont
 from forcegp.constraints.gauss import Equations, Linearization
 from forcegp.constraints.surface import Cylinder, ImplicitSurface, Plane, Sphere, Surface, SurfaceSchema
 from forcegp.constraints.system import Baumgarte, ConstrainedSystem
+from forcegp.constraints.unilateral import project_state
 
 __all__ = [
     "Baumgarte",
@@ -19,4 +20,5 @@ __all__ = [
     "Surface",
     "SurfaceContact",
     "SurfaceSchema",
+    "project_state",
 ]

@@ -6,7 +6,6 @@ machine's C++ compiler and kept on disk.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 from weakref import WeakKeyDictionary
@@ -16,10 +15,10 @@ from torch import Tensor
 
 from forcegp import dynamics, kinematics
 from forcegp.compiled.mechanics import CompiledMechanics
-from forcegp.constraints.contact import Anchor, MovingPoint
 from forcegp.constraints.gauss import Equations
 from forcegp.constraints.system import ConstrainedSystem
 from forcegp.errors import MissingDependencyError
+from forcegp.kinematics import Anchor
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointVector
 
@@ -41,7 +40,7 @@ class CompiledSystem(ConstrainedSystem):
 
     @cached_property
     def _anchors(self) -> tuple[Anchor, ...]:
-        return anchors_of(self)
+        return _anchors_of(self)
 
     @cached_property
     def _mechanics(self) -> CompiledMechanics | None:
@@ -59,8 +58,7 @@ class CompiledSystem(ConstrainedSystem):
         M, Q_C, Q_G, *blocks = self._mechanics.batch(q, qd)
         points = {}
         for anchor, i in zip(self._anchors, range(0, len(blocks), POINT), strict=True):
-            _, position, jacobian, bias = blocks[i : i + POINT]
-            points[anchor] = MovingPoint.of(position, jacobian, bias, qd)
+            points[anchor] = kinematics.PointMotion.of(blocks[i : i + POINT], qd)
         terms = [c.terms_of([points[_key(a)] for a in c.anchors]) for c in self.contacts]
 
         def links() -> tuple[kinematics.LinkPoses, kinematics.LinkMotion]:
@@ -74,9 +72,8 @@ class CompiledSystem(ConstrainedSystem):
 def compiled_system(system: ConstrainedSystem) -> ConstrainedSystem:
     """The system with compiled equations of motion, for many evaluations of one robot.
 
-    The first call for a robot compiles for some seconds; later ones, in any process, read the kernel from
-    the cache. Where there is no compiler, or the robot's parameters require gradients or lie on a GPU, the
-    system is returned as it is.
+    The first call for a robot compiles for some seconds; later ones, in any process, read the cache. It
+    is returned unchanged without a compiler, or if the robot's parameters require gradients or lie on a GPU.
 
     Example:
         >>> import torch, forcegp
@@ -86,13 +83,13 @@ def compiled_system(system: ConstrainedSystem) -> ConstrainedSystem:
         0.0
     """
     if system not in _SYSTEMS:
-        if isinstance(system, CompiledSystem) or _kernel(system.robot, anchors_of(system)) is None:
+        if isinstance(system, CompiledSystem) or _kernel(system.robot, _anchors_of(system)) is None:
             return system
         _SYSTEMS[system] = CompiledSystem(system.robot, system.contacts, system.baumgarte)
     return _SYSTEMS[system]
 
 
-def anchors_of(system: ConstrainedSystem) -> tuple[Anchor, ...]:
+def _anchors_of(system: ConstrainedSystem) -> tuple[Anchor, ...]:
     """The points that constraints read, each once."""
     return tuple(dict.fromkeys(_key(a) for contact in system.contacts for a in contact.anchors))
 
@@ -102,19 +99,13 @@ def _key(anchor: Anchor) -> Anchor:
     return frame, tuple(float(x) for x in point)
 
 
-def _can_compile(robot: RobotModel) -> bool:
-    if robot.device.type != "cpu" or robot.dtype not in (torch.float64, torch.float32):
-        return False
-    values = (getattr(robot, field.name) for field in dataclasses.fields(robot))
-    return not any(isinstance(value, Tensor) and value.requires_grad for value in values)
-
-
 def _kernel(robot: RobotModel, anchors: tuple[Anchor, ...]) -> CompiledMechanics | None:
     """The kernel of a robot, `None` where there can be none; kept as long as the robot."""
     kept = _KERNELS.setdefault(robot, {})
     if anchors not in kept:
+        known = robot.device.type == "cpu" and robot.dtype in (torch.float64, torch.float32)
         try:
-            kept[anchors] = CompiledMechanics(robot, anchors) if _can_compile(robot) else None
+            kept[anchors] = CompiledMechanics(robot, anchors) if known and not robot.learned else None
         except MissingDependencyError:
             kept[anchors] = None
     return kept[anchors]

@@ -8,76 +8,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.linalg import vecdot
-from torch.nn.functional import normalize
 
-from forcegp import kinematics
+from forcegp.constraints.gauss import ContactPoint
 from forcegp.constraints.surface import Surface, check_point
 from forcegp.errors import ParameterError
+from forcegp.kinematics import Anchor, PointMotion, skew
 from forcegp.robot.model import RobotModel
-
-Anchor = tuple[str, Sequence[float]]
-"""A frame, and a point in its coordinates [m]."""
-
-
-class MovingPoint(NamedTuple):
-    """The motion of a point fixed in a frame of the robot.
-
-    Attributes:
-        position, velocity: `(*batch, 3)` in the world [m], [m/s].
-        bias: `(*batch, 3)` acceleration at q̈ = 0 [m/s²].
-        jacobian: J `(*batch, 3, nq)`, world axes.
-        turning: ω `(*batch, 3)` of the frame [rad/s].
-        angular: J_ω `(*batch, 3, nq)`.
-    """
-
-    position: Tensor
-    velocity: Tensor
-    bias: Tensor
-    jacobian: Tensor
-    turning: Tensor
-    angular: Tensor
-
-    @classmethod
-    def of(cls, position: Tensor, jacobian: Tensor, bias: Tensor, qd: Tensor) -> MovingPoint:
-        """From what `kinematics.point_motion` gives, and q̇."""
-        rate = vecdot(jacobian, qd[..., None, :])
-        return cls(
-            position, rate[..., 3:], bias[..., 3:], jacobian[..., 3:, :], rate[..., :3], jacobian[..., :3, :]
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class ContactPoint:
-    """The point of the robot that touches a surface; of a rounded tip, the material point that touches now.
-
-    Attributes:
-        position, velocity: `(*batch, 3)` in the world [m], [m/s].
-        jacobian: J_E `(*batch, 3, nq)`, world axes.
-        normal: ∇c `(*batch, 3)` at the point.
-    """
-
-    position: Tensor
-    velocity: Tensor
-    jacobian: Tensor
-    normal: Tensor
-
-    @cached_property
-    def unit_normal(self) -> Tensor:
-        """n `(*batch, 3)`, the direction of ∇c."""
-        return normalize(self.normal, dim=-1)
-
-    @cached_property
-    def sliding(self) -> tuple[Tensor, Tensor]:
-        """Jacobian (1 − n nᵀ) J_E `(*batch, 3, nq)` and velocity (1 − n nᵀ) ṗ `(*batch, 3)` along the
-        surface."""
-        n, J, v = self.unit_normal, self.jacobian, self.velocity
-        return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
 
 
 class ConstraintTerms(NamedTuple):
@@ -108,7 +49,7 @@ class Constraint(ABC):
         """The points of the robot that the constraint reads, each with its frame."""
 
     @abstractmethod
-    def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
+    def terms_of(self, points: Sequence[PointMotion]) -> ConstraintTerms:
         """c, A and b from the motion of the anchors."""
 
     @abstractmethod
@@ -175,21 +116,22 @@ class SurfaceContact(Constraint):
     def anchors(self) -> tuple[Anchor, ...]:
         return ((self.frame, self.point),)
 
-    def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
+    def terms_of(self, points: Sequence[PointMotion]) -> ConstraintTerms:
         (tip,) = points
         surface = self.center_surface
         # c(p), A = ∇cᵀ J_p, b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ) (eq. 3)
         c, normal = surface.value(tip.position), surface.gradient(tip.position)
-        A = vecdot(normal[..., None], tip.jacobian, dim=-2)[..., None, :]
-        b = -(vecdot(normal, tip.bias) + surface.curvature(tip.position, tip.velocity))
-        touching = ContactPoint(tip.position, tip.velocity, tip.jacobian, normal)
+        J, velocity = tip.jacobian[..., 3:, :], tip.twist[..., 3:]
+        A = vecdot(normal[..., None], J, dim=-2)[..., None, :]
+        b = -(vecdot(normal, tip.bias[..., 3:]) + surface.curvature(tip.position, velocity))
+        touching = ContactPoint(tip.position, velocity, J, normal)
         if self.radius:
             # The touching material point p − r n has the velocity ṗ + ω × (−r n) and J_E = J_p + r [n]ₓ J_ω.
             arm = -self.radius * normal
             touching = ContactPoint(
                 tip.position + arm,
-                tip.velocity + kinematics.cross(tip.turning, arm),
-                tip.jacobian - kinematics.skew(arm) @ tip.angular,
+                velocity + torch.linalg.cross(tip.twist[..., :3], arm),
+                J - skew(arm) @ tip.jacobian[..., :3, :],
                 normal,
             )
         return ConstraintTerms(c[..., None], A, b[..., None], touching)
@@ -224,11 +166,12 @@ class PointConnection(Constraint):
         first = (self.frame, self.point)
         return (first,) if self.other_frame is None else (first, (self.other_frame, self.other_point))
 
-    def terms_of(self, points: Sequence[MovingPoint]) -> ConstraintTerms:
-        p, bias, J = points[0].position, points[0].bias, points[0].jacobian
+    def terms_of(self, points: Sequence[PointMotion]) -> ConstraintTerms:
+        first = points[0]
+        p, bias, J = first.position, first.bias[..., 3:], first.jacobian[..., 3:, :]
         if self.other_frame is None:
             place = torch.as_tensor(self.other_point, dtype=p.dtype, device=p.device)
             return ConstraintTerms(p - place, J, -bias)
         # c = p_1 − p_2, A = J_1 − J_2, b = J̇_2 q̇ − J̇_1 q̇
         other = points[1]
-        return ConstraintTerms(p - other.position, J - other.jacobian, other.bias - bias)
+        return ConstraintTerms(p - other.position, J - other.jacobian[..., 3:, :], other.bias[..., 3:] - bias)

@@ -5,14 +5,11 @@ Cholesky factor M = G Gᵀ and W = A G⁻ᵀ these are L = G⁻ᵀ W⁺ and (A M
 the singular values of W: those of A M⁻¹ Aᵀ are their squares, which in single precision leaves no room
 between redundant constraints and rounding.
 
-The derivatives of q̈ and λ with respect to state and force follow alike. Differentiating
-M q̈ − Q_C − Q_G − Q_D − Aᵀλ = Q and A q̈ = b at fixed q̈ and λ leaves the residuals
-
-    r_f = ∂Q − ∂ID + ∂Q_D + ∂(Aᵀ)λ,    r_c = ∂b − ∂A q̈,
-
-from which ∂q̈ = H r_f + L r_c and ∂λ = (A M⁻¹ Aᵀ)⁺(r_c − A M⁻¹ r_f). The derivatives of inverse dynamics are
-in closed form; those of the few constraint rows come from autograd. The pseudo-inverse itself is not
-differentiated, so redundant constraints of constant rank do no harm.
+At fixed q̈ and λ, the derivatives of M q̈ − Q_C − Q_G − Q_D − Aᵀλ = Q and A q̈ = b leave the residuals
+r_f = ∂Q − ∂ID + ∂Q_D + ∂(Aᵀ)λ and r_c = ∂b − ∂A q̈, from which ∂q̈ = H r_f + L r_c and
+∂λ = (A M⁻¹ Aᵀ)⁺(r_c − A M⁻¹ r_f). The derivatives of inverse dynamics are in closed form; those of the few
+constraint rows come from autograd. The pseudo-inverse itself is not differentiated, so redundant constraints
+of constant rank do no harm.
 """
 
 from __future__ import annotations
@@ -24,9 +21,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.linalg import vecdot
+from torch.nn.functional import normalize
 
 from forcegp import dynamics
-from forcegp.constraints.contact import ContactPoint
 from forcegp.derivatives import inverse_dynamics_derivatives
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
@@ -43,6 +41,34 @@ Redundant contacts of the bundled arms leave 2 ε; closed loops and ill-conditio
 def rank_tolerance(dtype: torch.dtype) -> float:
     """Smallest ratio of singular values of A G⁻ᵀ that counts as an independent constraint."""
     return max(RANK_TOLERANCE, ROUNDING * torch.finfo(dtype).eps)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPoint:
+    """The point of the robot that touches a surface; of a rounded tip, the material point that touches now.
+
+    Attributes:
+        position, velocity: `(*batch, 3)` in the world [m], [m/s].
+        jacobian: J_E `(*batch, 3, nq)`, world axes.
+        normal: ∇c `(*batch, 3)` at the point.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    jacobian: Tensor
+    normal: Tensor
+
+    @cached_property
+    def unit_normal(self) -> Tensor:
+        """n `(*batch, 3)`, the direction of ∇c."""
+        return normalize(self.normal, dim=-1)
+
+    @cached_property
+    def sliding(self) -> tuple[Tensor, Tensor]:
+        """Jacobian (1 − n nᵀ) J_E `(*batch, 3, nq)` and velocity (1 − n nᵀ) ṗ `(*batch, 3)` along the
+        surface."""
+        n, J, v = self.unit_normal, self.jacobian, self.velocity
+        return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,69 +244,37 @@ def linearize(
     qd: JointVector,
     force: JointVector,
 ) -> Linearization:
-    """The linearization at states whose equations of motion are known.
-
-    Args:
-        robot: the robot.
-        eom: its equations of motion at (q, q̇).
-        rows: A and b as a function of (q, q̇).
-        q, qd: `(*batch, nq)` joint positions and velocities.
-        force: `(*batch, nq)` motor torques and all other forces that the robot file does not know [N m, N].
-    """
+    """The linearization at states (q, q̇) with known equations of motion; `rows` gives A and b at states."""
     with torch.no_grad():
         Q_bar = eom.Q_K + force
         qdd, multiplier = eom.acceleration(Q_bar), eom.multiplier(Q_bar)
         inverse = inverse_dynamics_derivatives(robot, q, qd, qdd)
-    (g_q, g_qd), (h_q, _), damping = _residuals(robot, rows, q, qd, qdd, multiplier)
+    r_c, r_f = _residuals(robot, rows, torch.cat([q, qd], -1), qdd, multiplier)
     with torch.no_grad():
-        # r_f = ∂(Aᵀ)λ + ∂Q_D − ∂ID, r_c = ∂b − ∂A q̈
-        residual = {
-            "dq": (h_q - inverse.dq, g_q),
-            "dqd": (torch.diag_embed(damping) - inverse.dqd, g_qd),
-        }
+        r_f = r_f - torch.cat([inverse.dq, inverse.dqd], dim=-1)
         # ∂q̈ = H r_f + L r_c, ∂λ = (A M⁻¹ Aᵀ)⁺ (r_c − A M⁻¹ r_f)
-        A_M_inv, inertia = eom.M_inv_At.mT, eom.constraint_inertia
-        dqdd = {name: eom.H @ r_f + eom.L @ r_c for name, (r_f, r_c) in residual.items()}
-        dmultiplier = {name: inertia @ (r_c - A_M_inv @ r_f) for name, (r_f, r_c) in residual.items()}
-        return Linearization(
-            qdd, dqdd["dq"], dqdd["dqd"], eom.H,
-            multiplier, dmultiplier["dq"], dmultiplier["dqd"], -eom.L.mT,
-        )  # fmt: skip
+        by_q, by_qd = (eom.H @ r_f + eom.L @ r_c).chunk(2, -1)
+        along_q, along_qd = (eom.constraint_inertia @ (r_c - eom.M_inv_At.mT @ r_f)).chunk(2, -1)
+        return Linearization(qdd, by_q, by_qd, eom.H, multiplier, along_q, along_qd, -eom.L.mT)
 
 
 def _residuals(
     robot: RobotModel,
     rows: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
-    q: Tensor,
-    qd: Tensor,
+    state: Tensor,
     qdd: Tensor,
     multiplier: Tensor,
-) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], Tensor]:
-    """Jacobians of b − A q̈ and of Aᵀλ by q and q̇, and the diagonal of ∂Q_D/∂q̇, at fixed q̈ and λ."""
+) -> tuple[Tensor, Tensor]:
+    """Jacobians of b − A q̈ `(*batch, m, 2 nq)` and of Aᵀλ + Q_D by (q, q̇), at fixed q̈ and λ."""
     with torch.enable_grad():
-        q, qd = q.detach().clone().requires_grad_(), qd.detach().clone().requires_grad_()
-        # b − A q̈, Aᵀλ and Q_D
+        state = state.detach().clone().requires_grad_()
+        q, qd = state.chunk(2, -1)
         A, b = rows(q, qd)
         along = b - (A @ qdd[..., None])[..., 0]
-        force = (A.mT @ multiplier[..., None])[..., 0]
-        damping = dynamics.damping_force(robot, qd)
-        return _jacobians(along, q, qd), _jacobians(force, q, qd), _diagonal(damping, qd)
-
-
-def _jacobians(value: Tensor, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-    """∂value/∂q and ∂value/∂q̇ of samples that do not depend on each other, `(*batch, d, nq)`."""
-    if value.shape[-1] == 0 or not value.requires_grad:
-        empty = q.new_zeros(*value.shape, q.shape[-1])
-        return empty, empty
-    pairs = [
-        torch.autograd.grad(component.sum(), (q, qd), retain_graph=True, materialize_grads=True)
-        for component in value.unbind(-1)
-    ]
-    return torch.stack([by_q for by_q, _ in pairs], -2), torch.stack([by_qd for _, by_qd in pairs], -2)
-
-
-def _diagonal(value: Tensor, qd: Tensor) -> Tensor:
-    """Derivative of each component by its own velocity."""
-    if not value.requires_grad:
-        return torch.zeros_like(qd)
-    return torch.autograd.grad(value.sum(), qd, materialize_grads=True)[0]
+        force = (A.mT @ multiplier[..., None])[..., 0] + dynamics.damping_force(robot, qd)
+        slopes = [
+            torch.autograd.grad(component.sum(), state, retain_graph=True)[0]
+            for component in torch.cat([along, force], dim=-1).unbind(-1)
+        ]
+    jacobian = torch.stack(slopes, dim=-2)
+    return jacobian[..., : b.shape[-1], :], jacobian[..., b.shape[-1] :, :]

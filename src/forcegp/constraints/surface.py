@@ -75,18 +75,6 @@ def check_point(values: Sequence[float], what: str) -> None:
         raise ParameterError(f"{what} is not a point", expected="three finite coordinates [m]", got=values)
 
 
-def _point(values: Sequence[float], what: str) -> tuple[float, ...]:
-    check_point(values, what)
-    return tuple(float(x) for x in values)
-
-
-def _positive(value: float, what: str) -> None:
-    if not 0.0 < value < float("inf"):
-        raise ParameterError(
-            f"{what} is not a valid length", expected="a positive finite number [m]", got=value
-        )
-
-
 @dataclass(frozen=True)
 class Plane(Surface):
     """The plane c(p) = n·p − offset.
@@ -128,8 +116,46 @@ class Plane(Surface):
         return torch.zeros_like(p[..., 0])
 
 
+class _Round(Surface):
+    """c(p) = |r| − radius with r the part of p − center that `_across` leaves, touched from outside."""
+
+    center: Sequence[float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        what = type(self).__name__.lower()
+        check_point(self.center, f"the {what}'s center")
+        object.__setattr__(self, "center", tuple(float(x) for x in self.center))
+        if not 0.0 < self.radius < float("inf"):
+            raise ParameterError(
+                f"the {what}'s radius is not a valid length",
+                expected="a positive finite number [m]",
+                got=self.radius,
+            )
+
+    def _across(self, x: Tensor) -> Tensor:
+        return x
+
+    def raised(self, distance: float) -> Surface:
+        return replace(self, radius=self.radius + distance)  # pyright: ignore[reportArgumentType]
+
+    def value(self, p: Vector3) -> Scalars:
+        r = self._across(p - _vector(self.center, p))
+        return torch.linalg.vector_norm(r, dim=-1) - self.radius
+
+    def gradient(self, p: Vector3) -> Vector3:
+        return torch.nn.functional.normalize(self._across(p - _vector(self.center, p)), dim=-1)
+
+    def curvature(self, p: Vector3, v: Vector3) -> Scalars:
+        # vᵀ∇²c v = (|v|² − (rᵀv/|r|)²)/|r|
+        r, v = self._across(p - _vector(self.center, p)), self._across(v)
+        distance = torch.linalg.vector_norm(r, dim=-1)
+        along = (r * v).sum(-1) / distance
+        return ((v * v).sum(-1) - along**2) / distance
+
+
 @dataclass(frozen=True)
-class Sphere(Surface):
+class Sphere(_Round):
     """The sphere c(p) = |p − center| − radius, touched from outside.
 
     Args:
@@ -149,29 +175,9 @@ class Sphere(Surface):
     radius: float
     type: Literal["sphere"] = field(default="sphere", kw_only=True, repr=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "center", _point(self.center, "the sphere's center"))
-        _positive(self.radius, "the sphere's radius")
-
-    def raised(self, distance: float) -> Sphere:
-        return replace(self, radius=self.radius + distance)
-
-    def value(self, p: Vector3) -> Scalars:
-        return torch.linalg.vector_norm(p - _vector(self.center, p), dim=-1) - self.radius
-
-    def gradient(self, p: Vector3) -> Vector3:
-        return torch.nn.functional.normalize(p - _vector(self.center, p), dim=-1)
-
-    def curvature(self, p: Vector3, v: Vector3) -> Scalars:
-        # vᵀ∇²c v = (|v|² − (rᵀv/|r|)²)/|r|, r = p − center
-        r = p - _vector(self.center, p)
-        distance = torch.linalg.vector_norm(r, dim=-1)
-        along = (r * v).sum(-1) / distance
-        return ((v * v).sum(-1) - along**2) / distance
-
 
 @dataclass(frozen=True)
-class Cylinder(Surface):
+class Cylinder(_Round):
     """The infinite cylinder c(p) = |p − center − a aᵀ(p − center)| − radius, touched from outside.
 
     Args:
@@ -194,30 +200,12 @@ class Cylinder(Surface):
     type: Literal["cylinder"] = field(default="cylinder", kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", _point(self.center, "the cylinder's center"))
-        _positive(self.radius, "the cylinder's radius")
+        super().__post_init__()
         object.__setattr__(self, "axis", _unit(self.axis, "the cylinder's axis"))
 
     def _across(self, x: Tensor) -> Tensor:
         a = _vector(self.axis, x)
         return x - (x @ a)[..., None] * a
-
-    def raised(self, distance: float) -> Cylinder:
-        return replace(self, radius=self.radius + distance)
-
-    def value(self, p: Vector3) -> Scalars:
-        r = self._across(p - _vector(self.center, p))
-        return torch.linalg.vector_norm(r, dim=-1) - self.radius
-
-    def gradient(self, p: Vector3) -> Vector3:
-        return torch.nn.functional.normalize(self._across(p - _vector(self.center, p)), dim=-1)
-
-    def curvature(self, p: Vector3, v: Vector3) -> Scalars:
-        # as for a sphere, with r and v across the axis
-        r, across = self._across(p - _vector(self.center, p)), self._across(v)
-        distance = torch.linalg.vector_norm(r, dim=-1)
-        along = (r * across).sum(-1) / distance
-        return ((across * across).sum(-1) - along**2) / distance
 
 
 SurfaceSchema = Annotated[Plane | Sphere | Cylinder, Field(discriminator="type")]

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from forcegp import dynamics, kinematics
-from forcegp.constraints.contact import Constraint, ConstraintTerms, MovingPoint
+from forcegp.constraints.contact import Constraint, ConstraintTerms
 from forcegp.constraints.gauss import Equations, Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
 from forcegp.kinematics import LinkMotion, LinkPoses
@@ -22,20 +22,17 @@ from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintVector, JointVector
 
 SQUARE, LINEAR = 20, 60
-"""Matrices over joints and constraint rows, and vectors over them, that the equations of one state hold at
-their peak; measured, and rounded up."""
+"""Matrices and vectors over joints and constraint rows that one state takes at the peak; measured."""
 CERTAIN = 0.25
 """Part of the bound below which no measured work stays."""
-ITEM = 8
-"""Bytes of a float64."""
 
 
 @dataclass(frozen=True)
 class Baumgarte:
     """Makes the constraint error a damped oscillator, c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
 
-    Since c̈ = A q̈ − b, the stabilized right-hand side is b̃ = b − 2ωξ A q̇ − ω² c: the signs that the
-    paper prints in eq. (30) are the opposite ones, with which the error grows.
+    The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c; the signs that the paper prints in eq. (30)
+    are the opposite ones, with which the error grows.
 
     Args:
         natural_frequency: ω > 0 [rad/s].
@@ -110,12 +107,7 @@ class ConstrainedSystem:
     def _repr_html_(self) -> str:
         """A table of the constraints for notebooks."""
         rows = [
-            (
-                c.name,
-                type(c).__name__,
-                ", ".join(frame for frame, _ in c.anchors),
-                str(getattr(c, "surface", "–")),
-            )
+            (c.name, type(c).__name__, ", ".join(dict(c.anchors)), str(getattr(c, "surface", "–")))
             for c in self.contacts
         ]
         notes = [] if self.baumgarte is None else [str(self.baumgarte)]
@@ -139,24 +131,20 @@ class ConstrainedSystem:
         Raises:
             UnknownNameError: no such contact.
         """
-        for contact in self.contacts:
-            if contact.name == name:
-                return contact
-        raise UnknownNameError("contact", name, self.contact_names)
+        if name not in self.contact_names:
+            raise UnknownNameError("contact", name, self.contact_names)
+        return self.contacts[self.contact_names.index(name)]
 
     @property
     def state_bytes(self) -> int:
         """Upper bound on the memory that the equations of motion of one state take [bytes]."""
         width = self.robot.nq + self.m
-        return ITEM * (SQUARE * width**2 + LINEAR * width)
+        return 8 * (SQUARE * width**2 + LINEAR * width)
 
     def announce_states(self, states: int, copies: float, what: str) -> None:
-        """Announce, or refuse, work on many states; see `announce_memory`.
+        """Announce, or refuse, work on many states at once; see `announce_memory`.
 
-        Args:
-            states: how many are worked on at once.
-            copies: how many times the memory of the equations of motion a state takes at the peak.
-            what: the work, as the subject of a sentence.
+        `copies` is the peak in units of the memory of one state's equations of motion; `what` is the work.
 
         Raises:
             MemoryLimitError: it certainly needs more than is free.
@@ -238,16 +226,13 @@ class ConstrainedSystem:
     ) -> Linearization:
         """The constrained acceleration and the multiplier with their Jacobians by q, q̇ and force.
 
-        q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) with its exact derivatives. If Q depends on the state, as
-        learned forces do, add `dforce` times the derivative of Q.
+        q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) with its exact derivatives, detached from the graph.
+        If Q depends on the state, as learned forces do, add `dforce` times the derivative of Q.
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
             force: `(*batch, nq)` Q, the motor torques and all other forces that the robot file does not know.
             active: `(*batch, n_contacts)` bool, which contacts are closed in each sample; default all.
-
-        Returns:
-            q̈, λ and their Jacobians, detached from the autograd graph.
 
         Raises:
             ShapeError: an argument does not fit.
@@ -276,24 +261,15 @@ class ConstrainedSystem:
         rows = [i for i, contact in enumerate(self.contacts) for _ in range(contact.rows)]
         return torch.tensor(rows, dtype=torch.int64, device=self.robot.device)
 
-    @cached_property
-    def _places(self) -> list[list[tuple[int, Tensor]]]:
-        """Frame and point of the anchors of each constraint."""
-        at = kinematics.as_point
-        return [
-            [(self.robot.frame_index(frame), at(self.robot, point)) for frame, point in contact.anchors]
-            for contact in self.contacts
-        ]
-
     def _terms(self, q: Tensor, qd: Tensor) -> tuple[LinkPoses, LinkMotion, list[ConstraintTerms]]:
         """Where the links are and how they move, and what the constraints say there."""
         poses = kinematics.link_poses(self.robot, q)
         motion = kinematics.link_motion(self.robot, poses, qd)
-        moving = [
-            [MovingPoint.of(*kinematics.point_motion(self.robot, poses, motion, *at), qd) for at in places]
-            for places in self._places
-        ]
-        terms = [contact.terms_of(points) for contact, points in zip(self.contacts, moving, strict=True)]
+
+        def moving(frame: str, point: Sequence[float]) -> kinematics.PointMotion:
+            return kinematics.point_motion(self.robot, poses, motion, qd, frame, point)
+
+        terms = [contact.terms_of([moving(*at) for at in contact.anchors]) for contact in self.contacts]
         return poses, motion, terms
 
     def _rows(

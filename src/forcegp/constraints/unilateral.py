@@ -1,10 +1,8 @@
 """Contact with a surface, which pushes and never pulls: opening, closing, impact and sliding friction.
 
-The simulator and rollouts share this file. A closed contact opens where its multiplier would turn negative.
-An open contact closes where c ≤ 0 and ċ < 0, with an inelastic impact. Constraints without a surface, such as
-a connection of two points, hold in both directions and never change.
-
-The formulas take tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator.
+A closed contact opens where its multiplier would turn negative. An open contact closes where c ≤ 0 and ċ < 0,
+with an inelastic impact. Other constraints, such as a connection of two points, never change. The formulas
+take tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator.
 """
 
 from __future__ import annotations
@@ -17,12 +15,23 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints.contact import Constraint, SurfaceContact
-from forcegp.types import Array
+from forcegp.constraints.system import ConstrainedSystem
+from forcegp.errors import NumericalError
+from forcegp.types import ActiveContacts, Array, JointVector
 
 PULL = 1e-9
 """A contact pulls if λ is below minus this [N]; rounding must not open a contact that carries no load."""
 APPROACH = 1e-9
 """A contact is approached if ċ is below minus this [m/s]; after an impact ċ is zero up to rounding."""
+
+POSITION_TOLERANCE = 1e-12
+"""Largest constraint error that counts as none [m]; rounding of the kinematics of an arm leaves 1e-15."""
+ROUNDING = 100.0
+"""Constraint error, in units of the precision's ε, that rounding may leave; it counts in float32 only."""
+MAX_ITERATIONS = 30
+"""Newton doubles the digits in each iteration; a state off by a centimetre needs four."""
+MAX_STEP = 0.2
+"""Largest move of a joint in one iteration [rad, m]; light wrist joints are asked for more than they give."""
 
 
 @runtime_checkable
@@ -104,30 +113,12 @@ def any_row(system: ContactSystem, rows: Array) -> Array:
 
 
 def pulling(system: ContactSystem, active: Array, multiplier: Array) -> Array:
-    """Closed contacts that would have to pull, λ < 0, and therefore open.
-
-    Args:
-        system: robot and contacts.
-        active: `(*batch, n_contacts)` bool, closed contacts.
-        multiplier: λ `(*batch, m)` [N].
-
-    Returns:
-        `(*batch, n_contacts)` bool.
-    """
+    """Closed contacts `(*batch, n_contacts)` that would have to pull, λ `(*batch, m)` < 0, and that open."""
     return any_row(system, multiplier < -PULL) & can_open(system, active) & active
 
 
 def reached(system: ContactSystem, active: Array, c: Array, cd: Array) -> Array:
-    """Open contacts that the robot has reached, c ≤ 0 while ċ < 0, and that therefore close.
-
-    Args:
-        system: robot and contacts.
-        active: `(*batch, n_contacts)` bool, closed contacts.
-        c, cd: `(*batch, m)` constraint error and its rate [m], [m/s].
-
-    Returns:
-        `(*batch, n_contacts)` bool.
-    """
+    """Open contacts `(*batch, n_contacts)` that the robot has reached, c ≤ 0 while ċ < 0, and that close."""
     return any_row(system, (c <= 0.0) & (cd < -APPROACH)) & can_open(system, active) & ~active
 
 
@@ -139,22 +130,41 @@ def project_velocity(eom: Any, qd: Array) -> Array:
     return qd - (eom.L @ (eom.A @ qd[..., None]))[..., 0]
 
 
-def impact_velocity(system: ContactSystem, q: Array, qd: Array, active: Array) -> Array:
-    """Velocity `(*batch, nq)` after an inelastic impact without friction on the active contacts."""
-    return project_velocity(system.equations(q, qd, active=active), qd)
+def project_state(
+    system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
+) -> tuple[JointVector, JointVector]:
+    """The state on the constraint manifold next to (q, q̇) `(*batch, nq)`, in the metric of M.
+
+    Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces push;
+    q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy. For the contacts that are
+    `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0.
+
+    Raises:
+        NumericalError: the iteration does not converge, as where the surface is out of reach.
+    """
+    rows = system.active_rows(active, q.shape[:-1])
+    tolerance = max(POSITION_TOLERANCE, ROUNDING * torch.finfo(q.dtype).eps)
+    error = 0.0
+    for _ in range(MAX_ITERATIONS):
+        eom = system.equations(q, qd, active)
+        c = torch.where(rows, eom.c, 0.0)
+        error = float(c.detach().abs().max()) if c.numel() else 0.0
+        if error <= tolerance:
+            return q, project_velocity(eom, qd)
+        move = (eom.L @ c[..., None])[..., 0]
+        q = q - move * (MAX_STEP / move.detach().abs().amax(-1, keepdim=True).clamp(min=MAX_STEP))
+    raise NumericalError(
+        "no state on the constraint manifold is found",
+        expected=f"a constraint error of at most {tolerance:g} m after {MAX_ITERATIONS} iterations",
+        got=f"{error:.3g} m",
+        hint="start nearer to the surface, and check that the arm can reach it",
+    )
 
 
 def sliding_friction(system: ContactSystem, eom: Any, active: Array, viscous_friction: float) -> Array:
-    """Friction of the active contacts: Q_z = Σ J_Eᵀ F_z with F_z = −θ_v (I − n nᵀ) ṗ_E.
+    """Friction of the active contacts `(*batch, nq)`: Q_z = Σ J_Eᵀ F_z, F_z = −θ_v (I − n nᵀ) ṗ_E [N m, N].
 
-    Args:
-        system: robot and contacts.
-        eom: the equations of motion at the states.
-        active: `(*batch, n_contacts)` bool, closed contacts.
-        viscous_friction: θ_v [N s/m].
-
-    Returns:
-        `(*batch, nq)` [N m, N].
+    `active` is `(*batch, n_contacts)` bool, `viscous_friction` θ_v [N s/m].
     """
     Q_z = 0.0 * eom.Q_C
     for i, contact in enumerate(system.contacts):
@@ -175,7 +185,7 @@ def land(system: ContactSystem, q: Array, qd: Array, closed: Array) -> Landing:
     if not bool(new.any()):
         return Landing(closed, qd, eom, impact=False)
     closed = closed | new
-    qd = impact_velocity(system, q, qd, closed)
+    qd = project_velocity(system.equations(q, qd, active=closed), qd)
     return Landing(closed, qd, system.equations(q, qd, active=closed), impact=True)
 
 
@@ -187,14 +197,9 @@ def contact_forces(
     Q_u: Array,
     viscous_friction: float,
 ) -> ContactForces:
-    """Normal and friction force under the torque Q_u, after every contact that would have to pull has opened.
+    """Normal and friction force at a state `(nq,)` under the torque Q_u [N m], once no contact has to pull.
 
-    Args:
-        system: robot and contacts.
-        q, qd: `(nq,)` the state.
-        landing: the contacts closed so far, and the equations of motion with them.
-        Q_u: `(nq,)` motor torque [N m].
-        viscous_friction: θ_v [N s/m].
+    `landing` holds the closed contacts and their equations of motion, `viscous_friction` is θ_v [N s/m].
     """
     closed, eom = landing.closed, landing.eom
     # Q = Q_C + Q_G + Q_D + Q_u

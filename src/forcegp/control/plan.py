@@ -23,6 +23,14 @@ from forcegp.errors import NumericalError, ParameterError
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointVector, Rotation, Vector3
 
+NOT_NEGATIVE = "a finite number, 0 or above"
+
+
+def check_setting(name: str, valid: bool, expected: str, got: object) -> None:
+    """Raise `ParameterError` unless a setting is valid."""
+    if not valid:
+        raise ParameterError(f"{name} is out of range", expected=expected, got=got)
+
 
 @dataclass(frozen=True)
 class MotionConfig:
@@ -67,7 +75,7 @@ class MotionConfig:
     def __post_init__(self) -> None:
         for name in ("duration", "dt", "travel_time", "max_acceleration"):
             self._check(name, 0.0 < getattr(self, name) < float("inf"), "a positive finite number")
-        self._check_not_negative("elbow_swing")
+        self._check("elbow_swing", 0.0 <= self.elbow_swing < float("inf"), NOT_NEGATIVE)
         self._check("tool_turn", abs(self.tool_turn) < float("inf"), "a finite angle")
         for name in ("lift_height", "pressing_force"):
             low, high = getattr(self, name)
@@ -76,18 +84,13 @@ class MotionConfig:
         self._check("lift_probability", 0.0 <= self.lift_probability <= 1.0, "a number between 0 and 1")
         self._check("duration", self.duration >= self.dt, f"at least one step of {self.dt} s")
 
+    def _check(self, name: str, valid: bool, expected: str) -> None:
+        check_setting(name, valid, expected, getattr(self, name))
+
     @property
     def steps(self) -> int:
         """Number of samples."""
         return round(self.duration / self.dt)
-
-    def _check_not_negative(self, *names: str) -> None:
-        for name in names:
-            self._check(name, 0.0 <= getattr(self, name) < float("inf"), "a finite number, 0 or above")
-
-    def _check(self, name: str, valid: bool, expected: str) -> None:
-        if not valid:
-            raise ParameterError(f"{name} is out of range", expected=expected, got=getattr(self, name))
 
 
 POSE_TOLERANCE = 1e-10
@@ -111,21 +114,11 @@ def inverse_kinematics(
     starts: Tensor,
     near: JointVector,
 ) -> JointVector:
-    """Joint positions that put a point of a frame at a pose, by damped least squares from many starts.
+    """Joint positions `(nq,)` that put a point of a frame at a pose, by damped least squares from `starts`.
 
-    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move to `near` in the null space of J. An
-    arm with fewer than six joints is asked for the position alone.
-
-    Args:
-        robot: the robot.
-        frame, point: the tool point, fixed in a frame.
-        position: `(3,)` wanted in the world [m].
-        rotation: `(3, 3)` wanted axes of the frame in the world.
-        starts: `(k, nq)` where to start from.
-        near: `(nq,)` of the solutions found, the one next to this is taken.
-
-    Returns:
-        `(nq,)` [rad, m].
+    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move to `near` `(nq,)` in the null space of
+    J, and of the solutions from `starts` `(k, nq)` the one next to it is taken. The pose in the world is
+    `(3,)` [m] and `(3, 3)`; an arm with fewer than six joints is asked for the position alone.
 
     Raises:
         NumericalError: no start leads to the pose within the joint limits.
@@ -159,8 +152,8 @@ def _pose_error(
     rotation is −1 and not 3.
     """
     poses = kinematics.link_poses(robot, q)
-    reached = kinematics.rotation_of_poses(robot, poses, index)
-    shift = position - kinematics.point_of_poses(robot, poses, index, x) - robot.base_position
+    reached, origin = kinematics.pose_of_frame(robot, poses, index)
+    shift = position - (origin + reached @ x) - robot.base_position
     error = torch.cat([orientation_error(reached, rotation.expand_as(reached)), shift], dim=-1)
     J, rows = kinematics.jacobian_of_poses(robot, poses, index, x), task_rows(robot.nq)
     asked_for = rows.start > 0 or (reached * rotation).sum((-2, -1)) > 1.0
@@ -179,12 +172,9 @@ def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
 
 
 def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotation:
-    """Axes `(3, 3)` of a frame whose tool axis points into the surface, turned by π about the side axis.
+    """Axes `(3, 3)` of a frame whose `tool_axis` points into the surface, turned by π about the side axis.
 
-    Args:
-        normal: `(3,)` unit normal out of the surface.
-        ahead: `(3,)` unit tangent.
-        tool_axis: `(3,)` unit axis of the tool in its frame; the z axis for most arms.
+    `normal` and `ahead` are the unit normal out of the surface and a unit tangent, `(3,)` each.
     """
     z = torch.tensor([0.0, 0.0, 1.0], dtype=normal.dtype)
     down = torch.stack([-ahead, torch.linalg.cross(normal, ahead), -normal], dim=-1)
@@ -227,11 +217,7 @@ class Plan:
         return Target(*(values.numpy() for values in self.targets))
 
     def press(self, eom: Any) -> Any:
-        """Generalized force of a unit normal force on each of the tool's contacts `(*batch, nq)`, Σ Jᵀn/|n|.
-
-        Args:
-            eom: the equations of motion of a batch of states, or of one state in NumPy.
-        """
+        """Generalized unit normal force on each of the tool's contacts, summed, Σ Jᵀn/|n| `(*batch, nq)`."""
         total = 0.0 * eom.Q_C
         for name in self.contacts:
             at = eom.contact_points[name]
@@ -246,11 +232,6 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
     The tool's axis points from the origin of its frame to the middle of the contacts that the frame carries.
     An arm with fewer than six joints follows the position alone.
 
-    Args:
-        system: robot and contacts.
-        config: rectangle, times, forces.
-        generator: source of the random numbers.
-
     Raises:
         NumericalError: the rectangle's centre or the first waypoint is out of reach.
     """
@@ -262,16 +243,27 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
     frame = robot.frame_names[-1] if frame is None else frame
     center = kinematics.as_point(robot, config.center)
     chart = Chart.about(center, contact.center_surface if contact else None)
-    reference = _draw_reference(chart, config, generator)
+    count = math.ceil(config.duration / config.travel_time) + 1
+    waypoints = draw_waypoints(count, config.size, config.lift_height, config.lift_probability, generator)
+    t = torch.arange(config.steps, dtype=robot.dtype) * config.dt
+    lines = waypoints.to(robot.dtype), t, config.travel_time, config.max_acceleration
+    reference = straight_lines(chart, *lines)
     points = [c.point for c in carried] or [point]
     middle = torch.stack([kinematics.as_point(robot, x) for x in points]).mean(0)
-    rotation = tool_rotation(chart.axes[2], _ahead(chart, config.tool_turn), _tool_axis(middle))
+    u, v, normal = chart.axes
+    ahead = math.cos(config.tool_turn) * u + math.sin(config.tool_turn) * v
+    rotation = tool_rotation(normal, ahead, _tool_axis(middle))
     draws = 2.0 * torch.rand(STARTS, robot.nq, dtype=torch.float64, generator=generator) - 1.0
-    nearest = _middle_of_limits(robot)
+    # Furthest from the joint limits; zero where there are none.
+    nearest = torch.nan_to_num(0.5 * (robot.lower + robot.upper), nan=0.0, posinf=0.0, neginf=0.0)
     starts = nearest + (torch.linspace(0.0, math.pi, STARTS)[:, None] * draws).to(robot.dtype)
     home = inverse_kinematics(robot, frame, point, chart.center, rotation, starts, nearest)
     start = inverse_kinematics(robot, frame, point, reference.waypoints[0], rotation, home[None], home)
-    postures = _draw_postures(robot, home, frame, point, len(reference.travel_time), config, generator)
+    # Along the null space of the tool's Jacobian, the elbow swings.
+    J = kinematics.frame_jacobian(robot, home, frame, point)[task_rows(robot.nq)]
+    free = torch.linalg.svd(J)[2][len(J) :]
+    swing = 2.0 * torch.rand(count - 1, len(free), dtype=torch.float64, generator=generator) - 1.0
+    postures = home + config.elbow_swing * swing.to(robot.dtype) @ free
     targets = Target(
         reference.position,
         reference.velocity,
@@ -283,46 +275,11 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
     return Plan(tuple(c.name for c in carried), frame, point, reference, targets, start)
 
 
-def _ahead(chart: Chart, turn: float) -> Tensor:
-    """The direction of u turned about the normal `(3,)`."""
-    return math.cos(turn) * chart.axes[0] + math.sin(turn) * chart.axes[1]
-
-
-def _middle_of_limits(robot: RobotModel) -> Tensor:
-    """`(nq,)` joint positions furthest from their limits; zero where there are none."""
-    return torch.nan_to_num(0.5 * (robot.lower + robot.upper), nan=0.0, posinf=0.0, neginf=0.0)
-
-
 def _tool_axis(point: Tensor) -> Tensor:
     """The direction of the tool point in its frame, or the frame's z axis for a point at its origin."""
     if float(torch.linalg.vector_norm(point)) == 0.0:
         return torch.tensor([0.0, 0.0, 1.0], dtype=point.dtype)
     return torch.nn.functional.normalize(point, dim=-1)
-
-
-def _draw_reference(chart: Chart, config: MotionConfig, generator: torch.Generator) -> Reference:
-    lines = math.ceil(config.duration / config.travel_time)
-    waypoints = draw_waypoints(
-        lines + 1, config.size, config.lift_height, config.lift_probability, generator
-    ).to(chart.center.dtype)
-    t = torch.arange(config.steps, dtype=chart.center.dtype) * config.dt
-    return straight_lines(chart, waypoints, t, config.travel_time, config.max_acceleration)
-
-
-def _draw_postures(
-    robot: RobotModel,
-    home: Tensor,
-    frame: str,
-    point: Sequence[float],
-    segments: int,
-    config: MotionConfig,
-    generator: torch.Generator,
-) -> Tensor:
-    """`(segments, nq)` postures off the home posture along the null space, where the elbow swings."""
-    J = kinematics.frame_jacobian(robot, home, frame, point)[task_rows(robot.nq)]
-    free = torch.linalg.svd(J)[2][len(J) :]
-    swing = 2.0 * torch.rand(segments, len(free), dtype=torch.float64, generator=generator) - 1.0
-    return home + config.elbow_swing * swing.to(robot.dtype) @ free
 
 
 def _draw_push(reference: Reference, config: MotionConfig, generator: torch.Generator) -> Tensor:

@@ -1,51 +1,30 @@
 """Task-space inverse dynamics control with null-space control of the remaining freedom.
 
-The task is the pose of the tool: 3D position and 3D orientation, or its position alone for an arm with fewer
-than six joints. A redundant arm moves its elbow in the
-null space of the task's Jacobian, which leaves the error dynamics of the task untouched
-(Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1).
-
-The control law takes tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator,
-where the overhead of tensors would take most of the time.
+The task is the pose of the tool, or its position alone for an arm with fewer than six joints. A redundant arm
+moves its elbow in the null space of the task's Jacobian, which leaves the task's error dynamics untouched
+(Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1). The control law
+takes tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
-from forcegp import kinematics
 from forcegp.errors import NumericalError
-from forcegp.kinematics import LinkMotion, LinkPoses
-from forcegp.robot.model import RobotModel
-from forcegp.types import Array, JointVector
+from forcegp.kinematics import PointMotion
+from forcegp.types import Array
 
 POTRF, POTRS = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
 """LAPACK's Cholesky factorisation and solve, without the overhead of wrappers."""
 POSE_ROWS, POSITION_ROWS = 6, 3
 SINGULAR = 1e-3
 """Below this smallest pivot of √(J Jᵀ) the task asks for joint speeds a thousand times its own."""
-
-
-@runtime_checkable
-class RobotForces(Protocol):
-    """What the controller reads from the equations of motion: M and Q_K = Q_C + Q_G + Q_D."""
-
-    @property
-    def M(self) -> Array:
-        """`(*batch, nq, nq)` mass matrix."""
-        ...
-
-    @property
-    def Q_K(self) -> Array:
-        """`(*batch, nq)` the force that the robot file knows, without actuation."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -66,24 +45,6 @@ class Gains:
     orientation_damping: float = 20.0
     posture_stiffness: float = 16.0
     posture_damping: float = 8.0
-
-
-class ToolMotion(NamedTuple):
-    """The tool at a state (q, q̇).
-
-    Attributes:
-        rotation: `(*batch, 3, 3)` axes of the tool's frame in the world.
-        position: `(*batch, 3)` of the tool point in the world [m].
-        twist: `(*batch, 6)` [ω; ṗ] [rad/s], [m/s].
-        jacobian: J `(*batch, 6, nq)` with [ω; ṗ] = J q̇.
-        bias: J̇ q̇ `(*batch, 6)`.
-    """
-
-    rotation: Array
-    position: Array
-    twist: Array
-    jacobian: Array
-    bias: Array
 
 
 class Target(NamedTuple):
@@ -109,44 +70,17 @@ def task_rows(nq: int) -> slice:
     return slice(0 if nq >= POSE_ROWS else POSITION_ROWS, POSE_ROWS)
 
 
-def tool_motion(
-    robot: RobotModel,
-    poses: LinkPoses,
-    motion: LinkMotion,
-    qd: JointVector,
-    frame: str,
-    point: Sequence[float],
-) -> ToolMotion:
-    """Pose, twist, Jacobian and bias acceleration of the tool point, from links whose motion is known.
-
-    Raises:
-        UnknownNameError: no such frame.
-    """
-    index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
-    position, J, bias = kinematics.point_motion(robot, poses, motion, index, x)
-    rotation = kinematics.rotation_of_poses(robot, poses, index)
-    return ToolMotion(rotation, position, (J @ qd[..., None])[..., 0], J, bias)
-
-
 def orientation_error(rotation: Array, target: Array) -> Array:
-    """e_O = ½ Σᵢ rᵢ × rᵢᵈ over the axes, sin(angle) times the axis that turns the first onto the second.
+    """e_O = ½ Σᵢ rᵢ × rᵢᵈ of axes `(*batch, 3, 3)`: sin(angle) times the axis of the turn, `(*batch, 3)`.
 
-    The sum is the vector of the skew part of R_d Rᵀ.
-
-    Args:
-        rotation, target: `(*batch, 3, 3)` axes of a frame.
-
-    Returns:
-        `(*batch, 3)`, world axes.
-
-    Source: Siciliano et al., eq. 3.98.
+    The sum is the vector of the skew part of R_d Rᵀ, in world axes (Siciliano et al., eq. 3.98).
     """
     E = target @ rotation.swapaxes(-1, -2)
     skew = E - E.swapaxes(-1, -2)
     return 0.5 * _package(E).stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
 
-def task_acceleration(tool: ToolMotion, target: Target, gains: Gains) -> Array:
+def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Array:
     """[ω̇; p̈] `(*batch, 6)` that makes both errors damped oscillators, ë + k_D ė + k_P e = 0."""
     omega, velocity = tool.twist[..., :3], tool.twist[..., 3:]
     turning = (
@@ -161,19 +95,11 @@ def task_acceleration(tool: ToolMotion, target: Target, gains: Gains) -> Array:
     return _package(omega).concatenate([turning, moving], -1)
 
 
-def joint_acceleration(tool: ToolMotion, task: Array, posture: Array) -> Array:
+def joint_acceleration(tool: PointMotion, task: Array, posture: Array) -> Array:
     """y = J⁺(a − J̇q̇) + (I − J⁺J) y₀: the task's acceleration, and the posture's in its null space.
 
-    J are the rows of the tool's Jacobian that the arm can follow (`task_rows`). An arm with fewer joints than
-    these, such as a double pendulum, comes as close as it can.
-
-    Args:
-        tool: the tool at the state.
-        task: a `(*batch, 6)` wanted acceleration of the tool.
-        posture: y₀ `(*batch, nq)` wanted acceleration of the joints, as far as the task leaves it free.
-
-    Returns:
-        `(*batch, nq)` [rad/s², m/s²].
+    a `(*batch, 6)` is the task's and y₀ `(*batch, nq)` the posture's. J are the rows of the tool's Jacobian
+    that the arm can follow (`task_rows`); an arm with fewer joints than these comes as close as it can.
 
     Raises:
         NumericalError: the arm is singular, so that the task cannot be reached.
@@ -210,28 +136,24 @@ def _package(like: Array) -> Any:
 
 
 def control_torque(
-    tool: ToolMotion,
-    eom: RobotForces,
+    tool: PointMotion,
+    eom: Any,
     q: Array,
     qd: Array,
     target: Target,
     press: Array,
     gains: Gains,
 ) -> Array:
-    """Motor torque Q_u = M y − Q_K − Q_n F of task-space inverse dynamics control, before any limit.
+    """Motor torque Q_u = M y − Q_K − Q_n F `(*batch, nq)` of inverse dynamics control, not limited [N m].
 
     Args:
         tool: the tool at the state.
         eom: the equations of motion at the state; M and Q_K = Q_C + Q_G + Q_D are used.
         q, qd: `(*batch, nq)` the state.
         target: what is to be reached; F is its `push`.
-        press: Q_n `(*batch, nq)` generalized force of unit normal forces on the tool where it is, Jᵀn summed
-            over its contacts; along the normal of the reference, the push would drive the tool away from it
-            on a convex surface.
+        press: Q_n `(*batch, nq)`, Jᵀn of unit normal forces where the tool is, summed over its contacts;
+            along the normal of the reference, the push would drive the tool away on a convex surface.
         gains: feedback gains.
-
-    Returns:
-        `(*batch, nq)` [N m].
 
     Raises:
         NumericalError: the arm is singular.

@@ -36,7 +36,7 @@ class Trapezoid(NamedTuple):
     acceleration: Tensor
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Distance, speed and acceleration at time t since the start of the segment (held after its end)."""
+        """Distance, speed and acceleration at time t since the start of the segment, held after its end."""
         t = torch.minimum(t.clamp(min=0.0), self.travel_time)
         remaining = self.travel_time - t
         a, blend = self.acceleration, self.blend_time
@@ -53,20 +53,13 @@ class Trapezoid(NamedTuple):
 
 
 def trapezoid(length: Tensor, travel_time: float, max_acceleration: float) -> Trapezoid:
-    """Profiles of given length and travel time that accelerate with the maximum acceleration.
+    """Profiles of lengths d `(*batch,)` [m] and travel time T that accelerate with the maximum, a.
 
-    The blend time is t_c = T/2 − ½ √(T² − 4 d/a). Where the acceleration cannot cover the distance in the
-    travel time, T is lengthened to 2 √(d/a); the result's `travel_time` tells.
-
-    Args:
-        length: `(*batch,)` distances d ≥ 0 [m].
-        travel_time: T > 0 [s].
-        max_acceleration: a > 0 [m/s²].
+    The blend time is t_c = T/2 − ½ √(T² − 4 d/a). Where a cannot cover d in T, the `travel_time` of
+    the result is 2 √(d/a). Source: Siciliano et al., eqs. 4.7 and 4.8.
 
     Raises:
         ForceGPError: the time or the acceleration is not positive.
-
-    Source: Siciliano et al., *Robotics: Modelling, Planning and Control*, eqs. 4.7 and 4.8.
     """
     for name, value in (("travel_time", travel_time), ("max_acceleration", max_acceleration)):
         if not 0.0 < value < float("inf"):
@@ -84,8 +77,7 @@ class Chart:
     Args:
         center: `(3,)` origin, on the surface where there is one [m].
         axes: `(3, 3)` rows: directions of u, v, and the normal at the centre.
-        surface: the curved surface that u and v are laid onto; `None` where the chart is linear, on a
-            plane and in free space.
+        surface: the curved surface under u and v; `None` for a linear chart, on a plane and in free space.
     """
 
     center: Tensor
@@ -172,15 +164,7 @@ def draw_waypoints(
     lift_probability: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Chart coordinates `(count, 3)`: uniform in the rectangle, lifted off the surface now and then.
-
-    Args:
-        count: number of points.
-        size: sides of the rectangle [m].
-        lift_height: range of the uniform height of lifted points [m].
-        lift_probability: chance of each point to be lifted; 0 stays on the surface.
-        generator: source of the random numbers.
-    """
+    """Chart coordinates `(count, 3)` [m]: uniform in a rectangle, some lifted to a uniform height."""
     draws = torch.rand(count, 4, dtype=torch.float64, generator=generator)
     across = (draws[:, :2] - 0.5) * torch.tensor(size, dtype=torch.float64)
     low, high = lift_height
@@ -191,18 +175,10 @@ def draw_waypoints(
 def straight_lines(
     chart: Chart, waypoints: Tensor, t: Tensor, travel_time: float, max_acceleration: float
 ) -> Reference:
-    """Lines between successive waypoints, each with a trapezoidal velocity profile, sampled at times t.
+    """Lines between waypoints `(k, 3)` of a chart, with trapezoidal velocity profiles, at times t `(n,)` ≥ 0.
 
-    Speed and acceleration are those of the chart; on a plane and in free space, of the end-effector too.
-
-    Args:
-        chart: where the lines lie.
-        waypoints: `(k, 3)` chart coordinates, k ≥ 2.
-        t: `(n,)` sample times from 0 on; the last waypoint is held after the end [s].
-        travel_time, max_acceleration: see `trapezoid`.
-
-    Returns:
-        The reference; all its samples are computed at once.
+    Speed and acceleration are those of the chart; on a plane and in free space, of the end-effector too. The
+    last waypoint is held after the end; travel time and acceleration are those of `trapezoid`.
     """
     lines = waypoints.diff(dim=0)
     length = torch.linalg.vector_norm(lines, dim=-1)

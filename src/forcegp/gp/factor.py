@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import MissingDependencyError, NumericalError
-from forcegp.native.library import load_library
+from forcegp.native import load_library
 from forcegp.resources import threads_of_pytorch
 
 JITTER_STEPS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)

@@ -21,15 +21,9 @@ InertialParameters = Float[Tensor, "*batch 10"]
 
 
 def pseudo_inertia(mass: Scalars, com: Vector3, inertia: Rotation) -> PseudoInertia:
-    """J = [[Σ, m c], [m cᵀ, m]] with Σ = ½ tr(I_c) 1 − I_c + m c cᵀ.
+    """J = [[Σ, m c], [m cᵀ, m]] `(*batch, 4, 4)` with Σ = ½ tr(I_c) 1 − I_c + m c cᵀ; J > 0 if physical.
 
-    Args:
-        mass: `(*batch,)` [kg].
-        com: `(*batch, 3)` centre of mass in the link frame [m].
-        inertia: `(*batch, 3, 3)` rotational inertia about the centre of mass, link axes [kg m²].
-
-    Returns:
-        `(*batch, 4, 4)`, positive definite for a physical body.
+    `com` is the centre of mass in the link frame [m], `inertia` about it in link axes [kg m²].
     """
     eye = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
     half_trace = 0.5 * inertia.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -52,11 +46,7 @@ def from_pseudo_inertia(J: PseudoInertia) -> tuple[Scalars, Vector3, Rotation]:
 def from_log_cholesky(theta: InertialParameters) -> PseudoInertia:
     """J = U Uᵀ with U = e^α [[e^{d1}, s12, s13, t1], [0, e^{d2}, s23, t2], [0, 0, e^{d3}, t3], [0, 0, 0, 1]].
 
-    Args:
-        theta: `(*batch, 10)` = (α, d1, d2, d3, s12, s23, s13, t1, t2, t3).
-
-    Returns:
-        `(*batch, 4, 4)`, positive definite for every θ.
+    θ = (α, d1, d2, d3, s12, s23, s13, t1, t2, t3); J is positive definite for every θ.
     """
     alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = theta.unbind(-1)
     zero, one = torch.zeros_like(alpha), torch.ones_like(alpha)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
@@ -25,23 +24,15 @@ from forcegp.errors import (
 )
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import CheckedTree, Inertial, Joint, Site, Tree, checked, joint_motion, lock_joints
+from forcegp.robot.tree import Inertial, Joint, Site, Tree, checked, joint_motion, lock_joints
+from forcegp.robot.urdf import read_urdf
 
 FRICTION_VELOCITY = 0.1
 """Default speed over which Coulomb friction changes sign [rad/s, m/s]; robot files do not specify it."""
 SINGULAR = 1e-12
 """Smallest eigenvalue of the scaled mass matrix below which it counts as singular in double precision."""
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Pose of the base in the world, gravity, and the type and device of the robot's tensors."""
-
-    base_rotation: np.ndarray
-    base_position: np.ndarray
-    gravity: np.ndarray
-    dtype: torch.dtype
-    device: torch.device | str
+OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
+"""What the robot takes from the joints of the file as it is."""
 
 
 @dataclass(frozen=True)
@@ -54,25 +45,46 @@ class _Placed:
     links: dict[str, tuple[int, np.ndarray]]
 
 
-def build_robot(checked: CheckedTree, pose: Pose) -> RobotModel:
-    """The robot that a tree describes.
+def _build(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
+    """The robot that a tree describes, in double precision, with pose of the base and gravity as given.
 
     Raises:
         UnsupportedRobotError: the name of a frame is ambiguous.
         InertiaError: the robot can move without inertia.
     """
-    tree, remarks = checked.tree, list(checked.remarks)
-    placed = _place(checked.root, checked.joints)
+    remarks, placed = list(tree.remarks), _place(tree.joints)
     bodies = _merge(tree, placed)
     _check_mass_matrix(tree, placed, bodies)
     frames = _frames(tree, placed, remarks)
     for remark in remarks:
         warnings.warn(remark, RobotFileWarning, stacklevel=3)
-    return _model(tree, placed, bodies, frames, pose, tuple(remarks))
+    moving = placed.moving
+    poses = {"placement": np.stack(placed.placements), "frame": np.stack([T for _, _, T in frames])}
+    speed = np.full(len(moving), FRICTION_VELOCITY)
+    values = {
+        **{name: [getattr(joint, name) for joint in moving] for name in OF_JOINTS},
+        **{name: [getattr(body, name) for body in bodies] for name in ("mass", "com", "inertia")},
+        **{f"{name}_rotation": T[:, :3, :3] for name, T in poses.items()},
+        **{f"{name}_position": T[:, :3, 3] for name, T in poses.items()},
+        "stribeck": 0.0 * speed,
+        "stribeck_velocity": speed,
+        "friction_velocity": speed,
+        **world,
+    }
+    return RobotModel(
+        name=tree.name,
+        joint_names=tuple(joint.name for joint in moving),
+        joint_types=tuple("prismatic" if joint.kind == "prismatic" else "revolute" for joint in moving),
+        parents=tuple(placed.parents),
+        frame_names=tuple(name for name, _, _ in frames),
+        frame_parents=tuple(index for _, index, _ in frames),
+        remarks=tuple(remarks),
+        **{name: torch.tensor(np.asarray(x, dtype=np.float64)) for name, x in values.items()},
+    )
 
 
-def _place(root: str, joints: tuple[Joint, ...]) -> _Placed:
-    placed = _Placed([], [], [], {root: (BASE, np.eye(4))})
+def _place(joints: tuple[Joint, ...]) -> _Placed:
+    placed = _Placed([], [], [], {joints[0].parent: (BASE, np.eye(4))})
     for joint in joints:
         index, T = placed.links[joint.parent]
         T = T @ joint.placement
@@ -91,19 +103,16 @@ def _merge(tree: Tree, placed: _Placed) -> list[Inertial]:
     parts: list[list[Inertial]] = [[] for _ in placed.moving]
     for link in tree.links:
         index, T = placed.links[link.name]
-        if link.inertial is None or index == BASE:
-            continue
-        body, R = link.inertial, T[:3, :3]
-        parts[index].append(Inertial(body.mass, R @ body.com + T[:3, 3], R @ body.inertia @ R.T))
+        if link.inertial is not None and index != BASE:
+            body, R = link.inertial, T[:3, :3]
+            parts[index].append(Inertial(body.mass, R @ body.com + T[:3, 3], R @ body.inertia @ R.T))
     return [_sum(bodies) for bodies in parts]
 
 
 def _sum(bodies: list[Inertial]) -> Inertial:
-    mass = sum(body.mass for body in bodies)
-    if mass == 0.0:
-        return Inertial(0.0, np.zeros(3), sum((body.inertia for body in bodies), np.zeros((3, 3))))
-    com = sum((body.mass / mass * body.com for body in bodies), np.zeros(3))
-    inertia = np.zeros((3, 3))
+    mass, com, inertia = sum((body.mass for body in bodies), 0.0), np.zeros(3), np.zeros((3, 3))
+    for body in bodies:
+        com += body.mass / (mass or 1.0) * body.com
     for body in bodies:
         d = body.com - com
         inertia += body.inertia + body.mass * (d @ d * np.eye(3) - np.outer(d, d))
@@ -178,52 +187,6 @@ def _free_name(tree: Tree, site: Site, taken: set[str], remarks: list[str]) -> s
     return name
 
 
-def _model(
-    tree: Tree,
-    placed: _Placed,
-    bodies: list[Inertial],
-    frames: list[tuple[str, int, np.ndarray]],
-    pose: Pose,
-    remarks: tuple[str, ...],
-) -> RobotModel:
-    def tensor(values: object) -> torch.Tensor:
-        return torch.tensor(np.asarray(values, dtype=np.float64), dtype=pose.dtype, device=pose.device)
-
-    moving, placement = placed.moving, np.stack(placed.placements)
-    poses = np.stack([T for _, _, T in frames])
-    speed = [FRICTION_VELOCITY] * len(moving)
-    return RobotModel(
-        name=tree.name,
-        joint_names=tuple(joint.name for joint in moving),
-        joint_types=tuple("prismatic" if joint.kind == "prismatic" else "revolute" for joint in moving),
-        parents=tuple(placed.parents),
-        placement_rotation=tensor(placement[:, :3, :3]),
-        placement_position=tensor(placement[:, :3, 3]),
-        axis=tensor([joint.axis for joint in moving]),
-        mass=tensor([body.mass for body in bodies]),
-        com=tensor([body.com for body in bodies]),
-        inertia=tensor([body.inertia for body in bodies]),
-        damping=tensor([joint.damping for joint in moving]),
-        friction=tensor([joint.friction for joint in moving]),
-        stribeck=tensor([0.0] * len(moving)),
-        stribeck_velocity=tensor(speed),
-        friction_velocity=tensor(speed),
-        armature=tensor([joint.armature for joint in moving]),
-        lower=tensor([joint.lower for joint in moving]),
-        upper=tensor([joint.upper for joint in moving]),
-        velocity_limit=tensor([joint.velocity for joint in moving]),
-        effort_limit=tensor([joint.effort for joint in moving]),
-        frame_names=tuple(name for name, _, _ in frames),
-        frame_parents=tuple(index for _, index, _ in frames),
-        frame_rotation=tensor(poses[:, :3, :3]),
-        frame_position=tensor(poses[:, :3, 3]),
-        base_rotation=tensor(pose.base_rotation),
-        base_position=tensor(pose.base_position),
-        gravity=tensor(pose.gravity),
-        remarks=remarks,
-    )
-
-
 BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa", "kuka_iiwa14", "ur5")
 
 
@@ -267,34 +230,23 @@ def load_robot(
         InertiaError: the inertia of a link is not physical.
         ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.
     """
-    pose = Pose(
-        base_rotation=scipy.spatial.transform.Rotation.from_euler(
-            "xyz", _vector(base_rpy, "base_rpy")
-        ).as_matrix(),
-        base_position=_vector(base_position, "base_position"),
-        gravity=_vector(gravity, "gravity"),
-        dtype=dtype,
-        device=device,
-    )
-    tree = checked(lock_joints(_read(source), locked_joints or {}))
-    return build_robot(tree, pose)
+    turn = scipy.spatial.transform.Rotation.from_euler("xyz", _vector(base_rpy, "base_rpy"))
+    world = {
+        "base_rotation": turn.as_matrix(),
+        "base_position": _vector(base_position, "base_position"),
+        "gravity": _vector(gravity, "gravity"),
+    }
+    return _build(checked(lock_joints(_read(source), locked_joints or {})), world).to(device, dtype)
 
 
 def _read(source: str | Path) -> Tree:
-    if str(source) in BUNDLED:
-        with as_file(files("forcegp.robot") / "bundled" / f"{source}.urdf") as path:
-            return _read_file(path)
     path = Path(source).expanduser()
-    if not path.suffix and path.name == str(source):
+    if str(source) in BUNDLED:
+        path = Path(__file__).parent / "bundled" / f"{source}.urdf"
+    elif not path.suffix and path.name == str(source):
         raise UnknownNameError("robot", source, (*BUNDLED, "path of a .urdf or .xml file"))
-    return _read_file(path)
-
-
-def _read_file(path: Path) -> Tree:
     root = parse_xml(read_bytes(path), str(path))
     if root.tag == "robot":
-        from forcegp.robot.urdf import read_urdf  # the parser is slow to import, and saved models need none
-
         return read_urdf(root, str(path))
     if root.tag == "mujoco":
         from forcegp.robot.mjcf import read_mjcf  # loads MuJoCo, which is optional

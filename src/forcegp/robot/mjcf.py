@@ -9,6 +9,7 @@ import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, tostring
@@ -28,13 +29,9 @@ _KINDS: dict[int, JointKind] = {
 
 
 def read_mjcf(root: Element, path: Path) -> Tree:
-    """Links and joints of an MJCF document: bodies are links, bodies and sites are frames.
+    """Links and joints of the `<mujoco>` document of a file: bodies are links, bodies and sites are frames.
 
     A body with several joints gets a massless link between each two of them.
-
-    Args:
-        root: its `<mujoco>` element.
-        path: the file, for messages and includes.
 
     Raises:
         RobotFileError: the document is not valid; errors of MuJoCo's compiler are quoted.
@@ -44,8 +41,8 @@ def read_mjcf(root: Element, path: Path) -> Tree:
     document, coupled, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):
         model = _compile(document, str(path))
-    names = _names(model, "body", model.nbody)
-    joint_names = _names(model, "jnt", model.njnt)
+    names = [model.body(i).name or f"body_{i}" for i in range(model.nbody)]
+    joint_names = [model.joint(i).name or f"joint_{i}" for i in range(model.njnt)]
     links = [Link(names[0])]
     joints: list[Joint] = []
     for b in range(1, model.nbody):
@@ -60,7 +57,11 @@ def read_mjcf(root: Element, path: Path) -> Tree:
         label=str(path),
         links=tuple(links),
         joints=tuple(joints),
-        sites=_sites(model, names),
+        sites=tuple(
+            Site(name, names[model.site_bodyid[i]], _pose(model.site_pos[i], model.site_quat[i]))
+            for i in range(model.nsite)
+            if (name := model.site(i).name)
+        ),
         remarks=tuple(remarks),
     )
 
@@ -73,8 +74,8 @@ _HANDLER = threading.RLock()
 def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
     """Collect MuJoCo's warnings, which would otherwise go to a log file in the working folder.
 
-    The handler belongs to the whole process: one reader at a time replaces it, warnings of other threads
-    go on to theirs, and it is put back.
+    The handler belongs to the process: one reader at a time replaces it and puts it back, and warnings of
+    other threads go on to theirs.
     """
     thread = threading.get_ident()
     with _HANDLER:
@@ -103,13 +104,6 @@ def _compile(document: Element, label: str) -> Any:
         raise kind(message, expected="a valid MJCF model", got=text) from error
 
 
-def _names(model: Any, kind: str, count: int) -> list[str]:
-    """Names of the bodies or joints; those without one get `body_<number>` or `joint_<number>`."""
-    objects = {"body": mujoco.mjtObj.mjOBJ_BODY, "jnt": mujoco.mjtObj.mjOBJ_JOINT}
-    word = "body" if kind == "body" else "joint"
-    return [mujoco.mj_id2name(model, objects[kind], i) or f"{word}_{i}" for i in range(count)]
-
-
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     # MuJoCo puts the real part first, SciPy last.
     return transform(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix(), position)
@@ -132,34 +126,25 @@ def _chain(
     anchor = np.zeros(3)
     for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
         step = transform(np.eye(3), model.jnt_pos[j] - anchor)
-        link = f"{names[b]}/{joint_names[j]}"
-        chain.append(_joint(model, j, joint_names[j], parent, link, placement @ step, coupled, label))
-        parent, placement, anchor = link, np.eye(4), model.jnt_pos[j].copy()
+        joint = _joint(model, j, joint_names[j], names[b], coupled.get(joint_names[j]), label)
+        chain.append(replace(joint, parent=parent, placement=placement @ step @ joint.placement))
+        parent, placement, anchor = joint.child, np.eye(4), model.jnt_pos[j].copy()
     last = transform(np.eye(3), -anchor)
     chain.append(Joint("", "fixed", parent, names[b], placement @ last))
     return chain
 
 
-def _joint(
-    model: Any,
-    j: int,
-    name: str,
-    parent: str,
-    child: str,
-    placement: np.ndarray,
-    coupled: dict[str, Coupling],
-    label: str,
-) -> Joint:
+def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, label: str) -> Joint:
+    """A joint of a body, placed where its position is zero; its links are not known yet."""
     kind, dof = _KINDS.get(int(model.jnt_type[j])), model.jnt_dofadr[j]
     if kind is None:
         word = "free (floating)" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE else "ball"
         raise UnsupportedRobotError(
-            f"{label}: joint {name!r} of link {child.split('/')[0]!r} is a {word} joint",
+            f"{label}: joint {name!r} of link {body!r} is a {word} joint",
             expected="hinge and slide joints",
             got=word,
             hint="remove the free joint to hold the robot by its base" if "free" in word else None,
         )
-    follows = coupled.get(name)
     relation = f"mimics joint {follows.leader!r}" if follows and follows.leader else "is held in place"
     refused = f"{relation} by an equality constraint" if follows else ""
     if model.jnt_stiffness[j] or model.jnt_stiffnesspoly[j].any() or model.dof_dampingpoly[dof].any():
@@ -170,16 +155,16 @@ def _joint(
     return Joint(
         name=name,
         kind=kind,
-        parent=parent,
-        child=child,
-        placement=placement @ joint_motion(kind, axis, -start),
+        parent="",
+        child=f"{body}/{name}",
+        placement=joint_motion(kind, axis, -start),
         axis=axis,
         damping=float(model.dof_damping[dof]),
         friction=float(model.dof_frictionloss[dof]),
         armature=float(model.dof_armature[dof]),
         lower=float(limits[0]),
         upper=float(limits[1]),
-        effort=_effort(model, j),
+        effort_limit=_effort(model, j),
         refused=refused,
         follows=follows,
     )
@@ -188,14 +173,9 @@ def _joint(
 def _effort(model: Any, j: int) -> float:
     """Largest force that the joint and its actuators allow; the control range of a motor limits it too."""
     effort = float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
-    drives = [
-        a
-        for a in range(model.nu)
-        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[a, 0] == j
-    ]
-    if not drives:
-        return effort
-    return min(effort, sum(_drive_effort(model, a) for a in drives))
+    of_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    drives = np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == j))
+    return min(effort, sum(_drive_effort(model, a) for a in drives.tolist())) if len(drives) else effort
 
 
 def _drive_effort(model: Any, a: int) -> float:
@@ -205,13 +185,3 @@ def _drive_effort(model: Any, a: int) -> float:
     if model.actuator_ctrllimited[a] and model.actuator(a).name.startswith("motor"):
         limit = min(limit, float(np.abs(model.actuator_ctrlrange[a]).max()))
     return gear * limit if limit < np.inf else np.inf
-
-
-def _sites(model: Any, names: list[str]) -> tuple[Site, ...]:
-    sites = []
-    for s in range(model.nsite):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
-        if name:
-            body = names[model.site_bodyid[s]]
-            sites.append(Site(name, body, _pose(model.site_pos[s], model.site_quat[s])))
-    return tuple(sites)

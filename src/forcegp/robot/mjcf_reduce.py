@@ -40,14 +40,9 @@ class Coupling(NamedTuple):
 
 
 def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling], list[str]]:
-    """The reduced document, the joints that equality constraints couple, and remarks.
+    """The reduced document of a file, coupling by name of the joint that an equality constrains, and remarks.
 
-    Args:
-        root: the `<mujoco>` element.
-        path: its file; includes are looked for beside it.
-
-    Returns:
-        The reduced `<mujoco>` element; coupling by joint name; remarks.
+    Included files are looked for beside `path`.
 
     Raises:
         RobotFileError: an include or a number is not valid.
@@ -61,9 +56,10 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling]
     for section in root:
         where = f"{path}: <{section.tag}>"
         if section.tag == "compiler":
-            SubElement(document, "compiler", {k: section.attrib[k] for k in _COMPILER if k in section.attrib})
+            SubElement(document, "compiler", _only(section, _COMPILER))
         elif section.tag == "option":
-            remarks += _fluid(section, where)
+            fluid = ", ".join(name for name in ("density", "viscosity", "wind") if section.get(name))
+            remarks += [f"{where}: the forces of {fluid} are ignored"] if fluid else []
         elif section.tag == "default":
             document.append(_copy_default(section))
         elif section.tag == "worldbody":
@@ -122,11 +118,6 @@ def _included(include: Element, folder: Path, included: set[Path], path: Path) -
     return parse_xml(read_bytes(target), str(target))
 
 
-def _fluid(option: Element, where: str) -> list[str]:
-    present = [name for name in ("density", "viscosity", "wind") if option.get(name)]
-    return [f"{where}: the forces of {', '.join(present)} are ignored"] if present else []
-
-
 def _copy_default(default: Element) -> Element:
     copy = Element("default", default.attrib)
     limits = {}
@@ -134,16 +125,20 @@ def _copy_default(default: Element) -> Element:
         if child.tag == "default":
             copy.append(_copy_default(child))
         elif child.tag in _DEFAULTS:
-            SubElement(copy, child.tag, {k: v for k, v in child.attrib.items() if k not in _NO_MESH})
+            SubElement(copy, child.tag, _without(child, _NO_MESH))
         elif child.tag in _ACTUATORS:
-            limits |= _actuator_limits(child)
+            limits |= _only(child, _ACTUATOR_LIMITS)
     if limits:
         SubElement(copy, "general", limits)
     return copy
 
 
-def _actuator_limits(actuator: Element) -> dict[str, str]:
-    return {k: actuator.attrib[k] for k in _ACTUATOR_LIMITS if k in actuator.attrib}
+def _only(element: Element, names: tuple[str, ...]) -> dict[str, str]:
+    return {k: element.attrib[k] for k in names if k in element.attrib}
+
+
+def _without(element: Element, names: tuple[str, ...]) -> dict[str, str]:
+    return {k: v for k, v in element.attrib.items() if k not in names}
 
 
 def _copy_actuators(section: Element) -> Element:
@@ -152,8 +147,8 @@ def _copy_actuators(section: Element) -> Element:
     for i, actuator in enumerate(section):
         if actuator.tag in _ACTUATORS and actuator.get("joint"):
             name = f"{'motor' if actuator.tag == 'motor' else 'servo'}_{i}"
-            kept = {k: actuator.attrib[k] for k in ("class", "joint") if k in actuator.attrib}
-            SubElement(copy, "general", {"name": name, **kept, **_actuator_limits(actuator)})
+            kept = _only(actuator, ("class", "joint", *_ACTUATOR_LIMITS))
+            SubElement(copy, "general", {"name": name, **kept})
     return copy
 
 
@@ -169,7 +164,7 @@ def _copy_body(body: Element, from_geoms: bool, where: str) -> Element:
     name = body.get("name", "(unnamed)")
     has_inertial = any(part.tag == "inertial" for part in _parts(body))
     keep_geoms = body.tag == "body" and (from_geoms or not has_inertial)
-    copy = Element(body.tag, {k: v for k, v in body.attrib.items() if k not in ("user", "mocap", "sleep")})
+    copy = Element(body.tag, _without(body, ("user", "mocap", "sleep")))
     _copy_parts(body, copy, keep_geoms, from_geoms, f"{where} {name!r}")
     return copy
 
@@ -184,10 +179,9 @@ def _copy_parts(source: Element, copy: Element, keep_geoms: bool, from_geoms: bo
         elif part.tag == "geom":
             if keep_geoms and part.get("mass") != "0":
                 _refuse_mesh(part, where)
-                unwanted = ("name", *_NO_MESH)
-                SubElement(copy, "geom", {k: v for k, v in part.attrib.items() if k not in unwanted})
+                SubElement(copy, "geom", _without(part, ("name", *_NO_MESH)))
         elif part.tag in _BODY_PARTS:
-            SubElement(copy, part.tag, {k: v for k, v in part.attrib.items() if k != "user"})
+            SubElement(copy, part.tag, _without(part, ("user",)))
         elif part.tag not in _IGNORED_PARTS:
             raise UnsupportedRobotError(
                 f"{where} has a <{part.tag[:60]}>, which is not supported",

@@ -155,16 +155,21 @@ class RobotModel:
                 digest.update(value.detach().to("cpu", torch.float64).contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]
 
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """Names of the constants that require a gradient."""
+        values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        return tuple(name for name, x in values if isinstance(x, Tensor) and x.requires_grad)
+
     def frame_index(self, frame: str) -> int:
         """Index of a named frame.
 
         Raises:
             UnknownNameError: no such frame; the message lists the frames and the nearest one.
         """
-        try:
-            return self.frame_names.index(frame)
-        except ValueError:
-            raise UnknownNameError(f"frame of robot {self.name!r}", frame, self.frame_names) from None
+        if frame not in self.frame_names:
+            raise UnknownNameError(f"frame of robot {self.name!r}", frame, self.frame_names)
+        return self.frame_names.index(frame)
 
     def joint_index(self, joint: str) -> int:
         """Index of a named joint.
@@ -172,10 +177,9 @@ class RobotModel:
         Raises:
             UnknownNameError: no such joint; the message lists the joints and the nearest one.
         """
-        try:
-            return self.joint_names.index(joint)
-        except ValueError:
-            raise UnknownNameError(f"joint of robot {self.name!r}", joint, self.joint_names) from None
+        if joint not in self.joint_names:
+            raise UnknownNameError(f"joint of robot {self.name!r}", joint, self.joint_names)
+        return self.joint_names.index(joint)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RobotModel:
         """The same robot with its constants on another device or in another precision."""

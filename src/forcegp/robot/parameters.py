@@ -19,6 +19,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from forcegp.batchlast import skew
 from forcegp.errors import InertiaError, ModelError, UnknownNameError
 from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, log_cholesky, pseudo_inertia
 from forcegp.robot.model import RobotModel
@@ -86,11 +87,8 @@ class AnalyticalParameters(nn.Module):
     ) -> None:
         """Draw all coordinates uniformly from a window around the initial robot.
 
-        Args:
-            generator: the source of randomness.
-            relative: half width for logarithms: a parameter varies by a factor of up to e^{±relative}.
-            length: half width for centres of mass, shifts and lengths [m].
-            angle: half width for rotations [rad].
+        `relative` is the half width of logarithms, a factor of up to e^{±relative}; `length` of centres of
+        mass, shifts and lengths [m]; `angle` that of rotations [rad].
         """
         for quantity, x in self.coordinates.items():
             half = torch.full_like(x, relative)
@@ -106,10 +104,10 @@ class AnalyticalParameters(nn.Module):
     def _initial(self, quantity: str) -> nn.Parameter:
         robot, rows = self.start, self._rows[quantity]
         if quantity == "inertia":
-            for name, row in zip(self.joints[quantity], rows.tolist(), strict=True):
-                _check_inertia(robot, name, row)
-            J = pseudo_inertia(robot.mass[rows], robot.com[rows], robot.inertia[rows])
-            return nn.Parameter(log_cholesky(J))
+            bodies = zip(
+                self.joints[quantity], robot.mass[rows], robot.com[rows], robot.inertia[rows], strict=True
+            )
+            return nn.Parameter(torch.stack([_log_cholesky(*body) for body in bodies]))
         if quantity == "com":
             return nn.Parameter(robot.com[rows].clone())
         if quantity == "offset":
@@ -127,7 +125,7 @@ class AnalyticalParameters(nn.Module):
             )
         if quantity == "offset":
             rows = self._rows[quantity]
-            turn = torch.linalg.matrix_exp(_cross_matrix(x[:, :3]))
+            turn = torch.linalg.matrix_exp(skew(x[:, :3].T).permute(2, 0, 1))
             return {
                 "placement_rotation": self.start.placement_rotation[rows] @ turn,
                 "placement_position": self.start.placement_position[rows] + x[:, 3:],
@@ -157,9 +155,9 @@ def _check(joints: Mapping[str, tuple[str, ...]]) -> None:
             )
 
 
-def _check_inertia(robot: RobotModel, joint: str, row: int) -> None:
+def _log_cholesky(joint: str, mass: Tensor, com: Tensor, inertia: Tensor) -> Tensor:
     try:
-        log_cholesky(pseudo_inertia(robot.mass[row], robot.com[row], robot.inertia[row]))
+        return log_cholesky(pseudo_inertia(mass, com, inertia))
     except InertiaError as error:
         raise InertiaError(
             f"the inertia of the link of joint {joint!r} is not physical, so it has no log-Cholesky form",
@@ -167,10 +165,3 @@ def _check_inertia(robot: RobotModel, joint: str, row: int) -> None:
             got=error.got,
             hint="learn its mass or com alone, or start from a robot with a physical inertia",
         ) from error
-
-
-def _cross_matrix(v: Tensor) -> Tensor:
-    """[v]× of `(n, 3)` rotation vectors."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

@@ -49,11 +49,7 @@ class _BoundedBuilder(TreeBuilder):
 
 
 def read_bytes(path: Path) -> bytes:
-    """Content of a regular file of at most `MAX_BYTES`.
-
-    Raises:
-        RobotFileError: the file is missing, not a regular file, unreadable or too large.
-    """
+    """Content of a regular file of at most `MAX_BYTES`; RobotFileError if there is none."""
     try:
         if not path.is_file():
             kind = "a folder" if path.is_dir() else "something else" if path.exists() else "no such file"
@@ -75,12 +71,8 @@ def read_bytes(path: Path) -> bytes:
 def parse_xml(data: bytes, label: str) -> Element:
     """The element tree of an XML document without DTD, entities or external references.
 
-    Args:
-        data: the document.
-        label: the file name for messages.
-
     Raises:
-        RobotFileError: the document is malformed, hostile, too large or too deep.
+        RobotFileError: the document is malformed, hostile, too large or too deep; names `label`.
     """
     parser = DefusedXMLParser(
         target=_BoundedBuilder(label), forbid_dtd=True, forbid_entities=True, forbid_external=True
@@ -125,17 +117,10 @@ def xacro_error(label: str, got: str) -> RobotFileError:
 def parse_numbers(
     text: str, where: str, count: int, *, infinite: bool = False, error: type[RobotFileError] = RobotFileError
 ) -> list[float]:
-    """`count` finite numbers from an attribute.
-
-    Args:
-        text: the attribute's value.
-        where: file, element and attribute, for messages.
-        count: the number of values it must hold.
-        infinite: whether ±infinity is allowed (limits).
-        error: the class of error to raise.
+    """`count` finite numbers from the text of an attribute; `infinite` allows ±∞ (limits).
 
     Raises:
-        RobotFileError: the attribute does not hold `count` numbers that are finite and below `MAX_NUMBER`.
+        RobotFileError: (or `error`) too many, too few, not finite or above `MAX_NUMBER`; names `where`.
     """
     expected = f"{count} finite number{'s' if count > 1 else ''}"
     try:

@@ -1,13 +1,11 @@
-"""The tree of links and joints that URDF and MJCF files are read into, and its checks.
-
-Checked are names, a single root, supported joints and physical inertia.
-"""
+"""The tree of links and joints that URDF and MJCF files are read into, and its checks."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -29,7 +27,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid link; `frame` says whether the robot keeps its frame."""
+    """A rigid link; the robot keeps its frame if `frame` is true."""
 
     name: str
     inertial: Inertial | None = None
@@ -56,8 +54,8 @@ class Joint:
     armature: float = 0.0
     lower: float = -np.inf
     upper: float = np.inf
-    velocity: float = np.inf
-    effort: float = np.inf
+    velocity_limit: float = np.inf
+    effort_limit: float = np.inf
     refused: str = ""
     follows: tuple[str, float, float] | None = None
 
@@ -97,22 +95,8 @@ def joint_motion(kind: JointKind, axis: np.ndarray, q: float) -> np.ndarray:
     return transform(scipy.spatial.transform.Rotation.from_rotvec(q * axis).as_matrix(), np.zeros(3))
 
 
-def unit_axis(axis: np.ndarray, where: str) -> np.ndarray:
-    """The axis, scaled to unit length.
-
-    Raises:
-        RobotFileError: its length is zero.
-    """
-    length = float(np.linalg.norm(axis))
-    if length < 1e-9:
-        raise RobotFileError(
-            f"{where} has an axis of length zero", expected="a direction such as 0 0 1", got=axis.tolist()
-        )
-    return axis / length
-
-
 def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
-    """The tree with some joints fixed at given positions [rad, m], and with them the joints that follow them.
+    """The tree with some joints, and those that follow them, fixed at positions [rad, m].
 
     Raises:
         UnknownNameError: a joint does not exist.
@@ -125,7 +109,12 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
         if not np.isfinite(q):
             raise RobotFileError(f"{tree.label}: joint {name!r} cannot be locked", expected="a number", got=q)
 
-    held = _with_followers(tree, locked)
+    # q = multiplier · leader + offset; a follower may lead another joint.
+    held = {name: float(q) for name, q in locked.items()}
+    followers = [(joint.name, *joint.follows) for joint in tree.joints if joint.follows is not None]
+    for _, (name, leader, multiplier, offset) in product(followers, followers):
+        if leader in held:
+            held.setdefault(name, multiplier * held[leader] + offset)
 
     def lock(joint: Joint) -> Joint:
         if joint.kind == "fixed" or joint.name not in held:
@@ -136,39 +125,16 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
     return replace(tree, joints=tuple(lock(joint) for joint in tree.joints))
 
 
-def _with_followers(tree: Tree, locked: Mapping[str, float]) -> dict[str, float]:
-    """Positions of locked joints and of those that mimic them, q = multiplier · leader + offset."""
-    held = {name: float(q) for name, q in locked.items()}
-    for _ in tree.joints:  # a follower may lead another joint
-        for joint in tree.joints:
-            if joint.follows is not None and joint.follows[0] in held:
-                leader, multiplier, offset = joint.follows
-                held.setdefault(joint.name, multiplier * held[leader] + offset)
-    return held
-
-
 MAX_JOINTS = 500
 ROUNDING = 1e-6
 """Relative error of principal moments that are printed with a few digits only."""
 
 
-@dataclass(frozen=True)
-class CheckedTree:
-    """A valid tree: its root link, its joints with parents before children, and remarks."""
-
-    tree: Tree
-    root: str
-    joints: tuple[Joint, ...]
-    remarks: tuple[str, ...]
-
-
-def checked(tree: Tree) -> CheckedTree:
+def checked(tree: Tree) -> Tree:
     """The tree, checked, with its joints in depth-first order, siblings in the order of the file.
 
     Raises:
-        RobotFileError: the links and joints are not a single tree.
-        UnsupportedRobotError: a joint is of an unsupported type.
-        InertiaError: the inertia of a link is not physical.
+        RobotFileError, UnsupportedRobotError, InertiaError: not a tree, a joint, or an inertia is refused.
     """
     _check_names(tree)
     root = _root(tree)
@@ -192,7 +158,7 @@ def checked(tree: Tree) -> CheckedTree:
         )
     _check_kinds(tree)
     remarks = (*tree.remarks, *_check_inertia(tree, joints))
-    return CheckedTree(tree, root, tuple(joints), remarks)
+    return replace(tree, joints=tuple(joints), remarks=remarks)
 
 
 def _check_inertia(tree: Tree, joints: list[Joint]) -> list[str]:
@@ -320,16 +286,12 @@ def _lock(tree: Tree, refused: list[Joint]) -> dict[str, float]:
     lock: dict[str, float] = {}
     for joint in refused:
         if joint.follows is None or joint.follows[0] not in joints:
-            lock[joint.name] = _nearest_to_zero(joint)
+            lock[joint.name] = float(np.clip(0.0, joint.lower, joint.upper))
             continue
         leader, multiplier, offset = joint.follows
-        lock[leader] = _nearest_to_zero(joints[leader])
+        lock[leader] = float(np.clip(0.0, joints[leader].lower, joints[leader].upper))
         lock[joint.name] = multiplier * lock[leader] + offset
     return lock
-
-
-def _nearest_to_zero(joint: Joint) -> float:
-    return float(min(max(0.0, joint.lower), joint.upper))
 
 
 def _shown(names: list[str]) -> str:

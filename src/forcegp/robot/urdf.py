@@ -1,19 +1,17 @@
-"""URDF files: validated here, parsed by yourdfpy."""
+"""URDF files, with every element that is read checked; anything else in the file is ignored."""
 
 from __future__ import annotations
 
-import io
-from xml.etree.ElementTree import Element, SubElement, tostring
+from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
-import yourdfpy
+from scipy.spatial.transform import Rotation
 
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
 from forcegp.robot.safety import parse_numbers, xacro_error
-from forcegp.robot.tree import Inertial, Joint, Link, Tree, unit_axis
+from forcegp.robot.tree import Inertial, Joint, Link, Tree, transform
 
-_LINK_PARTS = ("inertial",)
-_JOINT_PARTS = ("origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
 _NUMBERS = {
     "origin": {"xyz": 3, "rpy": 3},
     "axis": {"xyz": 3},
@@ -36,17 +34,13 @@ _INSTEAD = {
     "planar": "write it as two prismatic joints and a revolute one",
 }
 """What to write for joint types that are not supported."""
-_MOVING = ("revolute", "continuous", "prismatic")
+_KINDS = ("revolute", "continuous", "prismatic", "fixed")
 WORLD = "world"
 """Name of the fixed surroundings, which some files use as a link without declaring it."""
 
 
 def read_urdf(root: Element, label: str) -> Tree:
-    """Links and joints of a URDF document.
-
-    Args:
-        root: its `<robot>` element.
-        label: the file name for messages.
+    """Links and joints of a URDF document from its `<robot>` element; `label` names the file in messages.
 
     Raises:
         RobotFileError: an element or a number is missing or not valid; the message names it.
@@ -54,26 +48,15 @@ def read_urdf(root: Element, label: str) -> Tree:
         InertiaError: a mass or an inertia is not a finite number.
     """
     _refuse_xacro(root, label)
-    document = Element("robot", name=root.get("name") or "robot")
-    for link in root.findall("link"):
-        _copy(document, link, _LINK_PARTS, f"{label}: link {_name(link, label)!r}")
-    for joint in root.findall("joint"):
-        _copy_joint(document, joint, label)
-    robot = yourdfpy.URDF.load(
-        io.BytesIO(tostring(document, encoding="utf-8")), build_scene_graph=False, load_meshes=False
-    ).robot
-    joints = tuple(_joint(joint, f"{label}: joint {joint.name!r}") for joint in robot.joints)
-    links = tuple(Link(link.name, _inertial(link)) for link in robot.links)
-    if not _uses_undeclared_world(links, joints):
-        return Tree(robot.name, label, links, joints)
-    remark = f"{label}: link {WORLD!r} is used but not declared; it is taken as the base"
-    return Tree(robot.name, label, (Link(WORLD), *links), joints, remarks=(remark,))
-
-
-def _uses_undeclared_world(links: tuple[Link, ...], joints: tuple[Joint, ...]) -> bool:
-    """Whether a fixed joint attaches the robot to a `world` that is not a link of the file, as in Drake."""
+    links = tuple(_link(element, label) for element in root.findall("link"))
+    joints = tuple(_joint(element, label) for element in root.findall("joint"))
+    remarks: tuple[str, ...] = ()
+    # As in Drake, a fixed joint may attach the robot to a `world` that is not a link of the file.
     attached = any(joint.parent == WORLD and joint.kind == "fixed" for joint in joints)
-    return attached and all(link.name != WORLD for link in links)
+    if attached and all(link.name != WORLD for link in links):
+        links = (Link(WORLD), *links)
+        remarks = (f"{label}: link {WORLD!r} is used but not declared; it is taken as the base",)
+    return Tree(root.get("name") or "robot", label, links, joints, remarks=remarks)
 
 
 def _refuse_xacro(root: Element, label: str) -> None:
@@ -94,124 +77,111 @@ def _name(element: Element, label: str) -> str:
     return name
 
 
-def _copy_joint(document: Element, joint: Element, label: str) -> None:
-    where = f"{label}: joint {_name(joint, label)!r}"
-    kind = joint.get("type")
+def _part(element: Element, tag: str, where: str) -> dict[str, Any]:
+    """Attributes of the only part with a tag, with their numbers read; empty if there is none."""
+    parts = element.findall(tag)
+    if len(parts) > 1:
+        raise RobotFileError(f"{where} has several <{tag}>", expected="one", got=len(parts))
+    if not parts:
+        return {}
+    values: dict[str, Any] = dict(parts[0].attrib)
+    error = InertiaError if tag in ("mass", "inertia") else RobotFileError
+    for name in _NEEDED.get(tag, ()):
+        if not values.get(name):
+            raise error(f"{where}: <{tag}> has no {name}", expected=f'{name}="..."')
+    for name, count in _NUMBERS.get(tag, {}).items():
+        if name in values:
+            at, infinite = f"{where}: {tag} {name}", tag == "limit"
+            numbers = parse_numbers(values[name], at, count, infinite=infinite, error=error)
+            values[name] = numbers[0] if count == 1 else np.array(numbers)
+    return values
+
+
+def _pose(element: Element, where: str) -> np.ndarray:
+    origin = _part(element, "origin", where)
+    rotation = Rotation.from_euler("xyz", origin.get("rpy", np.zeros(3)))
+    return transform(rotation.as_matrix(), origin.get("xyz", np.zeros(3)))
+
+
+def _link(element: Element, label: str) -> Link:
+    name = _name(element, label)
+    where = f"{label}: link {name!r}"
+    inertials = element.findall("inertial")
+    if len(inertials) > 1:
+        raise RobotFileError(f"{where} has several <inertial>", expected="one", got=len(inertials))
+    return Link(name, _inertial(inertials[0], where) if inertials else None)
+
+
+def _inertial(element: Element, where: str) -> Inertial:
+    mass, I = _part(element, "mass", where), _part(element, "inertia", where)
+    for part, values in (("mass", mass), ("inertia", I)):
+        if not values:
+            raise InertiaError(f"{where} has an <inertial> without <{part}>", expected=f"<{part} .../>")
+    rows = [["ixx", "ixy", "ixz"], ["ixy", "iyy", "iyz"], ["ixz", "iyz", "izz"]]
+    T, inertia = _pose(element, where), np.array([[I[name] for name in row] for row in rows])
+    return Inertial(mass["value"], T[:3, 3], T[:3, :3] @ inertia @ T[:3, :3].T)
+
+
+def _joint(element: Element, label: str) -> Joint:
+    name, kind = _name(element, label), element.get("type")
+    where = f"{label}: joint {name!r}"
     if kind is None:
         raise RobotFileError(f"{where} has no type", expected="type=revolute, prismatic, ...")
-    if kind not in (*_MOVING, "fixed"):
+    if kind not in _KINDS:
         raise UnsupportedRobotError(
             f"{where} is of type {kind!r}",
             expected="revolute, continuous, prismatic or fixed",
             got=kind,
             hint=_INSTEAD.get(kind),
         )
-    _copy(document, joint, _JOINT_PARTS, where)
-    for part in ("parent", "child"):
-        if joint.find(part) is None:
+    tags = ("parent", "child", "axis", "limit", "dynamics", "mimic")
+    parent, child, axis, limit, dynamics, mimic = (_part(element, tag, where) for tag in tags)
+    for part, values in (("parent", parent), ("child", child)):
+        if not values:
             raise RobotFileError(f"{where} has no <{part}>", expected=f'<{part} link="..."/>')
-
-
-def _copy(document: Element, source: Element, parts: tuple[str, ...], where: str) -> None:
-    """Copy the validated parts of a link or joint, so that nothing else reaches the parser."""
-    copy = SubElement(document, source.tag, dict(source.attrib))
-    for part in parts:
-        elements = source.findall(part)
-        if len(elements) > 1:
-            raise RobotFileError(f"{where} has several <{part}>", expected="one", got=len(elements))
-        if not elements:
-            continue
-        if part == "inertial":
-            _check_inertial(elements[0], where)
-            _copy(copy, elements[0], ("origin", "mass", "inertia"), where)
-        else:
-            _check_attributes(elements[0], where)
-            SubElement(copy, part, dict(elements[0].attrib))
-
-
-def _check_inertial(inertial: Element, where: str) -> None:
-    for part in ("mass", "inertia"):
-        if inertial.find(part) is None:
-            raise InertiaError(f"{where} has an <inertial> without <{part}>", expected=f"<{part} .../>")
-
-
-def _check_attributes(element: Element, where: str) -> None:
-    tag = element.tag
-    error = InertiaError if tag in ("mass", "inertia") else RobotFileError
-    for attribute in _NEEDED.get(tag, ()):
-        if not element.get(attribute):
-            raise error(f"{where}: <{tag}> has no {attribute}", expected=f'{attribute}="..."')
-    for attribute, count in _NUMBERS.get(tag, {}).items():
-        text = element.get(attribute)
-        if text is not None:
-            infinite = tag == "limit"
-            parse_numbers(text, f"{where}: {tag} {attribute}", count, infinite=infinite, error=error)
-
-
-def _pose(origin: np.ndarray | None) -> np.ndarray:
-    return np.eye(4) if origin is None else origin
-
-
-def _inertial(link: yourdfpy.Link) -> Inertial | None:
-    body = link.inertial
-    if body is None or body.mass is None or body.inertia is None:
-        return None
-    T = _pose(body.origin)
-    R = T[:3, :3]
-    return Inertial(body.mass, T[:3, 3], R @ body.inertia @ R.T)
-
-
-def _joint(joint: yourdfpy.Joint, where: str) -> Joint:
-    placement = _pose(joint.origin)
-    if joint.type == "fixed":
-        return Joint(joint.name, "fixed", joint.parent, joint.child, placement)
-    lower, upper, effort, velocity = _limits(joint, where)
-    # yourdfpy leaves these two as strings.
-    dynamics = joint.dynamics or yourdfpy.Dynamics()
-    damping, friction = float(dynamics.damping or 0.0), float(dynamics.friction or 0.0)
+    ends = parent["link"], child["link"], _pose(element, where)
+    if kind == "fixed":
+        return Joint(name, "fixed", *ends)
+    damping, friction = dynamics.get("damping", 0.0), dynamics.get("friction", 0.0)
     if min(damping, friction) < 0.0:
         raise RobotFileError(
             f"{where} has negative friction", expected="damping and friction ≥ 0", got=(damping, friction)
         )
     return Joint(
-        name=joint.name,
-        kind="prismatic" if joint.type == "prismatic" else "revolute",
-        parent=joint.parent,
-        child=joint.child,
-        placement=placement,
-        axis=unit_axis(joint.axis, where),
+        name,
+        "prismatic" if kind == "prismatic" else "revolute",
+        *ends,
+        axis=_unit(axis.get("xyz", np.array([1.0, 0.0, 0.0])), where),
         damping=damping,
         friction=friction,
-        lower=lower,
-        upper=upper,
-        velocity=velocity,
-        effort=effort,
-        refused=f"mimics joint {joint.mimic.joint!r}" if joint.mimic is not None else "",
-        follows=_follows(joint.mimic),
+        **_limits(limit, kind, where),
+        refused=f"mimics joint {mimic['joint']!r}" if mimic else "",
+        follows=(mimic["joint"], mimic.get("multiplier", 1.0), mimic.get("offset", 0.0)) if mimic else None,
     )
 
 
-def _follows(mimic: yourdfpy.Mimic | None) -> tuple[str, float, float] | None:
-    if mimic is None:
-        return None
-    # yourdfpy fills in the format's defaults, 1 and 0, where the file leaves them out.
-    return mimic.joint, float(mimic.multiplier or 0.0), float(mimic.offset or 0.0)
+def _unit(axis: np.ndarray, where: str) -> np.ndarray:
+    length = float(np.linalg.norm(axis))
+    if length < 1e-9:
+        raise RobotFileError(
+            f"{where} has an axis of length zero", expected="a direction such as 0 0 1", got=axis.tolist()
+        )
+    return axis / length
 
 
-def _limits(joint: yourdfpy.Joint, where: str) -> tuple[float, float, float, float]:
+def _limits(limit: dict[str, Any], kind: str, where: str) -> dict[str, float]:
     """Position, effort and velocity limits; a limit of effort or velocity that is 0 or missing is none."""
-    limit = joint.limit or yourdfpy.Limit()
-    effort, velocity = limit.effort or np.inf, limit.velocity or np.inf
+    effort, velocity = (limit.get(name) or np.inf for name in ("effort", "velocity"))
     if min(effort, velocity) < 0.0:
         raise RobotFileError(
             f"{where} has a negative limit", expected="effort and velocity ≥ 0", got=(effort, velocity)
         )
-    if joint.type == "continuous" or (limit.lower is None and limit.upper is None):
-        return -np.inf, np.inf, effort, velocity
-    # The format's default for one that is left out is 0.
-    lower, upper = limit.lower or 0.0, limit.upper or 0.0
+    limits = {"effort_limit": effort, "velocity_limit": velocity}
+    if kind == "continuous" or not ("lower" in limit or "upper" in limit):
+        return limits
+    lower, upper = limit.get("lower", 0.0), limit.get("upper", 0.0)
     if lower > upper:
         raise RobotFileError(
             f"{where} has its lower limit above its upper limit", expected="lower ≤ upper", got=(lower, upper)
         )
-    return lower, upper, effort, velocity
+    return limits | {"lower": lower, "upper": upper}

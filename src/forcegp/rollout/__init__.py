@@ -3,8 +3,8 @@
 from forcegp.rollout.comparison import Comparison, beside_log, compare, widening
 from forcegp.rollout.events import ContactEvent, contact_loss_probability
 from forcegp.rollout.forward import RolloutOptions, rollout, rollout_model
-from forcegp.rollout.inputs import Feedback, Inputs, Sampled, TaskSpaceControl, Torque
-from forcegp.rollout.law import AccelerationLaw, ForceField, ForceLaw, ForwardModel, Law, law_of
+from forcegp.rollout.inputs import Feedback, ForwardModel, Inputs, Sampled, TaskSpaceControl, Torque
+from forcegp.rollout.law import AccelerationLaw, ForceField, ForceLaw, Law, law_of
 from forcegp.rollout.trajectory import Bands, DivergedError, Divergence, Rollout
 
 __all__ = [

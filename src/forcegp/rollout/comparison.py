@@ -18,8 +18,8 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.rollout.forward import RolloutOptions, rollout_model, share_of
+from forcegp.rollout.inputs import ForwardModel
 from forcegp.rollout.integrate import Progress
-from forcegp.rollout.law import ForwardModel
 from forcegp.rollout.trajectory import Bands, Rollout
 
 
@@ -28,9 +28,9 @@ def widening(values: Tensor, band: Bands, level: float) -> float:
 
     The score of a trajectory is the factor that puts a share `level` of its values inside the band, from the
     ratios |value − median| / (half-width on that side); the factor is the ⌈(n + 1) level⌉-th smallest of n
-    scores. Trajectories are exchangeable, unlike the values along one: with bands widened by it
-    (`Bands.widened`), a further trajectory has a share `level` of its values inside with probability `level`
-    or more, however wrong the model is.
+    scores. A further exchangeable trajectory then has a share `level` of its values inside with probability
+    `level` or more, however wrong the model is (Lei, G'Sell, Rinaldo, Tibshirani, Wasserman,
+    *Distribution-free predictive inference for regression*, JASA 113, 2018, section 2.2).
 
     Args:
         values: `(n, …)` observed values of n trajectories, NaN where there is none.
@@ -39,9 +39,6 @@ def widening(values: Tensor, band: Bands, level: float) -> float:
 
     Returns:
         The factor; infinite if it takes more trajectories (9 for a level of 0.9) or samples of the model.
-
-    Source: Lei, G'Sell, Rinaldo, Tibshirani, Wasserman, *Distribution-free predictive inference for
-    regression* (JASA 113, 2018), section 2.2.
 
     Example:
         >>> bands = Bands(torch.tensor([-1.0]), torch.tensor([1.0]), torch.tensor([0.0]))
@@ -114,12 +111,8 @@ class Comparison:
     def coverage(self, model: str, level: float = LEVEL, inflation: float = 1.0) -> float:
         """Share of tip coordinates inside the band over samples, of all starts and all times but the first.
 
-        On a surface only the coordinates along it count, as the constraint fixes the one across it.
-
-        Args:
-            model: name.
-            level: share of the samples inside the band.
-            inflation: factor on the half-widths of the band, such as `inflation` of another comparison.
+        `level` is the share of samples inside the band, `inflation` a factor on its half-widths. On a surface
+        only the coordinates along it count, as the constraint fixes the one across it.
         """
         logged, band = self._tip_along(model, level)
         band = band.widened(inflation)
@@ -127,10 +120,7 @@ class Comparison:
         return float(inside.to(self.q.dtype).mean())
 
     def inflation(self, model: str, level: float = LEVEL) -> float:
-        """Factor by which bands must grow to cover a share `level` of tip coordinates (`widening`).
-
-        It counts trajectories, which must not overlap; infinite with too few, such as below 9 for 0.9.
-        """
+        """Factor by which bands must grow to cover a share `level` of tip coordinates (`widening`)."""
         return widening(*self._tip_along(model, level), level)
 
     def _tip_along(self, model: str, level: float) -> tuple[Tensor, Bands]:
@@ -217,14 +207,7 @@ def compare(
 
 
 def beside_log(name: str, predicted: Rollout, log: Dataset, dt: float) -> Comparison:
-    """One trajectory that was rolled out from the first row of a log, beside that log.
-
-    Args:
-        name: of the model.
-        predicted: without batch.
-        log: a single trajectory.
-        dt: period of both [s].
-    """
+    """One trajectory, rolled out from the first row of a log, beside it; both have the period dt [s]."""
     rows = torch.arange(len(log))[None]
     return _beside(predicted.system, log, rows, dt, {name: predicted[None]})
 

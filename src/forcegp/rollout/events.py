@@ -12,9 +12,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forcegp.constraints.unilateral import impact_velocity, pulling, reached, rows_of
+from forcegp.constraints.unilateral import project_velocity, pulling, reached, rows_of
 from forcegp.errors import ModelError
-from forcegp.rollout.law import ForwardModel, Instant, RolloutProblem, State, Step
+from forcegp.rollout.inputs import ForwardModel
+from forcegp.rollout.law import Instant, RolloutProblem, State, Step
 
 MAX_EVENTS = 8
 """Events within one step; a contact that bounces to rest within a step has infinitely many."""
@@ -55,7 +56,7 @@ def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
     landing = (crossed & active).any(-1)
     if not bool(landing.any()):
         return State(state.t, state.q, state.qd, active)
-    after = impact_velocity(problem.system, state.q, state.qd, active)
+    after = project_velocity(problem.system.equations(state.q, state.qd, active), state.qd)
     qd = torch.where(landing[:, None], after, state.qd)
     return State(state.t, state.q, qd, active)
 
@@ -80,14 +81,7 @@ def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, I
 def advance(
     problem: RolloutProblem, step: Step, state: State, first: Instant, h: Tensor
 ) -> tuple[State, list[ContactEvent]]:
-    """One step of the batch, stopping each trajectory at its events on the way.
-
-    Args:
-        problem: what is integrated.
-        step: method of integration.
-        state, first: where the step begins, and the motion there.
-        h: `(n, 1)` length of the step [s].
-    """
+    """One step of the batch of length h `(n, 1)` [s], stopping each trajectory at its events on the way."""
     trial = step(problem, state, first, h)
     events: list[ContactEvent] = []
     for _ in range(MAX_EVENTS):
@@ -157,18 +151,10 @@ def _listed(problem: RolloutProblem, state: State, crossed: Tensor) -> list[Cont
 def contact_loss_probability(
     model: ForwardModel, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
 ) -> Tensor:
-    """Probability that a contact would have to pull at a state, and therefore opens.
+    """Probability `(*batch, m)` that a contact would have to pull at states `(*batch, nq)`, and opens.
 
-    P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²). A contact that is open is lost already: its
-    probability is 1.
-
-    Args:
-        model: a model with a posterior over forces.
-        q, qd, tau: `(*batch, nq)` states.
-        active: `(*batch, n_contacts)` bool, closed contacts; default all.
-
-    Returns:
-        `(*batch, m)`, between 0 and 1.
+    P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²); 1 for a contact that is open already. `active`
+    `(*batch, n_contacts)` are the closed contacts; default all.
 
     Raises:
         ModelError: the model gives no variance of the multiplier.

@@ -14,9 +14,9 @@ from forcegp.constraints.compiled_system import compiled_system
 from forcegp.constraints.unilateral import any_row, can_open
 from forcegp.errors import ForceGPError, ModelError, UnknownNameError
 from forcegp.resources import one_thread
-from forcegp.rollout.inputs import Disturbed, Torque, inputs_of
+from forcegp.rollout.inputs import Disturbed, ForwardModel, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
-from forcegp.rollout.law import ForceLaw, ForwardModel, Law, RolloutProblem, State, law_of
+from forcegp.rollout.law import ForceLaw, Law, RolloutProblem, State, law_of
 from forcegp.rollout.trajectory import FIELDS, DivergedError, Rollout
 
 STEP = 1.0 / 240.0
@@ -129,9 +129,6 @@ def rollout(
             contacts can open, those that touch.
         options: step, method, stabilization.
         progress: called after each step.
-
-    Returns:
-        The trajectories.
 
     Raises:
         DivergedError: a trajectory diverged; the error holds what was computed.

@@ -1,26 +1,74 @@
-"""Motor torques of a rollout: an array over time, a log, a feedback law, or the task-space controller."""
+"""What a rollout is given: a model, and motor torques as an array, a log, a feedback law or a controller."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.control.plan import Plan
-from forcegp.control.task_space import Gains, Target, control_torque, tool_motion
+from forcegp.control.task_space import Gains, Target, control_torque
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
+from forcegp.forces.dry_friction import ForceField
+from forcegp.kinematics import point_motion
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
 """Part of a sampling period within which a time counts as a sampling time, against rounding."""
 EVEN = 0.02
 """Largest deviation of a step from the sampling period, relative to the period, in a log that is replayed."""
+
+
+@runtime_checkable
+class ForwardModel(Protocol):
+    """What a rollout asks of a model of the forward dynamics."""
+
+    @property
+    def kind(self) -> str:
+        """Name of the class of models."""
+        ...
+
+    @property
+    def system(self) -> ConstrainedSystem:
+        """Robot and contacts that the model was made for."""
+        ...
+
+    @property
+    def has_function_samples(self) -> bool:
+        """Whether `force_samples` draws functions from a posterior over forces."""
+        ...
+
+    def force_field(self) -> ForceField | None:
+        """The mean impressed force, or `None` for a model of accelerations alone."""
+        ...
+
+    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
+        """Force functions drawn from the posterior, on `(samples * k, nq)` states."""
+        ...
+
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        """Root of the spectral density of the logged torques' noise `(nq,)` [N m √s], `None` for none."""
+        ...
+
+    def predict(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str = "qdd",
+        *,
+        active: Tensor | None = None,
+        covariance: bool = True,
+    ) -> Any:
+        """`mean` and `std` `(*batch, d)` of a quantity at states `(*batch, nq)`; `std` may be `None`."""
+        ...
 
 
 class Reached(NamedTuple):
@@ -64,13 +112,7 @@ Torque = Tensor | Dataset | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Sampled(Inputs):
-    """Torques over time, held or interpolated between samples; the last one is held.
-
-    Args:
-        values: `(n or 1, samples, nq)`.
-        dt: sampling period [s].
-        linear: interpolate linearly instead of holding each sample.
-    """
+    """Torques `(n or 1, samples, nq)` with a period dt [s], held or interpolated; the last one is held."""
 
     values: Tensor
     dt: float
@@ -109,13 +151,7 @@ class Feedback(Inputs):
 
 @dataclass(frozen=True)
 class Disturbed(Inputs):
-    """Inputs with noise, which is held for a period: logged torques are not quite those that acted.
-
-    Args:
-        inputs: torques without the noise.
-        noise: `(n, steps, nq)` [N m].
-        dt: how long each value is held [s].
-    """
+    """Inputs with noise `(n, steps, nq)` [N m], each value held for dt [s], as logged torques are noisy."""
 
     inputs: Inputs
     noise: Tensor
@@ -139,14 +175,10 @@ class Disturbed(Inputs):
 
 @dataclass(frozen=True)
 class TaskSpaceControl(Inputs):
-    """The simulator's task-space controller following a plan, with the analytical mechanics of a system.
+    """The simulator's task-space controller following a plan of period dt [s].
 
-    Args:
-        system: the mechanics that the controller assumes.
-        plan: the motion that it follows.
-        dt: sampling period of the plan [s].
-        gains: its gains.
-        limit: `(nq,)` torque limits [N m]; `None` for the robot's own.
+    It assumes the analytical mechanics of `system`; `limit` `(nq,)` are torque limits [N m], by default those
+    of the robot.
     """
 
     system: ConstrainedSystem
@@ -163,7 +195,7 @@ class TaskSpaceControl(Inputs):
         robot, eom, q, qd = self.system.robot, at.eom, at.q, at.qd
         if at.system.robot is not robot:
             eom = self.system.equations(q, qd)
-        tool = tool_motion(robot, eom.poses, eom.motion, qd, self.plan.frame, self.plan.point)
+        tool = point_motion(robot, eom.poses, eom.motion, qd, self.plan.frame, self.plan.point)
         k = torch.floor(t[:, 0] / self.dt + EDGE).long().clamp(max=len(self.plan.reference.t) - 1)
         target = Target(*(values[k] for values in self.plan.targets))
         command = control_torque(tool, eom, q, qd, target, self.plan.press(eom), self.gains)
@@ -174,14 +206,11 @@ class TaskSpaceControl(Inputs):
 def inputs_of(
     tau: Torque, batch: torch.Size, rows: int, dt: float | None, interpolation: str = "hold"
 ) -> Inputs:
-    """Inputs from what a caller passes.
+    """Inputs from what a caller passes, for `rows` trajectories, a multiple of the batch of initial states.
 
-    Args:
-        tau: `(*batch, samples, nq)` or `(samples, nq)`, a log, a law of (t, q, q̇), or inputs.
-        batch: batch of the initial states.
-        rows: number of trajectories; a multiple of the batch.
-        dt: sampling period of an array [s]; a log has its own, and a single sample is a constant torque.
-        interpolation: `"hold"` or `"linear"`.
+    `tau` is `(*batch, samples, nq)` or `(samples, nq)` with a period dt [s], a log, which has its own period,
+    a law of (t, q, q̇), or inputs; a single sample is a constant torque. `interpolation` is `"hold"` or
+    `"linear"`.
 
     Raises:
         UnknownNameError: unknown interpolation.

@@ -1,16 +1,11 @@
 """Integration of a rollout over time: the methods for one step, and the loop over all steps.
 
 The methods are semi-implicit Euler, Runge-Kutta of order four, and SciPy's adaptive ones with error control.
-
-After a step the state may be projected onto the constraint manifold, c(q) = 0 and A q̇ = 0, in the metric of
-M. Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces
-push; q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy, and also the velocity
-after an inelastic impact without friction, M (q̇⁺ − q̇⁻) = AᵀΛ with A q̇⁺ = 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,62 +13,11 @@ import scipy
 import torch
 from torch import Tensor
 
-from forcegp.constraints.system import ConstrainedSystem
-from forcegp.constraints.unilateral import project_velocity
+from forcegp.constraints.unilateral import project_state
 from forcegp.errors import ForceGPError, ModelError, NumericalError
 from forcegp.rollout.events import ContactEvent, advance, settle
 from forcegp.rollout.law import REGULARIZATION, STILL, Instant, RolloutProblem, State, Step, compliance_of
 from forcegp.rollout.trajectory import Divergence, Rollout
-from forcegp.types import ActiveContacts, JointVector
-
-POSITION_TOLERANCE = 1e-12
-"""Largest constraint error that counts as none [m]; rounding of the kinematics of an arm leaves 1e-15."""
-ROUNDING = 100.0
-"""Constraint error, in units of the precision's ε, that rounding may leave; it counts in float32 only."""
-MAX_ITERATIONS = 30
-"""Newton doubles the digits in each iteration; a state off by a centimetre needs four."""
-MAX_STEP = 0.2
-"""Largest move of a joint in one iteration [rad, m]; light wrist joints are asked for more than they give."""
-
-
-def project_state(
-    system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
-) -> tuple[JointVector, JointVector]:
-    """The state on the constraint manifold next to (q, q̇).
-
-    Args:
-        system: robot and contacts.
-        q, qd: `(*batch, nq)` joint positions and velocities.
-        active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-
-    Returns:
-        q with |c(q)| ≤ 1e−12 m (1e−5 m in float32) and q̇ with A q̇ = 0, for the active contacts.
-
-    Raises:
-        NumericalError: the iteration does not converge, as where the surface is out of reach.
-    """
-    rows = system.active_rows(active, q.shape[:-1])
-    tolerance = max(POSITION_TOLERANCE, ROUNDING * torch.finfo(q.dtype).eps)
-    error = torch.zeros((), dtype=q.dtype)
-    for _ in range(MAX_ITERATIONS):
-        eom = system.equations(q, qd, active)
-        c = torch.where(rows, eom.c, 0.0)
-        error = _largest(c)
-        if float(error) <= tolerance:
-            return q, project_velocity(eom, qd)
-        move = (eom.L @ c[..., None])[..., 0]
-        q = q - move * (MAX_STEP / move.detach().abs().amax(-1, keepdim=True).clamp(min=MAX_STEP))
-    raise NumericalError(
-        "no state on the constraint manifold is found",
-        expected=f"a constraint error of at most {tolerance:g} m after {MAX_ITERATIONS} iterations",
-        got=f"{float(error):.3g} m",
-        hint="start nearer to the surface, and check that the arm can reach it",
-    )
-
-
-def _largest(c: Tensor) -> Tensor:
-    return c.detach().abs().max() if c.numel() else c.new_zeros(())
-
 
 Progress = Callable[[int, int], None]
 """Called with the number of steps done and the total number."""
@@ -107,12 +51,16 @@ def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tens
 def adaptive(method: str) -> Step:
     """A step made of as many steps of a method of `scipy.integrate` as its error control asks for.
 
-    The whole batch shares the steps. Time runs from 0 to 1 within the step, so that trajectories whose
-    steps differ, as after an event, are solved together.
+    The whole batch shares the steps; time runs from 0 to 1 within the step, whose length may differ by row.
     """
 
     def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
-        _refuse_gradients(first, method)
+        if first.qdd.requires_grad:
+            raise ModelError(
+                f"{method} has no gradients",
+                expected="one of semi_implicit_euler, rk4",
+                hint="or call it under torch.no_grad()",
+            )
         end, shape = state.t + h, (2, *state.q.shape)
 
         def rate(s: float, y: np.ndarray) -> np.ndarray:
@@ -131,15 +79,6 @@ def adaptive(method: str) -> Step:
         return State(end, q, qd, state.active)
 
     return step
-
-
-def _refuse_gradients(first: Instant, method: str) -> None:
-    if first.qdd.requires_grad:
-        raise ModelError(
-            f"{method} has no gradients",
-            expected="one of semi_implicit_euler, rk4",
-            hint="or call it under torch.no_grad()",
-        )
 
 
 METHODS: dict[str, Step] = {
@@ -187,20 +126,10 @@ def integrate(
     speed_limit: float,
     progress: Progress | None = None,
 ) -> Rollout:
-    """Integrate n trajectories; one that diverges is dropped while the others go on.
+    """Integrate n trajectories over steps of dt [s]; one that diverges is dropped while the others go on.
 
-    Args:
-        problem: right-hand side of the differential equation.
-        step: method of integration.
-        start: initial states.
-        dt: step, and period of the output [s].
-        steps: number of steps.
-        project: whether to project position and velocity onto the manifold after each step.
-        speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
-        progress: called after each step.
-
-    Returns:
-        The trajectories, batch `(n,)`; shorter than asked for if all diverged.
+    `project` moves position and velocity onto the manifold after each step; a joint faster than `speed_limit`
+    [rad/s, m/s] counts as diverged. The result, batch `(n,)`, is shorter than asked for if all diverged.
     """
     record, state, step = _Record(), start, _stopping(step)
     alive = torch.ones(len(start.q), dtype=torch.bool, device=start.q.device)
@@ -217,7 +146,12 @@ def integrate(
             record.write(state, now, alive)
             if k == steps:
                 break
-            reached = _stepped(problem, step, state, now, torch.where(alive[:, None], h, 0.0), record, alive)
+            length = torch.where(alive[:, None], h, 0.0)
+            if problem.unilateral:
+                reached, events = advance(problem, step, state, now, length)
+                record.note(events, alive)
+            else:
+                reached = step(problem, state, now, length)
             if project:
                 q, qd = project_state(problem.system, reached.q, reached.qd, reached.active & alive[:, None])
                 reached = State(reached.t, q, qd, reached.active)
@@ -230,17 +164,6 @@ def integrate(
         if progress is not None:
             progress(k + 1, steps)
     return _result(problem, record, dt)
-
-
-def _stepped(
-    problem: RolloutProblem, step: Step, state: State, now: Instant, h: Tensor, record: _Record, alive: Tensor
-) -> State:
-    """The state one step later, with the contacts that open and close on the way."""
-    if not problem.unilateral:
-        return step(problem, state, now, h)
-    after, events = advance(problem, step, state, now, h)
-    record.note(events, alive)
-    return after
 
 
 def _stopping(step: Step) -> Step:
@@ -297,21 +220,16 @@ def _result(problem: RolloutProblem, record: _Record, dt: float) -> Rollout:
             "the motion at the initial state cannot be computed", got=record.diverged[0].reason
         )
 
-    def over_time(values: list[Tensor]) -> Tensor:
-        return torch.stack(values, dim=1)
+    def over_time(values: Sequence[State] | Sequence[Instant], names: str) -> dict[str, Tensor]:
+        return {name: torch.stack([getattr(x, name) for x in values], dim=1) for name in names.split()}
 
     t = torch.arange(len(states), dtype=states[0].t.dtype, device=states[0].t.device) * dt
+    columns = over_time(states, "q qd active") | over_time(motions, "qdd tau multiplier c cd")
     return Rollout(
-        system=problem.system,
-        t=t,
-        q=over_time([state.q for state in states]),
-        qd=over_time([state.qd for state in states]),
-        qdd=over_time([motion.qdd for motion in motions]),
-        tau=over_time([motion.tau for motion in motions]),
-        multiplier=over_time([motion.multiplier for motion in motions]),
-        c=over_time([motion.c for motion in motions]),
-        cd=over_time([motion.cd for motion in motions]),
-        active=over_time([state.active for state in states]),
+        problem.system,
+        t,
+        **columns,
+        samples=None,
         events=tuple(record.events),
         diverged=tuple(record.diverged),
     )

@@ -1,23 +1,17 @@
-"""The right-hand side of a rollout: states, and the law that gives the acceleration at each of them.
-
-A law is a force field on the constrained system, q̈ = L b + H Q̄, or a model of accelerations alone. Rollouts
-know no particular model: anything with the methods of `ForwardModel` can be rolled out.
-
-Joints that stick and slide: dry friction as a complementarity problem over a step.
+"""The right-hand side of a rollout: states, the law that gives the acceleration, and joints that stick.
 
 Over a step h, dry friction p of the joints changes the velocity to q̇⁺ = q̇ + h (q̈₀ + G p), with q̈₀ the
 acceleration without it. It opposes motion as much as it can: |p_i| ≤ F_i, p_i = −F_i sign(q̇⁺_i) where the
-joint slides, and anything within the limit where it is at rest (Moreau; Stewart and Trinkle, *An implicit
+joint slides, and anything within the limit where it is at rest (Stewart and Trinkle, *An implicit
 time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb friction*, 1996). In
-contact G = H, so that the contact's force answers to that of joints that stick.
+contact G = H, so that the contact's force answers to that of joints that stick. Block principal pivoting
+solves this complementarity problem exactly (Júdice and Pires, *A block principal pivoting algorithm for
+large-scale strictly monotone linear complementarity problems*, 1994): guess which joints stick, solve for
+their friction, exchange those that contradict the guess.
 
-The problem is solved exactly by block principal pivoting (Júdice and Pires, *A block principal pivoting
-algorithm for large-scale strictly monotone linear complementarity problems*, 1994): guess which joints stick,
-solve for their friction, exchange those that contradict the guess.
-
-Light joints with much viscous friction D are stiff: where h G_ii D_i > 1, an explicit step turns their
-motion round, and above 2 it grows without end. There viscous friction is that at the end of the step,
-q̈ = q̈₀ + G (p − h D q̈), as in MuJoCo's Euler integrator; elsewhere it is that of the start.
+Where h G_ii D_i > 1 for a light joint with viscous friction D, an explicit step turns its motion round, and
+above 2 it grows without end. There viscous friction is that at the end of the step, q̈ = q̈₀ + G (p − h D q̈),
+as in MuJoCo's Euler integrator; elsewhere it is that of the start.
 """
 
 from __future__ import annotations
@@ -26,7 +20,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -37,7 +31,7 @@ from forcegp.forces.dry_friction import DryFriction, ForceField, split
 from forcegp.forces.posterior import ForcePosterior, ForceSamples
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import States
-from forcegp.rollout.inputs import Inputs, Reached
+from forcegp.rollout.inputs import ForwardModel, Inputs, Reached
 
 REGULARIZATION = 1e-10
 """Compliance of sticking, relative to that of a free joint. In contact more joints can stick than can move,
@@ -70,33 +64,13 @@ class Stuck(NamedTuple):
 
 
 def overshooting(G: Tensor, damping: Tensor, h: Tensor) -> Tensor | None:
-    """The viscous friction D `(n, nq)` of states where it would turn a joint round within the step.
-
-    Args:
-        G: `(n, nq, nq)` acceleration per joint force.
-        damping: `(n, nq)` D ≥ 0 [N m s/rad, N s/m].
-        h: `(n, 1)` step [s].
-
-    Returns:
-        D where h G_ii D_i > 1 for a joint of the state and 0 elsewhere; `None` where no state has one.
-    """
+    """D `(n, nq)` of states where h G_ii D_i > 1 for a joint, 0 elsewhere; `None` where no state has one."""
     rows = (h * G.diagonal(dim1=-2, dim2=-1) * damping > 1.0).any(-1, keepdim=True)
     return torch.where(rows, damping, 0.0) if bool(rows.any()) else None
 
 
 def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-    """Acceleration and its response to joint forces with viscous friction at the end of a step.
-
-    q̈ = q̈₀ + G (p − h D q̈), so q̈ = (1 + h G D)⁻¹ (q̈₀ + G p).
-
-    Args:
-        qdd: `(n, nq)` q̈₀, with viscous friction at the start of the step [rad/s², m/s²].
-        G: `(n, nq, nq)` acceleration per joint force p.
-        damping: `(n, nq)` D ≥ 0 [N m s/rad, N s/m].
-        h: `(n, 1)` step [s].
-
-    Returns:
-        (1 + h G D)⁻¹ q̈₀ and (1 + h G D)⁻¹ G.
+    """(1 + h G D)⁻¹ q̈₀ and (1 + h G D)⁻¹ G: acceleration and response with D at the end of the step.
 
     Example:
         >>> import torch
@@ -117,14 +91,10 @@ def compliance_of(G: Tensor) -> Tensor:
 
 
 def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Tensor) -> Stuck:
-    """The dry friction of joints over a step.
+    """The dry friction of joints over a step h `(n, 1)` [s] from velocities q̇ `(n, nq)`; 0 for an instant.
 
-    Args:
-        qdd: `(n, nq)` acceleration without it [rad/s², m/s²].
-        G: `(n, nq, nq)` acceleration per dry friction, H or M⁻¹.
-        limit: `(n, nq)` its largest size F ≥ 0 [N m, N].
-        qd: `(n, nq)` velocity at the start of the step [rad/s, m/s].
-        h: `(n, 1)` step; 0 for an instant [s].
+    `qdd` is the acceleration without it, `G` `(n, nq, nq)` acceleration per friction, H or M⁻¹, and `limit`
+    `(n, nq)` the largest size F ≥ 0 [N m, N].
 
     Raises:
         NumericalError: no friction solves the problem, since G is not positive definite.
@@ -172,87 +142,14 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
     )
 
 
-@runtime_checkable
-class PredictedQuantity(Protocol):
-    """A predicted quantity."""
-
-    @property
-    def mean(self) -> Tensor:
-        """`(*batch, d)`."""
-        ...
-
-    @property
-    def std(self) -> Tensor | None:
-        """`(*batch, d)` standard deviation, `None` without one."""
-        ...
-
-
-@runtime_checkable
-class ForwardModel(Protocol):
-    """What a rollout asks of a model of the forward dynamics."""
-
-    @property
-    def kind(self) -> str:
-        """Name of the class of models."""
-        ...
-
-    @property
-    def system(self) -> ConstrainedSystem:
-        """Robot and contacts that the model was made for."""
-        ...
-
-    @property
-    def has_function_samples(self) -> bool:
-        """Whether `force_samples` draws functions from a posterior over forces."""
-        ...
-
-    def force_field(self) -> ForceField | None:
-        """The mean impressed force, or `None` for a model of accelerations alone."""
-        ...
-
-    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
-        """Force functions drawn from the posterior, on `(samples * k, nq)` states."""
-        ...
-
-    @property
-    def torque_disturbance(self) -> Tensor | None:
-        """Root of the spectral density of the logged torques' noise `(nq,)` [N m √s], `None` for none."""
-        ...
-
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: str = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-    ) -> PredictedQuantity:
-        """Predict a quantity at states `(*batch, nq)`."""
-        ...
-
-
-class LawMotion(NamedTuple):
-    """What a law gives at a state.
-
-    Attributes:
-        qdd: `(n, nq)`.
-        multiplier: λ `(n, m)`; NaN where the law knows no forces.
-    """
-
-    qdd: Tensor
-    multiplier: Tensor
-
-
 class Law(ABC):
     """A deterministic acceleration of a constrained system."""
 
     has_multiplier: bool
 
     @abstractmethod
-    def motion(self, system: ConstrainedSystem, at: States) -> LawMotion:
-        """Acceleration and multiplier at states."""
+    def motion(self, system: ConstrainedSystem, at: States) -> tuple[Tensor, Tensor]:
+        """q̈ `(n, nq)` and λ `(n, m)` at states; NaN where the law knows no forces."""
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
         """What tells the dry friction of joints apart at states; `None` where there is no such friction."""
@@ -266,8 +163,8 @@ class ForceLaw(Law):
     force: ForceField
     has_multiplier: bool = True
 
-    def motion(self, system: ConstrainedSystem, at: States) -> LawMotion:
-        return LawMotion(*at.eom.motion_under(self.force(system, at)))
+    def motion(self, system: ConstrainedSystem, at: States) -> tuple[Tensor, Tensor]:
+        return at.eom.motion_under(self.force(system, at))
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
         force = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
@@ -288,17 +185,13 @@ class AccelerationLaw(Law):
     model: ForwardModel
     has_multiplier: bool = False
 
-    def motion(self, system: ConstrainedSystem, at: States) -> LawMotion:
+    def motion(self, system: ConstrainedSystem, at: States) -> tuple[Tensor, Tensor]:
         qdd = self.model.predict(at.q, at.qd, at.tau, "qdd", active=at.active, covariance=False).mean
-        return LawMotion(qdd, torch.full_like(at.eom.c, torch.nan))
+        return qdd, torch.full_like(at.eom.c, torch.nan)
 
 
 def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
     """The mean motion of a model: of its force field if it has one, otherwise of its accelerations.
-
-    Args:
-        model: a fitted model.
-        system: where it is to be rolled out; by default the model's own system.
 
     Raises:
         ModelError: a model of accelerations alone is asked for the motion of another system.
@@ -311,13 +204,15 @@ def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
     ):
         raise ModelError(
             f"this model ({model.kind}) predicts accelerations of the system that it was fitted on only",
-            expected=f"robot {trained.robot.name!r} with contacts "
-            f"{', '.join(trained.contact_names) or '(none)'}",
-            got=f"another system: robot {system.robot.name!r} with contacts "
-            f"{', '.join(system.contact_names) or '(none)'}",
+            expected=_described(trained),
+            got=f"another system: {_described(system)}",
             hint="leave `system` out, or use a model of forces such as StructuredGP",
         )
     return AccelerationLaw(model)
+
+
+def _described(system: ConstrainedSystem) -> str:
+    return f"robot {system.robot.name!r} with contacts {', '.join(system.contact_names) or '(none)'}"
 
 
 class State(NamedTuple):
@@ -345,8 +240,7 @@ class Instant(NamedTuple):
     Attributes:
         tau, qdd: `(n, nq)` motor torque and acceleration.
         multiplier, c, cd: `(n, m)` λ, constraint error and its rate.
-        held: `(n, nq)` joints that stick, or come to rest by the end of the step; `None` without dry
-            friction.
+        held: `(n, nq)` joints at rest by the end of the step; `None` without dry friction.
     """
 
     tau: Tensor
@@ -359,14 +253,9 @@ class Instant(NamedTuple):
 
 @dataclass(frozen=True)
 class RolloutProblem:
-    """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system.
+    """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the stabilization of the rollout.
 
-    Args:
-        system: robot and contacts, with the stabilization of the rollout.
-        law: gives the acceleration.
-        inputs: give the torque.
-        unilateral: whether contacts with a surface can open and close.
-        sticking: whether dry friction holds joints at rest, rather than being smooth.
+    `unilateral` lets contacts with a surface open and close, `sticking` dry friction hold joints.
     """
 
     system: ConstrainedSystem

@@ -13,7 +13,7 @@ from torch import Tensor
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ModelError, NumericalError
+from forcegp.errors import ModelError, NumericalError, ParameterError, UnknownNameError
 from forcegp.rollout.events import ContactEvent
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 FIELDS = ("q", "qd", "qdd", "tau", "multiplier", "c", "cd", "active")
 """Attributes of a rollout that have the shape of its batch."""
+JOINT_QUANTITIES = ("q", "qd", "qdd", "tau")
+QUANTITIES = (*JOINT_QUANTITIES, "multiplier", "c", "cd")
 
 
 class Divergence(NamedTuple):
@@ -132,17 +134,35 @@ class Rollout:
             joints: which joints or contacts; default all.
             ax: matplotlib axes to draw on, one per panel; default a new figure.
 
-        Returns:
-            The axes, one per panel.
-
         Raises:
             UnknownNameError: no such quantity or joint.
-            ParameterError: several trajectories (choose one: `rollout[0].plot()`), or the number of axes is
-                not that of the panels.
+            ParameterError: several trajectories (choose one: `rollout[0].plot()`), or a wrong number of axes.
         """
-        from forcegp.rollout.plot import plot
+        from forcegp.plots import MEASURED, PREDICTED, Curve, Panel, Timeline, axis_label, chosen, draw_panels
 
-        return plot(self, quantity, log, joints, ax)
+        if quantity not in QUANTITIES:
+            raise UnknownNameError("quantity of a rollout", quantity, QUANTITIES)
+        if self.rows != 1:
+            raise ParameterError(
+                "several trajectories cannot be drawn on one axis",
+                expected="one trajectory",
+                got=self.rows,
+                hint="choose one, such as rollout[0].plot()",
+            )
+        robot = self.system.robot
+        of_joints = quantity in JOINT_QUANTITIES
+        names = robot.joint_names if of_joints else _row_names(self.system)
+        values = getattr(self, quantity).reshape(len(self.t), -1)
+        std = _spread(self, quantity)
+        logged = None if log is None else _logged(self, log, quantity)
+        panels = []
+        for i in chosen(joints, names, f"component of {quantity}"):
+            curves = [] if logged is None else [Curve(logged[:, i], "logged", MEASURED)]
+            curves.append(Curve(values[:, i], "predicted", PREDICTED, None if std is None else std[:, i]))
+            kinds = robot.joint_types[i : i + 1] if of_joints else ()
+            panels.append(Panel(names[i], axis_label(quantity, kinds), curves))
+        active = self.active.reshape(len(self.t), -1)
+        return draw_panels(panels, Timeline.of(self.t), list(active.unbind(-1)), ax)
 
     @property
     def batch(self) -> torch.Size:
@@ -200,3 +220,36 @@ class Rollout:
         places = index if isinstance(index, tuple) else (index,)
         samples = None if self.samples is None else self.samples[(slice(None), *places)]
         return dataclasses.replace(self, **chosen, samples=samples)
+
+
+def _row_names(system: ConstrainedSystem) -> list[str]:
+    """One name per row of the constraints."""
+    return [
+        contact.name if contact.rows == 1 else f"{contact.name} {row + 1}"
+        for contact in system.contacts
+        for row in range(contact.rows)
+    ]
+
+
+def _spread(path: Rollout, quantity: str) -> Tensor | None:
+    """Standard deviation `(T, d)` over the function samples, of which a finite one is needed at each time."""
+    if path.samples is None:
+        return None
+    values = getattr(path.samples, quantity).reshape(-1, len(path.t), getattr(path, quantity).shape[-1])
+    finite = values.isfinite()
+    count = finite.sum(0)
+    mean = values.nan_to_num(0.0).sum(0) / count
+    return ((values - mean).nan_to_num(0.0).square().sum(0) / (count - 1).clamp(min=1)).sqrt()
+
+
+def _logged(path: Rollout, log: Dataset, quantity: str) -> Tensor | None:
+    """Logged values `(T, d)` at the times of the rollout, or `None` where they are not logged."""
+    if len(log) < len(path.t):
+        raise ParameterError(
+            "the log is shorter than the rollout", expected=f"{len(path.t)} rows or more", got=len(log)
+        )
+    if quantity in JOINT_QUANTITIES:
+        return getattr(log.select(path.system.robot.joint_names), quantity)[: len(path.t)]
+    columns = [log.contact_extras.get(quantity, {}).get(name) for name in path.system.contact_names]
+    present = [column[: len(path.t), None] for column in columns if column is not None]
+    return torch.cat(present, dim=-1) if len(present) == len(_row_names(path.system)) > 0 else None

@@ -5,19 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from forcegp.control.plan import MotionConfig
-from forcegp.errors import ForceGPError
+from forcegp.control.plan import NOT_NEGATIVE, MotionConfig, check_setting
 
 CONTACTS = ("rigid", "solver")
 LONGEST_STEP = 5e-4
 """Of the contact solver [s]; a contact of the default stiffness takes eight such steps."""
 WHOLE = 1e-6
 """Rounding of a ratio that is meant to be whole."""
-
-
-def _check(name: str, valid: bool, expected: str, got: object) -> None:
-    if not valid:
-        raise ForceGPError(f"{name} is out of range", expected=expected, got=got)
 
 
 @dataclass(frozen=True)
@@ -35,7 +29,7 @@ class ContactSolver:
             `LONGEST_STEP`.
 
     Raises:
-        ForceGPError: a value is out of range; the message names it.
+        ParameterError: a value is out of range; the message names it.
     """
 
     friction: float = 0.3
@@ -49,23 +43,21 @@ class ContactSolver:
         for name in ("tip_radius", "stiffness_time", "step"):
             value = getattr(self, name)
             if value is not None:
-                _check(name, 0.0 < value < float("inf"), "a positive finite number", value)
+                check_setting(name, 0.0 < value < float("inf"), "a positive finite number", value)
         for name in ("joint_friction", "joint_damping"):
             values = getattr(self, name)
-            _check(name, all(0.0 <= x < float("inf") for x in values), "finite numbers, 0 or above", values)
-        _check("friction", 0.0 <= self.friction < float("inf"), "a finite number, 0 or above", self.friction)
+            check_setting(
+                name, all(0.0 <= x < float("inf") for x in values), "finite numbers, 0 or above", values
+            )
+        check_setting("friction", 0.0 <= self.friction < float("inf"), NOT_NEGATIVE, self.friction)
 
     def substeps(self, dt: float) -> int:
-        """Steps of the engine in a sampling period.
-
-        Raises:
-            ForceGPError: it is not a multiple of `step`.
-        """
+        """Steps of the engine in a sampling period dt [s]; ParameterError unless a multiple of `step`."""
         if self.step is None:
             return math.ceil(dt / LONGEST_STEP - WHOLE)
         steps = dt / self.step
         whole = steps > 0.5 and abs(steps - round(steps)) < WHOLE
-        _check("step", whole, f"a whole part of dt = {dt} s", self.step)
+        check_setting("step", whole, f"a whole part of dt = {dt} s", self.step)
         return round(steps)
 
 
@@ -80,7 +72,7 @@ class Sensors:
         torque_delay: time by which the logged torque lags behind the motion [s], rounded to whole samples.
 
     Raises:
-        ForceGPError: a value is out of range; the message names it.
+        ParameterError: a value is out of range; the message names it.
     """
 
     encoder_resolution: float = 0.0
@@ -90,7 +82,7 @@ class Sensors:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            _check(name, 0.0 <= value < float("inf"), "a finite number, 0 or above", value)
+            check_setting(name, 0.0 <= value < float("inf"), NOT_NEGATIVE, value)
 
 
 @dataclass(frozen=True)
@@ -114,7 +106,7 @@ class SimulationConfig(MotionConfig):
         480
 
     Raises:
-        ForceGPError: a value is out of range; the message names it.
+        ParameterError: a value is out of range; the message names it.
     """
 
     seed: int = 0
@@ -127,8 +119,9 @@ class SimulationConfig(MotionConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_not_negative("viscous_friction", "noise_std")
-        _check("contact", self.contact in CONTACTS, "'rigid' or 'solver'", self.contact)
+        for name in ("viscous_friction", "noise_std"):
+            self._check(name, 0.0 <= getattr(self, name) < float("inf"), NOT_NEGATIVE)
+        self._check("contact", self.contact in CONTACTS, "'rigid' or 'solver'")
         if self.contact == "solver":
-            _check("engine", self.engine in ("auto", "mujoco"), "'mujoco', whose solver it is", self.engine)
+            self._check("engine", self.engine in ("auto", "mujoco"), "'mujoco', whose solver it is")
             self.solver.substeps(self.dt)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
-from forcegp.errors import ForceGPError, UnsupportedRobotError
+from forcegp.errors import ForceGPError, UnsupportedRobotError, optional_module
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.simulate.config import ContactSolver
-from forcegp.simulate.mujoco import full_mass_matrix, import_mujoco
+from forcegp.simulate.engines import NEEDS_MUJOCO, MuJoCoWorld
 from forcegp.simulate.urdf import link_name, write_urdf
-from forcegp.types import JointVector
 
 CYLINDER_LENGTH = 100.0
 """Half length of the cylinder that stands for an infinite one [m]."""
@@ -47,22 +44,10 @@ class SolvedForces(NamedTuple):
     F_z: np.ndarray
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """Geometry ids of a surface and of the tip that may touch it, and the tip's body."""
-
-    surface: int
-    tip: int
-    body: int
-
-
-class ContactSolverEngine:
+class ContactSolverEngine(MuJoCoWorld):
     """A robot in a MuJoCo world with solid surfaces and rounded tips, moved by motor torques alone.
 
-    Args:
-        system: robot and contacts, each with a plane, a sphere or a cylinder.
-        dt: sampling period, during which a torque is held [s].
-        solver: friction and geometry.
+    Each contact needs a plane, a sphere or a cylinder; a torque is held for the sampling period dt [s].
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -71,40 +56,22 @@ class ContactSolverEngine:
     """
 
     def __init__(self, system: ConstrainedSystem, dt: float, solver: ContactSolver) -> None:
-        self._mujoco = mujoco = import_mujoco()
-        self._system, robot = system, system.robot
-        self._model = model = self._compile(system, solver)
+        mujoco, robot = optional_module("mujoco", NEEDS_MUJOCO), system.robot
         self._substeps = solver.substeps(dt)
-        model.opt.timestep = dt / self._substeps
-        model.opt.gravity[:] = robot.gravity.numpy()
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        model.opt.tolerance = SOLVED
-        self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
-        model.dof_armature[self._dof] = robot.armature.numpy()
-        model.dof_damping[self._dof] = robot.damping.numpy() + _per_joint(robot, solver, "joint_damping")
-        model.dof_frictionloss[self._dof] = robot.friction.numpy() + _per_joint(
-            robot, solver, "joint_friction"
-        )
-        self._pairs = [self._pair(i) for i in range(len(system.contacts))]
-        self._no_contact = np.zeros((0, 2, robot.nq)), np.zeros((0, 2, 3))
-        self._data = mujoco.MjData(model)
+        super().__init__(robot, _compile(mujoco, system, solver), dt / self._substeps)
+        options = self._model.opt
+        options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        options.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        options.tolerance = SOLVED
+        damping, friction = (_per_joint(robot, solver, name) for name in ("joint_damping", "joint_friction"))
+        self._model.dof_damping[self._dof] = robot.damping.numpy() + damping
+        self._model.dof_frictionloss[self._dof] = robot.friction.numpy() + friction
+        geom = self._model.geom
+        self._pairs = [(geom(f"surface_{i}").id, geom(f"tip_{i}").id) for i in range(len(system.contacts))]
 
     @property
     def name(self) -> str:
-        """Name and version, for the record."""
-        return f"mujoco {self._mujoco.__version__}, contact solver"
-
-    def reset(self, q: JointVector, qd: JointVector) -> None:
-        """Put the robot at q `(nq,)` moving at qd `(nq,)`."""
-        self._data.qpos[self._dof] = q.numpy()
-        self._data.qvel[self._dof] = qd.numpy()
-
-    def state(self) -> tuple[JointVector, JointVector]:
-        """The present q and qd, `(nq,)` each [rad, rad/s]."""
-        dtype = self._system.robot.dtype
-        q, qd = self._data.qpos[self._dof], self._data.qvel[self._dof]
-        return torch.tensor(q, dtype=dtype), torch.tensor(qd, dtype=dtype)
+        return f"{super().name}, contact solver"
 
     def forces(self, torque: np.ndarray) -> SolvedForces:
         """Acceleration and forces at the present state under a motor torque `(nq,)` [N m].
@@ -115,14 +82,16 @@ class ContactSolverEngine:
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque
         self._mujoco.mj_forward(self._model, data)
-        qdd, later = self._of_the_step()
-        contacts = [self._contact_force(pair) for pair in self._pairs]
-        Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else self._no_contact
+        M, hD = self._mass_matrix(data), self._model.opt.timestep * self._model.dof_damping
+        qdd = np.linalg.solve(M + np.diag(hD), M @ data.qacc)
+        contacts = [self._contact_force(*pair) for pair in self._pairs]
+        none = np.zeros((0, 2, len(dof))), np.zeros((0, 2, 3))
+        Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else none
         Q_I, Q_z = Q.sum(0)
         whole = data.qfrc_applied + data.qfrc_passive + data.qfrc_constraint - data.qfrc_bias
         return SolvedForces(
             qdd=qdd[dof],
-            Q=(whole + later)[dof] - Q_I - Q_z,
+            Q=(whole - hD * qdd)[dof] - Q_I - Q_z,
             Q_I=Q_I,
             Q_z=Q_z,
             multiplier=np.linalg.norm(F[:, 0], axis=-1),
@@ -130,67 +99,53 @@ class ContactSolverEngine:
             F_z=F[:, 1],
         )
 
-    def _of_the_step(self) -> tuple[np.ndarray, np.ndarray]:
-        """q̈ with which the next step changes the velocity, and −h D q̈, by which friction differs then."""
-        model, data = self._model, self._data
-        M = full_mass_matrix(model, data)
-        hD = model.opt.timestep * model.dof_damping
-        qdd = np.linalg.solve(M + np.diag(hD), M @ data.qacc)
-        return qdd, -hD * qdd
-
     def step(self) -> None:
         """Advance by the sampling period under the torque last given to `forces`."""
         self._mujoco.mj_step(self._model, self._data, self._substeps)
 
-    def close(self) -> None:
-        """Release the engine's resources: MuJoCo holds none."""
-
-    def _contact_force(self, pair: _Pair) -> tuple[np.ndarray, np.ndarray]:
-        """Normal and friction force on the tip of one pair, generalized `(2, nq)` and Cartesian `(2, 3)`."""
+    def _contact_force(self, surface: int, tip: int) -> tuple[np.ndarray, np.ndarray]:
+        """Normal and friction force of a surface on a tip, generalized `(2, nq)` and Cartesian `(2, 3)`."""
         model, data = self._model, self._data
         Q, F = np.zeros((2, len(self._dof))), np.zeros((2, 3))
         wrench, jacobian = np.zeros(6), np.zeros((3, model.nv))
         for i in range(data.ncon):
             contact = data.contact[i]
-            if {contact.geom1, contact.geom2} != {pair.surface, pair.tip}:
+            if {contact.geom1, contact.geom2} != {surface, tip}:
                 continue
             # MuJoCo gives the force on its second geometry, in axes whose first is the normal towards it.
-            sign = 1.0 if contact.geom2 == pair.tip else -1.0
+            sign = 1.0 if contact.geom2 == tip else -1.0
             self._mujoco.mj_contactForce(model, data, i, wrench)
             axes = sign * contact.frame.reshape(3, 3)
-            self._mujoco.mj_jac(model, data, jacobian, None, contact.pos, pair.body)
+            self._mujoco.mj_jac(model, data, jacobian, None, contact.pos, int(model.geom_bodyid[tip]))
             for part, force in enumerate((wrench[0] * axes[0], wrench[1:3] @ axes[1:])):
                 F[part] += force
                 Q[part] += (jacobian.T @ force)[self._dof]
         return Q, F
 
-    def _compile(self, system: ConstrainedSystem, solver: ContactSolver) -> Any:
-        """The robot with a tip and a surface for each contact; only these pairs can touch."""
-        mujoco, robot = self._mujoco, system.robot
-        spec = mujoco.MjSpec.from_string(write_urdf(robot))
-        for i, contact in enumerate(system.contacts):
-            if not isinstance(contact, SurfaceContact):
-                raise ForceGPError(
-                    f"the contact solver has no geometry for the constraint {contact.name!r}",
-                    expected="contacts of a point with a surface",
-                    hint='use contact = "rigid"',
-                )
-            body, position, radius = _tip(robot, contact, solver.tip_radius)
-            ghost = {"contype": 0, "conaffinity": 0, "mass": 0.0}
-            link = spec.worldbody if body == BASE else spec.body(link_name(robot, body))
-            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-            link.add_geom(name=f"tip_{i}", type=sphere, size=[radius, 0, 0], pos=position, **ghost)
-            spec.worldbody.add_geom(name=f"surface_{i}", **_shape(mujoco, contact), **ghost)
-            pair = spec.add_pair(geomname1=f"surface_{i}", geomname2=f"tip_{i}")
-            pair.condim = 3
-            pair.friction = [solver.friction, solver.friction, 0.0, 0.0, 0.0]
-            pair.solref = [solver.stiffness_time, 1.0]
-            pair.solimp = IMPEDANCE
-        return spec.compile()
 
-    def _pair(self, i: int) -> _Pair:
-        surface, tip = (self._model.geom(f"{part}_{i}").id for part in ("surface", "tip"))
-        return _Pair(surface, tip, int(self._model.geom_bodyid[tip]))
+def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> Any:
+    """The robot with a tip and a surface for each contact; only these pairs can touch."""
+    robot = system.robot
+    spec = mujoco.MjSpec.from_string(write_urdf(robot))
+    for i, contact in enumerate(system.contacts):
+        if not isinstance(contact, SurfaceContact):
+            raise ForceGPError(
+                f"the contact solver has no geometry for the constraint {contact.name!r}",
+                expected="contacts of a point with a surface",
+                hint='use contact = "rigid"',
+            )
+        body, position, radius = _tip(robot, contact, solver.tip_radius)
+        ghost = {"contype": 0, "conaffinity": 0, "mass": 0.0}
+        link = spec.worldbody if body == BASE else spec.body(link_name(robot, body))
+        sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+        link.add_geom(name=f"tip_{i}", type=sphere, size=[radius, 0, 0], pos=position, **ghost)
+        spec.worldbody.add_geom(name=f"surface_{i}", **_shape(mujoco, contact), **ghost)
+        pair = spec.add_pair(geomname1=f"surface_{i}", geomname2=f"tip_{i}")
+        pair.condim = 3
+        pair.friction = [solver.friction, solver.friction, 0.0, 0.0, 0.0]
+        pair.solref = [solver.stiffness_time, 1.0]
+        pair.solimp = IMPEDANCE
+    return spec.compile()
 
 
 def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarray:

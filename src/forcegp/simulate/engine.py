@@ -1,7 +1,4 @@
-"""What a physics engine must offer to simulate a robot, and where to get one.
-
-`check_engine` compares it with our own equations of motion.
-"""
+"""What a physics engine must offer to simulate a robot, and how it compares with our equations of motion."""
 
 from __future__ import annotations
 
@@ -14,11 +11,7 @@ from torch import Tensor
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import MissingDependencyError, UnknownNameError
-from forcegp.robot.model import RobotModel
 from forcegp.types import JointMatrix, JointVector
-
-ENGINES = ("pybullet", "mujoco")
 
 
 @runtime_checkable
@@ -65,43 +58,6 @@ class Engine(Protocol):
         ...
 
 
-def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
-    """An engine by name.
-
-    Args:
-        robot: the robot it holds.
-        dt: step [s].
-        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet where it is installed, else MuJoCo.
-
-    Example:
-        >>> import torch, forcegp
-        >>> robot = forcegp.load_robot("double_pendulum")
-        >>> engine = make_engine(robot, dt=0.001, name="mujoco")
-        >>> engine.mass_matrix(torch.zeros(2, dtype=torch.float64)).shape
-        torch.Size([2, 2])
-
-    Raises:
-        UnknownNameError: no such engine.
-        MissingDependencyError: the engine's package is not installed.
-    """
-    from forcegp.simulate.mujoco import MuJoCoEngine
-    from forcegp.simulate.pybullet import PyBulletEngine
-
-    makers = dict(zip(ENGINES, (PyBulletEngine, MuJoCoEngine), strict=True))
-    if name != "auto" and name not in makers:
-        raise UnknownNameError("engine", name, ["auto", *makers])
-    if name != "auto":
-        return makers[name](robot, dt)
-    try:
-        return PyBulletEngine(robot, dt)
-    except MissingDependencyError:
-        return MuJoCoEngine(robot, dt)
-
-
-CHUNK = 8192
-"""States whose equations are held in memory at once."""
-
-
 @dataclass(frozen=True)
 class EngineCheck:
     """Largest differences between an engine and our library on random states.
@@ -137,16 +93,9 @@ class EngineCheck:
 def check_engine(
     system: ConstrainedSystem, engine: Engine, generator: torch.Generator, states: int = 50
 ) -> EngineCheck:
-    """Compare an engine with our library on random states.
+    """Largest differences between an engine and our library on random states of a system.
 
-    Args:
-        system: robot and contacts.
-        engine: holds the same robot.
-        generator: source of the states: angles in ±π, speeds and accelerations of some rad/s and rad/s².
-        states: how many.
-
-    Returns:
-        The largest differences.
+    Angles are in ±π, speeds and accelerations of some rad/s and rad/s².
     """
     robot = system.robot
 
@@ -173,29 +122,6 @@ def check_engine(
             constrained_acceleration=_largest(_step(engine, q, qd, held) - constrained),
             largest_acceleration=max(_largest(free), _largest(constrained)),
         )
-
-
-def acceleration_mismatch(
-    system: ConstrainedSystem,
-    q: JointVector,
-    qd: JointVector,
-    qdd: JointVector,
-    Q_bar: JointVector,
-    active: Tensor,
-) -> float:
-    """Largest difference between logged accelerations and L b + H Q̄ of our equations [rad/s²].
-
-    Args:
-        system: robot and contacts.
-        q, qd, qdd: `(n, nq)` logged motion, without noise.
-        Q_bar: `(n, nq)` impressed forces Q + Q_z.
-        active: `(n, n_contacts)` closed contacts.
-    """
-    worst = 0.0
-    for rows in torch.arange(len(q)).split(CHUNK):
-        ours = system.equations(q[rows], qd[rows], active=active[rows]).acceleration(Q_bar[rows])
-        worst = max(worst, _largest(ours - qdd[rows]))
-    return worst
 
 
 def _step(engine: Engine, q: Tensor, qd: Tensor, force: Tensor) -> Tensor:

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from forcegp import dynamics
 from forcegp.compiled.mechanics import CompiledMechanics
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.contact import Anchor, Constraint, MovingPoint
 from forcegp.constraints.gauss import RANK_TOLERANCE
 from forcegp.control.plan import Plan
-from forcegp.control.task_space import POTRF, POTRS, ToolMotion, tool_motion
+from forcegp.control.task_space import POTRF, POTRS
 from forcegp.errors import MissingDependencyError
+from forcegp.kinematics import Anchor, PointMotion, point_motion
 
 Vector = NDArray[np.floating]
 Blocks = Callable[[Vector, Vector], Sequence[Vector]]
@@ -65,7 +65,7 @@ class StateEquations:
     Q_D: Vector
     Q_K: Vector
     contact_points: dict[str, TouchingPoint]
-    tool: ToolMotion
+    tool: PointMotion
 
     @cached_property
     def _M_cholesky(self) -> Vector:
@@ -94,15 +94,9 @@ class StateEquations:
 
 
 class Mechanics:
-    """A system whose equations of motion are asked for at one state at a time.
+    """A system whose equations of motion are asked for at one state at a time; the plan names the tool point.
 
-    Args:
-        system: robot and contacts.
-        plan: names the tool point.
-
-    Attributes:
-        contacts, m: those of the system.
-        compiled: whether the kernel is used, and not the functions for batches.
+    `contacts` and `m` are those of the system; `compiled` tells whether the kernel is used.
     """
 
     def __init__(self, system: ConstrainedSystem, plan: Plan) -> None:
@@ -115,9 +109,10 @@ class Mechanics:
 
     def equations(self, q: Vector, qd: Vector, active: NDArray[np.bool_] | None = None) -> StateEquations:
         """The equations of motion at a state `(nq,)`; `active` `(n_contacts,)` defaults to all."""
+        velocity = torch.from_numpy(qd)
         M, Q_C, Q_G, *points = self._blocks(q, qd)
         frames = [points[i : i + POINT] for i in range(0, len(points), POINT)]
-        moving = [_moving_point(p, J, bias, qd) for _, p, J, bias in frames]
+        moving = [PointMotion.of([torch.from_numpy(x) for x in frame], velocity) for frame in frames]
         terms = [
             contact.terms_of([moving[k] for k in places])
             for contact, places in zip(self.contacts, self._places, strict=True)
@@ -130,7 +125,7 @@ class Mechanics:
         if self._system.baumgarte is not None:
             b = self._system.baumgarte.stabilized(*(torch.from_numpy(x) for x in (b, c, cd))).numpy()
         rows = np.ones(len(b)) if active is None else np.repeat(active, self._rows)
-        Q_D = dynamics.damping_force(self._system.robot, torch.from_numpy(qd)).numpy()
+        Q_D = dynamics.damping_force(self._system.robot, velocity).numpy()
         rotation, position, jacobian, bias = frames[0]
         return StateEquations(
             M=M,
@@ -141,23 +136,13 @@ class Mechanics:
             Q_C=Q_C,
             Q_D=Q_D,
             Q_K=Q_C + Q_G + Q_D,
-            contact_points=_contact_points(self.contacts, terms),
-            tool=ToolMotion(rotation, position, jacobian @ qd, jacobian, bias),
+            contact_points={
+                contact.name: TouchingPoint(*(getattr(at, name).numpy() for name in TouchingPoint._fields))
+                for contact, (*_, at) in zip(self.contacts, terms, strict=True)
+                if at is not None
+            },
+            tool=PointMotion(rotation, position, jacobian @ qd, jacobian, bias),
         )
-
-
-def _moving_point(position: Vector, jacobian: Vector, bias: Vector, qd: Vector) -> MovingPoint:
-    """The motion of a point as the constraints read it, in tensors."""
-    return MovingPoint.of(*(torch.from_numpy(x) for x in (position, jacobian, bias, qd)))
-
-
-def _contact_points(contacts: Sequence[Constraint], constraint_terms: Sequence) -> dict[str, TouchingPoint]:
-    named = ((contact.name, terms.point) for contact, terms in zip(contacts, constraint_terms, strict=True))
-    return {
-        name: TouchingPoint(*(x.numpy() for x in (at.position, at.velocity, at.jacobian, at.normal)))
-        for name, at in named
-        if at is not None
-    }
 
 
 def _blocks(system: ConstrainedSystem, anchors: Sequence[Anchor]) -> tuple[Blocks, bool]:
@@ -170,7 +155,8 @@ def _blocks(system: ConstrainedSystem, anchors: Sequence[Anchor]) -> tuple[Block
     def eager(q: Vector, qd: Vector) -> Sequence[Vector]:
         state = torch.from_numpy(q), torch.from_numpy(qd)
         eom = system.equations(*state)
-        tools = [tool_motion(system.robot, eom.poses, eom.motion, state[1], *anchor) for anchor in anchors]
+        links = system.robot, eom.poses, eom.motion, state[1]
+        tools = [point_motion(*links, *anchor) for anchor in anchors]
         points = [x for t in tools for x in (t.rotation, t.position, t.jacobian, t.bias)]
         return [x.numpy() for x in (eom.M, eom.Q_C, eom.Q_G, *points)]
 

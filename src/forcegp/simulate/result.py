@@ -8,15 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp import dynamics, kinematics
+from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.control.plan import Plan
-from forcegp.control.task_space import tool_motion
 from forcegp.control.trajectory import Reference
 from forcegp.data.dataset import Dataset
 from forcegp.data.fields import DataHeader
 from forcegp.simulate.config import SimulationConfig
-from forcegp.simulate.engine import acceleration_mismatch
+
+CHUNK = 8192
+"""States whose equations are held in memory at once."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,7 @@ class RunLog:
     Attributes:
         q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)`; qdd is the engine's acceleration, without noise.
         multiplier, c: `(n, m)`.
-        contact: `(n, n_contacts)` bool.
-        saturated: `(n,)` bool, a torque limit was hit.
+        contact, saturated: `(n, n_contacts)` and `(n,)` bool; whether a torque limit was hit.
         contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, where an engine of its own computed them [N].
         measured: what sensors say instead of `q`, `qd`, `tau`, where they are not perfect.
     """
@@ -54,36 +54,25 @@ class RunLog:
             return torch.zeros(steps, width, dtype=dtype)
 
         nq, m = system.robot.nq, system.m
-        return RunLog(
-            q=columns(nq),
-            qd=columns(nq),
-            qdd=columns(nq),
-            tau=columns(nq),
-            Q=columns(nq),
-            Q_I=columns(nq),
-            Q_z=columns(nq),
-            multiplier=columns(m),
-            c=columns(m),
-            contact=columns(len(system.contacts), torch.bool),
-            saturated=torch.zeros(steps, dtype=torch.bool),
-        )
+        q, qd, qdd, tau, Q, Q_I, Q_z = (columns(nq) for _ in range(7))
+        contact, saturated = columns(len(system.contacts), torch.bool), columns(1, torch.bool)[:, 0]
+        return RunLog(q, qd, qdd, tau, Q, Q_I, Q_z, columns(m), columns(m), contact, saturated)
 
-    def arrays(self) -> LogRows:
+    def arrays(self) -> dict[str, np.ndarray]:
         """The columns as arrays that share their memory, to write single rows."""
         names = (f.name for f in fields(self))
-        return LogRows({n: x.numpy() for n in names if isinstance(x := getattr(self, n), Tensor)})
+        return {n: x.numpy() for n in names if isinstance(x := getattr(self, n), Tensor)}
 
 
-class LogRows:
-    """The columns of a log, written row by row."""
+def write(rows: dict[str, np.ndarray], k: int, **values: object) -> None:
+    """Write values of row k, by column."""
+    for name, value in values.items():
+        rows[name][k] = value
 
-    def __init__(self, columns: dict[str, np.ndarray]) -> None:
-        self._columns = columns
 
-    def write(self, k: int, **values: object) -> None:
-        """Write values of row k, by column."""
-        for name, value in values.items():
-            self._columns[name][k] = value
+def noise(like: Tensor, generator: torch.Generator) -> Tensor:
+    """White noise of unit variance, drawn in double precision whatever the type."""
+    return torch.randn(like.shape, dtype=torch.float64, generator=generator).to(like.dtype)
 
 
 @dataclass(frozen=True)
@@ -149,7 +138,7 @@ def make_result(
     robot = system.robot
     poses = kinematics.link_poses(robot, log.q)
     motion = kinematics.link_motion(robot, poses, log.qd)
-    tool = tool_motion(robot, poses, motion, log.qd, plan.frame, plan.point)
+    tool = kinematics.point_motion(robot, poses, motion, log.qd, plan.frame, plan.point)
     beyond = ((log.q < robot.lower) | (log.q > robot.upper)).any(-1)
     return SimulationResult(
         data=_dataset(system, config, plan, log, engine, generator),
@@ -166,12 +155,18 @@ def make_result(
 
 
 def _mismatch(system: ConstrainedSystem, config: SimulationConfig, log: RunLog) -> float:
-    """Largest difference of the engine's accelerations to ours, under its contact forces if it has any."""
+    """Largest difference between the engine's accelerations and L b + H Q̄ of our equations [rad/s²].
+
+    Where the engine has contact forces of its own, they are impressed forces of free motion.
+    """
+    Q_bar, active = log.Q + log.Q_z, log.contact
     if config.contact == "solver":
-        force = log.Q + log.Q_I + log.Q_z
-        M = dynamics.mass_matrix(system.robot, log.q)
-        return float((torch.linalg.solve(M, force[..., None])[..., 0] - log.qdd).abs().max())
-    return acceleration_mismatch(system, log.q, log.qd, log.qdd, log.Q + log.Q_z, log.contact)
+        system, Q_bar, active = ConstrainedSystem(system.robot), Q_bar + log.Q_I, active[:, :0]
+    worst = 0.0
+    for rows in torch.arange(len(log.q)).split(CHUNK):
+        eom = system.equations(log.q[rows], log.qd[rows], active=active[rows])
+        worst = max(worst, float((eom.acceleration(Q_bar[rows]) - log.qdd[rows]).abs().max()))
+    return worst
 
 
 def _dataset(
@@ -183,7 +178,6 @@ def _dataset(
     generator: torch.Generator,
 ) -> Dataset:
     robot, names = system.robot, system.contact_names
-    noise = torch.randn(log.qdd.shape, dtype=torch.float64, generator=generator).to(robot.dtype)
     header = DataHeader(
         dt=config.dt,
         noise_std=config.noise_std,
@@ -199,7 +193,7 @@ def _dataset(
         t=plan.reference.t,
         q=log.measured.get("q", log.q),
         qd=log.measured.get("qd", log.qd),
-        qdd=log.qdd + config.noise_std * noise,
+        qdd=log.qdd + config.noise_std * noise(log.qdd, generator),
         tau=log.measured.get("tau", log.tau),
         joint_names=robot.joint_names,
         contact={name: log.contact[:, i] for i, name in enumerate(names)},

@@ -22,9 +22,10 @@ from forcegp.errors import NumericalError
 from forcegp.resources import one_thread
 from forcegp.simulate.config import Sensors, SimulationConfig
 from forcegp.simulate.contact_solver import NO_FORCE, ContactSolverEngine
-from forcegp.simulate.engine import Engine, make_engine
+from forcegp.simulate.engine import Engine
+from forcegp.simulate.engines import make_engine
 from forcegp.simulate.mechanics import Mechanics
-from forcegp.simulate.result import RunLog, SimulationResult, make_result
+from forcegp.simulate.result import RunLog, SimulationResult, make_result, noise, write
 
 RUNAWAY_SPEED = 50.0
 """A joint faster than this [rad/s] has left any planned motion."""
@@ -35,7 +36,7 @@ Progress = Callable[[int, int], None]
 """Called with the number of steps done and the number in all."""
 
 
-def torque_limit(system: ConstrainedSystem, config: MotionConfig) -> Tensor:
+def _torque_limit(system: ConstrainedSystem, config: MotionConfig) -> Tensor:
     """Torque limits `(nq,)` [N m]: those of the settings, or else the robot's own."""
     robot = system.robot
     if config.torque_limit is None:
@@ -45,7 +46,7 @@ def torque_limit(system: ConstrainedSystem, config: MotionConfig) -> Tensor:
     return limit
 
 
-def check_speed(t: float, q: np.ndarray, qd: np.ndarray) -> None:
+def _check_speed(t: float, q: np.ndarray, qd: np.ndarray) -> None:
     """Stop a run that diverges.
 
     Raises:
@@ -60,13 +61,12 @@ def check_speed(t: float, q: np.ndarray, qd: np.ndarray) -> None:
         )
 
 
-def report(progress: Progress | None, done: int, steps: int) -> None:
-    """Call the progress function every few steps, and after the last."""
+def _report(progress: Progress | None, done: int, steps: int) -> None:
     if progress is not None and (done % PROGRESS_STRIDE == 0 or done == steps):
         progress(done, steps)
 
 
-def follow_with_solver(
+def _follow_with_solver(
     system: ConstrainedSystem,
     config: SimulationConfig,
     plan: Plan,
@@ -74,44 +74,33 @@ def follow_with_solver(
     generator: torch.Generator,
     progress: Progress | None,
 ) -> RunLog:
-    """Step the engine through the plan; the controller sees what the sensors measure.
-
-    Args:
-        system: robot and contacts, the mechanics that the controller assumes.
-        config: settings of motion, solver and sensors.
-        plan: the motion.
-        engine: the robot in its world.
-        generator: source of the sensors' noise.
-        progress: called every few steps.
-
-    Returns:
-        The log: true motion and forces, and what was measured where sensors are not perfect.
-    """
+    """Step the engine through the plan; the controller sees what the sensors measure."""
     log, mechanics, sensors = RunLog.empty(config.steps, system), Mechanics(system, plan), config.sensors
-    rows, limit, targets = log.arrays(), torque_limit(system, config).numpy(), plan.arrays()
+    rows, limit, targets = log.arrays(), _torque_limit(system, config).numpy(), plan.arrays()
     measured = {"q": torch.zeros_like(log.q), "qd": torch.zeros_like(log.qd)}
     F_I, F_z = (log.q.new_zeros(config.steps, len(system.contacts), 3) for _ in range(2))
     engine.reset(plan.start, torch.zeros_like(plan.start))
     for k in range(config.steps):
         true_q, true_qd = engine.state()
-        check_speed(k * config.dt, true_q.numpy(), true_qd.numpy())
+        _check_speed(k * config.dt, true_q.numpy(), true_qd.numpy())
         q, qd = _measured_state(true_q, true_qd, sensors, generator)
         measured["q"][k], measured["qd"][k] = q, qd
         eom, target = mechanics.equations(q.numpy(), qd.numpy()), Target(*(values[k] for values in targets))
         command = control_torque(eom.tool, eom, q.numpy(), qd.numpy(), target, plan.press(eom), config.gains)
         Q_u = np.clip(command, -limit, limit)
         solution = engine.forces(Q_u)
-        rows.write(k, q=true_q, qd=true_qd, tau=Q_u, saturated=(Q_u != command).any(), qdd=solution.qdd)
-        rows.write(k, Q=solution.Q, Q_I=solution.Q_I, Q_z=solution.Q_z, multiplier=solution.multiplier)
+        write(rows, k, q=true_q, qd=true_qd, tau=Q_u, saturated=(Q_u != command).any(), qdd=solution.qdd)
+        write(rows, k, Q=solution.Q, Q_I=solution.Q_I, Q_z=solution.Q_z, multiplier=solution.multiplier)
         F_I[k], F_z[k] = torch.from_numpy(solution.F_I), torch.from_numpy(solution.F_z)
         engine.step()
-        report(progress, k + 1, config.steps)
+        _report(progress, k + 1, config.steps)
     log.c.copy_(system.equations(log.q, log.qd).c)
     log.contact.copy_(log.multiplier > NO_FORCE)
-    names = enumerate(system.contact_names)
-    forces = {"F_I": {}, "F_z": {}} if system.contacts else {}
-    for i, name in names:
-        forces["F_I"][name], forces["F_z"][name] = F_I[:, i], F_z[:, i]
+    forces = {
+        name: {contact: F[:, i] for i, contact in enumerate(system.contact_names)}
+        for name, F in (("F_I", F_I), ("F_z", F_z))
+        if system.contacts
+    }
     measured["tau"] = _measured_torque(log.tau, config, generator)
     seen = {} if sensors == Sensors() else measured
     return dataclasses.replace(log, contact_forces=forces, measured=seen)
@@ -124,7 +113,7 @@ def _measured_state(
     if sensors.encoder_resolution > 0.0:
         q = (q / sensors.encoder_resolution).round() * sensors.encoder_resolution
     if sensors.velocity_noise > 0.0:
-        qd = qd + sensors.velocity_noise * _noise(qd, generator)
+        qd = qd + sensors.velocity_noise * noise(qd, generator)
     return q, qd
 
 
@@ -132,11 +121,7 @@ def _measured_torque(tau: Tensor, config: SimulationConfig, generator: torch.Gen
     """The torque as it is logged: late by whole samples, the first one repeated, and noisy."""
     late = round(config.sensors.torque_delay / config.dt)
     rows = (torch.arange(len(tau)) - late).clamp(min=0)
-    return tau[rows] + config.sensors.torque_noise * _noise(tau, generator)
-
-
-def _noise(like: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.randn(like.shape, dtype=torch.float64, generator=generator).to(like.dtype)
+    return tau[rows] + config.sensors.torque_noise * noise(tau, generator)
 
 
 ON_SURFACE = 1e-8
@@ -148,12 +133,10 @@ def simulate(
 ) -> SimulationResult:
     """Simulate a motion of the robot, in contact or free, and log it.
 
-    The engine moves the robot under Q_u + Q_D + Q_I + Q_z, where the motor torque Q_u comes from a
-    task-space controller, the normal force Q_I from the constrained equations of motion with their
-    Baumgarte terms, and Q_z is viscous friction at the contact (section 5 of the paper).
-
-    Surface contacts are unilateral: one opens when its multiplier would turn negative, and closes with an
-    inelastic impact. The run is computed on the CPU, where the data stay.
+    The engine moves the robot under Q_u + Q_D + Q_I + Q_z: the motor torque of a task-space controller, joint
+    friction, the normal force of the constrained equations of motion with their Baumgarte terms, and viscous
+    friction at the contact (section 5 of the paper). A contact opens when its multiplier would turn negative,
+    and closes with an inelastic impact. The run is computed on the CPU, where the data stay.
 
     Args:
         system: robot and contacts; without contacts the motion is free.
@@ -167,8 +150,7 @@ def simulate(
         >>> import forcegp
         >>> from forcegp.simulate import SimulationConfig
         >>> system = forcegp.load_scene("kuka_plane").system()
-        >>> result = simulate(system, SimulationConfig(duration=0.1, engine="mujoco"))
-        >>> len(result.data)
+        >>> len(simulate(system, SimulationConfig(duration=0.1, engine="mujoco")).data)
         24
 
     Raises:
@@ -183,7 +165,7 @@ def simulate(
         plan = make_plan(system, config, generator)
         if config.contact == "solver":
             engine = ContactSolverEngine(system, config.dt, config.solver)
-            log = follow_with_solver(system, config, plan, engine, generator, progress)
+            log = _follow_with_solver(system, config, plan, engine, generator, progress)
             return make_result(system, config, plan, log, engine.name, generator)
         with closing(make_engine(system.robot, config.dt, config.engine)) as engine:
             log = _follow(system, config, plan, engine, progress)
@@ -199,12 +181,13 @@ def _follow(
 ) -> RunLog:
     """Step the engine through the plan."""
     log, mechanics = RunLog.empty(config.steps, system), Mechanics(system, plan)
-    rows, limit, targets = log.arrays(), torque_limit(system, config).numpy(), plan.arrays()
-    closed = _closed_at_start(mechanics, plan.start.numpy())
+    rows, limit, targets = log.arrays(), _torque_limit(system, config).numpy(), plan.arrays()
     engine.reset(plan.start, torch.zeros_like(plan.start))
     q, qd = (x.numpy() for x in engine.state())
+    # Inverse kinematics puts the tool on the surface, up to rounding.
+    closed = ~any_row(mechanics, np.abs(mechanics.equations(q, qd).c) > ON_SURFACE)
     for k in range(config.steps):
-        check_speed(k * config.dt, q, qd)
+        _check_speed(k * config.dt, q, qd)
         landing = land(mechanics, q, qd, closed)
         if landing.impact:
             qd = landing.qd
@@ -215,15 +198,9 @@ def _follow(
         forces = contact_forces(mechanics, q, qd, landing, Q_u, config.viscous_friction)
         engine.step(torch.from_numpy(Q_u + forces.Q_D + forces.Q_I + forces.Q_z))
         q_next, qd_next = (x.numpy() for x in engine.state())
-        rows.write(k, q=q, qd=qd, qdd=(qd_next - qd) / config.dt, tau=Q_u, saturated=(Q_u != command).any())
-        rows.write(k, Q=forces.Q, Q_I=forces.Q_I, Q_z=forces.Q_z)
-        rows.write(k, multiplier=forces.multiplier, c=forces.c, contact=forces.closed)
+        write(rows, k, q=q, qd=qd, qdd=(qd_next - qd) / config.dt, tau=Q_u, saturated=(Q_u != command).any())
+        write(rows, k, Q=forces.Q, Q_I=forces.Q_I, Q_z=forces.Q_z)
+        write(rows, k, multiplier=forces.multiplier, c=forces.c, contact=forces.closed)
         closed, q, qd = forces.closed, q_next, qd_next
-        report(progress, k + 1, config.steps)
+        _report(progress, k + 1, config.steps)
     return log
-
-
-def _closed_at_start(mechanics: Mechanics, q: np.ndarray) -> np.ndarray:
-    """Constraints that hold at the start; inverse kinematics puts the tool on the surface, up to rounding."""
-    c = mechanics.equations(q, 0.0 * q).c
-    return ~any_row(mechanics, np.abs(c) > ON_SURFACE)

@@ -18,14 +18,8 @@ GIMBAL = 1e-12
 def write_urdf(robot: RobotModel) -> str:
     """The robot as URDF text: inertial parameters and joints only, mounted in the world at its base pose.
 
-    Shapes, joint limits, damping and friction are left out on purpose: an engine that reads the file can
-    add no force of its own, and every force is one that the caller applies.
-
-    Args:
-        robot: the robot.
-
-    Returns:
-        The text of the file; its joints carry the robot's joint names.
+    Shapes, joint limits, damping and friction are left out: an engine that reads the file adds no force
+    of its own.
     """
     root = Element("robot", name=robot.name)
     _link(root, WORLD, 1.0, torch.zeros(3), torch.eye(3), torch.ones(3))

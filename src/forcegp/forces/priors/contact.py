@@ -23,7 +23,8 @@ from torch.linalg import vecdot
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
-from forcegp.constraints.contact import ContactPoint, SurfaceContact
+from forcegp.constraints.contact import SurfaceContact
+from forcegp.constraints.gauss import ContactPoint
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, ForcePrior, check_inputs
 from forcegp.forces.priors.joint import JointForcePrior

@@ -1,0 +1,222 @@
+"""From C++ source text to a shared library: the system's compiler, and a cache on disk.
+
+Compiled kernels are code: they are kept where only their owner writes, and checked before they run. A kernel
+is named `<key>-<SHA-256 of the file>.so`; the key identifies what was compiled, and the digest a whole file.
+The folder is private (0700) and so are the files (0600), whatever the umask.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import hashlib
+import os
+import platform
+import shutil
+import stat
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from forcegp.errors import MissingDependencyError
+from forcegp.files import atomic_file
+from forcegp.temporary import Temporary, discard, sweep
+
+FLAGS = ["-std=c++17", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-w", "-shared", "-fPIC"]
+LIBRARY = "kernel.so"
+PROC = Path("/proc/self/fd")
+"""Names of open files and folders by their descriptors, on Linux."""
+
+
+def find_compiler() -> str:
+    """Path of the C++ compiler: `$CXX`, or the first of c++, g++ and clang++ on the PATH.
+
+    Raises:
+        MissingDependencyError: there is none.
+    """
+    wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
+    for name in wanted:
+        if path := shutil.which(name):
+            return os.path.abspath(path)
+    raise MissingDependencyError(
+        "compiled kernels need a C++ compiler and none was found",
+        expected=" or ".join(wanted) + " on the PATH",
+        hint="install one (for example: apt install g++), or set CXX",
+    )
+
+
+def _machine() -> str:
+    """What `-march=native` depends on."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return platform.processor() + platform.machine()
+    keys = ("model name", "flags", "cpu family", "model\t", "Features", "CPU part")
+    return "\n".join(sorted({line for line in text.splitlines() if line.startswith(keys)}))
+
+
+def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
+    """The shared library of a C++ source text, with functions `extern "C"`, compiled unless the cache has it.
+
+    Raises:
+        MissingDependencyError: there is no compiler, it failed, or the cache cannot be written or trusted.
+    """
+    compiler = find_compiler()
+    try:
+        version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+        place = cache_directory()
+    except (OSError, RuntimeError) as cause:
+        raise MissingDependencyError(
+            "the C++ compiler or the folder of its results cannot be used",
+            got=str(cause),
+            hint="set CXX to a C++ compiler, and FORCEGP_CACHE to a folder that can be written",
+        ) from cause
+    key = hashlib.sha256("\0".join([source, version, _machine(), level, *FLAGS]).encode()).hexdigest()[:32]
+    try:
+        folder = private_folder(place)
+        kept = find(folder, key)
+        if kept is not None:
+            try:
+                return ctypes.CDLL(str(kept))
+            except OSError:  # of another machine that shares the folder: build it anew
+                discard(kept)
+        return ctypes.CDLL(str(store(folder, key, _compiled([compiler, level], source, folder))))
+    except OSError as cause:
+        raise MissingDependencyError(
+            f"the kernel cannot be written to {place}",
+            got=str(cause),
+            hint="set FORCEGP_CACHE to a folder that can be written",
+        ) from cause
+
+
+def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
+    """The content of the shared library; what a killed compiler left in the folder is removed."""
+    target = folder / "build"
+    sweep(target)
+    build = Temporary(target, folder=True, mode=0o700)
+    try:
+        build.path.chmod(0o700)
+        return _built(compiler, source, build.path)
+    finally:
+        build.close()
+
+
+def _built(compiler: Sequence[str], source: str, folder: Path) -> bytes:
+    """What the compiler writes into a private folder, which is held open: its name may change hands."""
+    if not PROC.is_dir():  # no folder has a name by its descriptor here
+        _run_compiler(compiler, source, folder)
+        return (folder / LIBRARY).read_bytes()
+    held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        status = os.fstat(held)
+        if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) != 0o700:
+            raise OSError(errno.EPERM, "another folder was put in the place of the build folder", str(folder))
+        _run_compiler(compiler, source, PROC / str(held))
+        with os.fdopen(os.open(LIBRARY, os.O_RDONLY | os.O_NOFOLLOW, dir_fd=held), "rb") as file:
+            return file.read()
+    finally:
+        os.close(held)
+
+
+def _run_compiler(compiler: Sequence[str], source: str, folder: Path) -> None:
+    command = [*compiler, *FLAGS, "-x", "c++", "-", "-o", LIBRARY, "-pthread"]
+    done = subprocess.run(command, input=source, capture_output=True, text=True, check=False, cwd=folder)
+    if done.returncode != 0:
+        raise MissingDependencyError(
+            f"the C++ compiler {compiler[0]} could not build the kernel",
+            got=done.stderr.strip()[-2000:],
+            hint="set CXX to a recent GCC or Clang",
+        )
+
+
+def cache_directory() -> Path:
+    """Where compiled kernels are kept: `$FORCEGP_CACHE`, or `forcegp` in the user's cache folder."""
+    chosen = os.environ.get("FORCEGP_CACHE")
+    if chosen:
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "forcegp"
+
+
+def private_folder(folder: Path) -> Path:
+    """The folder, made for its owner alone where it does not exist (OSError if it cannot be made).
+
+    Raises:
+        MissingDependencyError: others own it or can write to it or replace it; names the folder at fault.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+        folder.chmod(0o700)
+    folder = folder.resolve()
+    if os.name == "posix":
+        _check_owner(folder)
+    return folder
+
+
+def _check_owner(folder: Path) -> None:
+    for place in (folder, *folder.parents):
+        status = place.stat()
+        if status.st_uid not in ((os.geteuid(),) if place == folder else (os.geteuid(), 0)):
+            raise _untrusted(folder, place, f"owned by user {status.st_uid}")
+        # In a folder with the sticky bit, such as /tmp, nobody replaces what belongs to another.
+        sticky = place != folder and bool(status.st_mode & stat.S_ISVTX)
+        shared = bool(status.st_mode & stat.S_IWGRP) and not (place != folder and _is_alone_in(status.st_gid))
+        if (shared or status.st_mode & stat.S_IWOTH) and not sticky:
+            raise _untrusted(folder, place, f"permissions {stat.S_IMODE(status.st_mode):04o}")
+
+
+def _is_alone_in(group: int) -> bool:
+    """Whether nobody but the user and root is in a group, as far as the system lists its members."""
+    import grp
+    import pwd
+
+    try:
+        allowed = {pwd.getpwuid(os.geteuid()).pw_name, "root"}
+        members = {*grp.getgrgid(group).gr_mem, *(x.pw_name for x in pwd.getpwall() if x.pw_gid == group)}
+    except KeyError:
+        return False
+    return group == os.getegid() and members <= allowed
+
+
+def _untrusted(folder: Path, place: Path, got: str) -> MissingDependencyError:
+    return MissingDependencyError(
+        f"compiled kernels are not kept in {folder}, since others could put code there",
+        expected=f"{place} to belong to you, and nobody else to write to it",
+        got=got,
+        hint="set FORCEGP_CACHE to a folder of your own, or call chmod 700 on it",
+    )
+
+
+def find(folder: Path, key: str) -> Path | None:
+    """The kernel of a key, if the folder has one that is whole and the user's own; others are removed."""
+    for path in sorted(folder.glob(f"{key}-*.so")):
+        if _trusted(path):
+            return path
+        discard(path)
+    return None
+
+
+def _trusted(path: Path) -> bool:
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+    except OSError:
+        return False
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            return False
+        if os.name == "posix" and (
+            status.st_uid != os.geteuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        ):
+            return False
+        return path.stem.partition("-")[2] == hashlib.sha256(file.read()).hexdigest()
+
+
+def store(folder: Path, key: str, content: bytes) -> Path:
+    """Write a kernel; OSError if it cannot be written."""
+    library = folder / f"{key}-{hashlib.sha256(content).hexdigest()}.so"
+    with atomic_file(library, mode=0o600) as temporary:
+        temporary.chmod(0o600)
+        temporary.write_bytes(content)
+    return library

@@ -1,0 +1,225 @@
+"""PyBullet and MuJoCo as physics engines, with everything off that would act beside the forces we apply."""
+
+from __future__ import annotations
+
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forcegp.errors import MissingDependencyError, UnknownNameError, UnsupportedRobotError, optional_module
+from forcegp.robot.model import RobotModel
+from forcegp.simulate.engine import Engine
+from forcegp.simulate.urdf import write_urdf
+from forcegp.types import JointMatrix, JointVector
+
+NEEDS_MUJOCO = "the engine 'mujoco'"
+MAX_JOINT_VELOCITY = 1e6
+"""Bullet clamps joint velocities at 100 rad/s unless told otherwise; a clamp is a force nobody applied."""
+
+
+class PyBulletEngine(Engine):
+    """A robot in a PyBullet world of its own, with a step dt [s].
+
+    Raises:
+        MissingDependencyError: PyBullet is not installed.
+        UnsupportedRobotError: a drive has inertia of its own, which PyBullet has no place for.
+    """
+
+    def __init__(self, robot: RobotModel, dt: float) -> None:
+        try:
+            import pybullet
+            from pybullet_utils.bullet_client import BulletClient
+        except ImportError:
+            raise MissingDependencyError(
+                "the engine 'pybullet' needs the package pybullet",
+                hint='pip install "forcegp[pybullet]" (Python 3.11 or older), or use the engine "mujoco"',
+            ) from None
+        for joint, armature in zip(robot.joint_names, robot.armature.tolist(), strict=True):
+            if armature != 0.0:
+                raise UnsupportedRobotError(
+                    f"joint {joint!r} of robot {robot.name!r} has a drive with inertia",
+                    expected="armature 0, as PyBullet has no place for it",
+                    got=armature,
+                    hint='use the engine "mujoco"',
+                )
+        self._robot, self._dt = robot, dt
+        self._bullet: Any = BulletClient(pybullet.DIRECT)
+        self._bullet.setTimeStep(dt)
+        self._bullet.setGravity(*robot.gravity.tolist())
+        self._body = self._load()
+        info = (
+            self._bullet.getJointInfo(self._body, i) for i in range(self._bullet.getNumJoints(self._body))
+        )
+        index = {entry[1].decode(): entry[0] for entry in info}
+        self._joints = [index[name] for name in robot.joint_names]
+        # PyBullet's vectors list joints by their index.
+        self._order = np.argsort(np.argsort(self._joints)).tolist()
+        self._silence()
+
+    @property
+    def name(self) -> str:
+        return f"pybullet {version('pybullet')}"
+
+    @property
+    def dt(self) -> float:
+        return self._dt
+
+    def reset(self, q: JointVector, qd: JointVector) -> None:
+        for joint, position, velocity in zip(self._joints, q.tolist(), qd.tolist(), strict=True):
+            self._bullet.resetJointState(self._body, joint, position, velocity)
+
+    def state(self) -> tuple[JointVector, JointVector]:
+        states = self._bullet.getJointStates(self._body, self._joints)
+        q, qd = zip(*((state[0], state[1]) for state in states), strict=True)
+        return torch.tensor(q, dtype=self._robot.dtype), torch.tensor(qd, dtype=self._robot.dtype)
+
+    def step(self, force: JointVector) -> None:
+        bullet = self._bullet
+        bullet.setJointMotorControlArray(
+            self._body, self._joints, bullet.TORQUE_CONTROL, forces=force.tolist()
+        )
+        bullet.stepSimulation()
+
+    def mass_matrix(self, q: JointVector) -> JointMatrix:
+        M = self._bullet.calculateMassMatrix(self._body, self._ordered(q))
+        return torch.tensor(M, dtype=self._robot.dtype)[self._order][:, self._order]
+
+    def inverse_dynamics(self, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
+        state = (self._ordered(x) for x in (q, qd, qdd))
+        force = self._bullet.calculateInverseDynamics(self._body, *state)
+        return torch.tensor(force, dtype=self._robot.dtype)[self._order]
+
+    def close(self) -> None:
+        if self._bullet.isConnected():
+            self._bullet.disconnect()
+
+    def _load(self) -> int:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "robot.urdf"
+            path.write_text(write_urdf(self._robot), encoding="utf-8")
+            flags = self._bullet.URDF_USE_INERTIA_FROM_FILE
+            return self._bullet.loadURDF(str(path), useFixedBase=True, flags=flags)
+
+    def _silence(self) -> None:
+        damping = {"linearDamping": 0.0, "angularDamping": 0.0, "jointDamping": 0.0}
+        for link in (-1, *self._joints):
+            self._bullet.changeDynamics(self._body, link, **damping, maxJointVelocity=MAX_JOINT_VELOCITY)
+        motors, none = self._bullet.VELOCITY_CONTROL, [0.0] * len(self._joints)
+        self._bullet.setJointMotorControlArray(self._body, self._joints, motors, forces=none)
+
+    def _ordered(self, values: JointVector) -> list[float]:
+        return values[np.argsort(self._joints)].tolist()
+
+
+class MuJoCoWorld:
+    """A robot in a compiled MuJoCo model with its joint names; gravity and drive inertia are the robot's."""
+
+    def __init__(self, robot: RobotModel, model: Any, dt: float) -> None:
+        self._mujoco, self._robot, self._model = optional_module("mujoco", NEEDS_MUJOCO), robot, model
+        model.opt.timestep = dt
+        model.opt.gravity[:] = robot.gravity.numpy()
+        self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
+        model.dof_armature[self._dof] = robot.armature.numpy()
+        self._data = self._mujoco.MjData(model)
+
+    @property
+    def name(self) -> str:
+        """Name and version, for the record."""
+        return f"mujoco {self._mujoco.__version__}"
+
+    def reset(self, q: JointVector, qd: JointVector) -> None:
+        """Put the robot at q `(nq,)` moving at qd `(nq,)`."""
+        self._set(self._data, q, qd)
+
+    def state(self) -> tuple[JointVector, JointVector]:
+        """The present q and qd, `(nq,)` each [rad, rad/s]."""
+        return self._tensor(self._data.qpos[self._dof]), self._tensor(self._data.qvel[self._dof])
+
+    def close(self) -> None:
+        """Release the engine's resources: MuJoCo holds none."""
+
+    def _set(self, data: Any, q: JointVector, qd: JointVector) -> None:
+        data.qpos[self._dof] = q.numpy()
+        data.qvel[self._dof] = qd.numpy()
+
+    def _tensor(self, values: np.ndarray) -> Tensor:
+        return torch.tensor(values, dtype=self._robot.dtype)
+
+    def _mass_matrix(self, data: Any) -> np.ndarray:
+        """M `(nv, nv)` of a state whose positions are up to date; `mj_fullM` differs between versions."""
+        M = np.zeros((self._model.nv, self._model.nv))
+        for column, unit in zip(M, np.eye(self._model.nv), strict=True):
+            self._mujoco.mj_mulM(self._model, data, column, unit)
+        return M
+
+
+class MuJoCoEngine(MuJoCoWorld, Engine):
+    """A robot in a MuJoCo world of its own, with a step dt [s].
+
+    Raises:
+        MissingDependencyError: MuJoCo is not installed.
+    """
+
+    def __init__(self, robot: RobotModel, dt: float) -> None:
+        mujoco = optional_module("mujoco", NEEDS_MUJOCO)
+        super().__init__(robot, mujoco.MjModel.from_xml_string(write_urdf(robot)), dt)
+        self._model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+        self._scratch = mujoco.MjData(self._model)
+
+    @property
+    def dt(self) -> float:
+        return float(self._model.opt.timestep)
+
+    def step(self, force: JointVector) -> None:
+        self._data.qfrc_applied[self._dof] = force.numpy()
+        self._mujoco.mj_step(self._model, self._data)
+
+    def mass_matrix(self, q: JointVector) -> JointMatrix:
+        self._set(self._scratch, q, torch.zeros_like(q))
+        self._mujoco.mj_forward(self._model, self._scratch)
+        return self._tensor(self._mass_matrix(self._scratch)[np.ix_(self._dof, self._dof)])
+
+    def inverse_dynamics(self, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
+        data = self._scratch
+        self._set(data, q, qd)
+        data.qacc[self._dof] = qdd.numpy()
+        self._mujoco.mj_inverse(self._model, data)
+        return self._tensor(data.qfrc_inverse[self._dof])
+
+
+MAKERS = {"pybullet": PyBulletEngine, "mujoco": MuJoCoEngine}
+
+
+def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
+    """An engine by name.
+
+    Args:
+        robot: the robot it holds.
+        dt: step [s].
+        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet where it is installed, else MuJoCo.
+
+    Example:
+        >>> import torch, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> engine = make_engine(robot, dt=0.001, name="mujoco")
+        >>> engine.mass_matrix(torch.zeros(2, dtype=torch.float64)).shape
+        torch.Size([2, 2])
+
+    Raises:
+        UnknownNameError: no such engine.
+        MissingDependencyError: the engine's package is not installed.
+    """
+    if name != "auto" and name not in MAKERS:
+        raise UnknownNameError("engine", name, ["auto", *MAKERS])
+    if name != "auto":
+        return MAKERS[name](robot, dt)
+    try:
+        return PyBulletEngine(robot, dt)
+    except MissingDependencyError:
+        return MuJoCoEngine(robot, dt)
