@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -235,10 +234,8 @@ def shown(sizes: Profile, fits: Sequence[Fit]) -> list[Fit]:
 
 
 def viewed(fits: Sequence[Fit]) -> list[Fit]:
-    """The fit that the view shows: the largest structured one; none if viser is not installed."""
+    """The fit that the view shows: the largest structured one."""
     fits = [fit for fit in fits if fit.name.startswith("sgp") and fit.name not in PAPER_KERNELS.values()]
-    if find_spec("viser") is None:
-        return []
     return sorted(fits, key=lambda fit: (fit.points, fit.name == "sgp-mean"))[-1:]
 
 

@@ -12,8 +12,8 @@ from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.models.load import load_model
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.report.animation import animation_source
 from forcegp.report.rollout_data import RolloutData, together
-from forcegp.report.rollouts import animation_source
 from forcegp.report.window import WindowData
 from reproduction.covariance import CovarianceData
 from reproduction.multiplier import MultiplierData

@@ -25,7 +25,8 @@ RolloutFile = Annotated[
     typer.Option("--rollout", "-r", help="The rollout.parquet of `forcegp rollout`, shown as it predicts."),
 ]
 Out = Annotated[
-    Path | None, typer.Option("--out", "-o", help="One HTML file that works offline; default: a live view.")
+    Path | None,
+    typer.Option("--out", "-o", help="HTML file that works offline; default: serve the page."),
 ]
 Seconds = Annotated[float, typer.Option(min=0.05, help="Length of the motion in seconds.")]
 Start = Annotated[int, typer.Option(min=0, help="Row of the log to start from.")]
@@ -33,7 +34,7 @@ Samples = Annotated[
     int, typer.Option(min=0, help="Function samples whose paths of the tip are drawn, of a structured model.")
 ]
 Horizon = Annotated[float, typer.Option(min=0.01, help="How far ahead the paths reach in seconds.")]
-Port = Annotated[int, typer.Option(min=1024, max=65535, help="Port of the live view.")]
+Port = Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page.")]
 
 
 def view(
@@ -54,7 +55,7 @@ def view(
     deviations at its tip, and the paths of the tip that the model predicts from the first state. With a scene
     and a log, the force is the logged one. Without a log the robot stands still.
 
-    The live view is served to this computer only. With --out, one HTML file is written that needs no network.
+    The page is served to this computer only. With --out, one HTML file is written that needs no network.
 
     [bold]Examples[/bold]
 
@@ -65,12 +66,12 @@ def view(
     forcegp view my_scene.toml --rollout rollout/rollout.parquet
     """
     from forcegp.destination import check_destination
+    from forcegp.errors import ParameterError
+    from forcegp.view.page import serve, view_page, write_view
 
     if out is not None:
         check_destination(out)
     if data is not None and rollout is not None:
-        from forcegp.errors import ParameterError
-
         raise ParameterError("--data and --rollout exclude each other", hint="name one motion to look at")
     system, model, shapes = _target(target)
     motion = _motion(system, model, data or rollout, start, seconds)
@@ -78,19 +79,11 @@ def view(
         motion = _with_paths(motion, model, _stretch(data, system, start, seconds), samples, horizon)
     title = f"{target}: {data or rollout or 'at rest'}"
     if out is None:
-        from forcegp.view.page import serve
-
-        serve(
-            motion, shapes, port, say=lambda address: typer.echo(f"{title}\nopen {address}, end with Ctrl-C")
-        )
+        page = view_page(motion, shapes, title)
+        serve(page, port, say=lambda address: typer.echo(f"{title}\nopen {address}, end with Ctrl-C"))
         return
-    from forcegp.view.page import write_view
-
-    with progress_bar("writing the view", 1) as advance:
-        write_view(out, motion, shapes, title)
-        advance(1)
-    figures = {"pictures": len(motion.t), "paths": len(motion.paths), "page": str(out)}
-    show(figures, as_json)
+    write_view(out, motion, shapes, title)
+    show({"pictures": len(motion.t), "paths": len(motion.paths), "page": str(out)}, as_json)
 
 
 def _target(target: str) -> tuple[ConstrainedSystem, FittedModel | None, list[Shape]]:

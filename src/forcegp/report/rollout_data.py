@@ -9,14 +9,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from forcegp import kinematics
 from forcegp.files import Header
+from forcegp.report.animation import FRAMES_PER_SECOND, arm_points, rounded
 from forcegp.report.html import Part, Series, series
-from forcegp.robot.model import BASE, RobotModel
 from forcegp.rollout.comparison import HORIZONS, LEVEL, Comparison
-
-FRAMES_PER_SECOND = 20
-"""Frame rate of the animation."""
 
 
 class Band(Part):
@@ -122,12 +118,13 @@ def rollout_data(comparison: Comparison, calibration: Comparison | None = None) 
     """
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
-    joints = [arm_points(comparison.system.robot, comparison.q[0, ::stride], comparison)]
-    films = [Film(label="logged", points=_rounded(joints[0]))]
+    tip = comparison.frame, comparison.point
+    joints = arm_points(comparison.system.robot, comparison.q[0, ::stride], *tip)
+    films = [Film(label="logged", points=rounded(joints))]
     for name, rolled in comparison.predicted.items():
         sound = _sound(rolled.q[0])
-        points = arm_points(rolled.system.robot, rolled.q[0, :sound:stride], comparison)
-        films.append(Film(label=name, points=_rounded(points)))
+        points = arm_points(rolled.system.robot, rolled.q[0, :sound:stride], *tip)
+        films.append(Film(label=name, points=rounded(points)))
     logged = comparison.multiplier
     return RolloutData(
         t=series(comparison.t),
@@ -140,7 +137,7 @@ def rollout_data(comparison: Comparison, calibration: Comparison | None = None) 
         horizons=horizons,
         models=[_model_path(comparison, name, horizons, calibration) for name in comparison.predicted],
         frame_times=series(comparison.t[::stride]),
-        bodies=joints[0].shape[1],
+        bodies=joints.shape[1],
         films=films,
     )
 
@@ -229,21 +226,3 @@ def _sound(q: Tensor) -> int:
 
 def _finite(values: Tensor) -> Tensor:
     return values[torch.isfinite(values)]
-
-
-def arm_points(robot: RobotModel, q: Tensor, comparison: Comparison) -> Tensor:
-    """Base, link origins on the way to the tip, and the tip: `(frames, points, 3)` in the world [m]."""
-    poses = kinematics.link_poses(robot, q)
-    joint = robot.frame_parents[robot.frame_index(comparison.frame)]
-    chain: list[int] = []
-    while joint != BASE:
-        chain.insert(0, joint)
-        joint = robot.parents[joint]
-    origins = poses.position[:, chain] + robot.base_position
-    base = robot.base_position.expand(len(q), 1, 3)
-    tip = kinematics.point_position(robot, q, comparison.frame, tuple(comparison.point))[:, None]
-    return torch.cat([base, origins, tip], dim=1)
-
-
-def _rounded(points: Tensor) -> Series:
-    return [round(x, 5) for x in points.flatten().tolist()]

@@ -1,16 +1,9 @@
-"""Predicted trajectories beside the logged one: plots, table and animation.
-
-The arm in motion: an animation in the page, drawn by its own script.
-"""
+"""Predicted trajectories beside the logged one: plots, table and animation."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
 import math
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
 from markupsafe import Markup
@@ -18,13 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.files import write_text
+from forcegp.report.animation import animation, animation_source
 from forcegp.report.html import NONE, PictureBlock, Series, Table, render
 from forcegp.report.rollout_data import Band, ModelPath, RolloutData
 from forcegp.report.style import DASHES, INK, Picture, colour, draw, label, line
 
 
-def animation(data: RolloutData) -> Markup:
-    """The arm in motion: a canvas with a slider, a play button and a checkbox for each model."""
+def _animation(data: RolloutData) -> Markup:
+    """The logged arm and the predicted ones in motion."""
     films = [
         {
             "label": "simulated" if film.label == "logged" else label(film.label),
@@ -35,25 +29,7 @@ def animation(data: RolloutData) -> Markup:
         for film in data.films
     ]
     content = {"times": data.frame_times, "bodies": data.bodies, "films": films}
-    # "</" would end the script element, even inside a string.
-    text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
-    return Markup(
-        '<figure class="animation"><canvas width="920" height="560" role="img" '
-        'aria-label="The arm moving: simulated in black, predicted in colour"></canvas>'
-        '<p><button type="button">Play</button> <input type="range" min="0" value="0" step="1" '
-        'aria-label="time"> <output></output></p><p class="films"></p>'
-        f'<script type="application/json">{text}</script><script>{_script()}</script></figure>'
-    )
-
-
-def animation_source() -> str:
-    """Hash of the animation's script for a content security policy."""
-    digest = hashlib.sha256(_script().encode()).digest()
-    return "sha256-" + base64.b64encode(digest).decode()
-
-
-def _script() -> str:
-    return (files("forcegp.report") / "templates" / "animation.js").read_text(encoding="utf-8")
+    return animation(content, "The arm moving: simulated in black, predicted in colour")
 
 
 WIDTH = 4.6
@@ -210,7 +186,7 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
         "its prediction diverged."
     )
     block = PictureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
-    return RolloutSection(block, rollout_table(data), animation(data), animation_source())
+    return RolloutSection(block, rollout_table(data), _animation(data), animation_source())
 
 
 def write_rollouts(folder: Path, title: str, data: RolloutData) -> Path:

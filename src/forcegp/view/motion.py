@@ -15,13 +15,12 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.models.base import Predictor
+from forcegp.report.animation import FRAMES_PER_SECOND
 from forcegp.rollout import Rollout, RolloutOptions
 from forcegp.rollout.comparison import tip_of
 from forcegp.rollout.inputs import sampling_period
 
 Array = NDArray[np.float64]
-RATE = 20.0
-"""Pictures per second."""
 LOGGED, MEAN, SAMPLE = "logged", "predicted", "sampled"
 
 
@@ -148,7 +147,8 @@ def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:
 
 def pictures(t: Tensor) -> Tensor:
     """The rows that are shown: the last one before each picture's time."""
-    times = torch.arange(float(t[0]), float(t[-1]) + 0.5 / RATE, 1.0 / RATE, dtype=t.dtype)
+    period = 1.0 / FRAMES_PER_SECOND
+    times = torch.arange(float(t[0]), float(t[-1]) + 0.5 * period, period, dtype=t.dtype)
     return torch.unique((torch.searchsorted(t.contiguous(), times, right=True) - 1).clamp(0, len(t) - 1))
 
 
