@@ -85,7 +85,7 @@ class Temporary:
 
 
 def sweep(target: Path) -> None:
-    """Remove what killed writers of a target left beside it."""
+    """Delete temporary files of crashed writers of a target."""
     for path in leftovers_of(target) if fcntl is not None else []:
         locked, descriptor = _lock(path)
         if descriptor is not None:
@@ -116,12 +116,7 @@ def _lock(path: Path) -> tuple[bool, int | None]:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return os.path.samestat(os.fstat(descriptor), path.lstat()), descriptor
-    except BlockingIOError:
+    except OSError as error:
         os.close(descriptor)
-        return False, None
-    except FileNotFoundError:
-        os.close(descriptor)
-        return False, None
-    except OSError:  # no flock on this file system
-        os.close(descriptor)
-        return True, None
+        # Any other error: no flock on this file system.
+        return not isinstance(error, BlockingIOError | FileNotFoundError), None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from forcegp.constraints import ConstrainedSystem, Constraint, PointConnection, SurfaceContact
+from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import SceneError, did_you_mean
 from forcegp.robot import RobotModel, load_robot
 from forcegp.robot.load import BUNDLED as BUNDLED_ROBOTS
@@ -94,13 +94,11 @@ class Scene:
             SceneError: a part is not valid; the message names the key and line.
         """
         robot, sections, at = self.robot(dtype, device), self.sections, self.document.at
-        constraints: list[Constraint] = []
-        for i, c in enumerate(sections.contact):
-            constraints.append(SurfaceContact(c.name, c.frame, c.point, c.surface, radius=c.radius))
-            at(("contact", i, "frame"), constraints[-1].check, robot)
-        for i, c in enumerate(sections.connection):
-            constraints.append(PointConnection(c.name, c.frame, c.point, c.other_frame, c.other_point))
-            at(("connection", i, "frame"), constraints[-1].check, robot)
+        tables = [(("contact", i), table) for i, table in enumerate(sections.contact)]
+        tables += [(("connection", i), table) for i, table in enumerate(sections.connection)]
+        constraints = [table.build() for _, table in tables]
+        for (key, _), constraint in zip(tables, constraints, strict=True):
+            at((*key, "frame"), constraint.check, robot)
         return at(("contact",), ConstrainedSystem, robot, constraints, baumgarte=sections.baumgarte)
 
 

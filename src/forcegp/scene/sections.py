@@ -1,12 +1,7 @@
 """The tables of a scene file.
 
-Surfaces, the stabilization and the simulation are described by the classes that they make, so a key of a
-scene file is a parameter of that class; the other tables are described here.
-
-The table `[model]` of a scene file or of a file of its own: which model, and how it learns.
-
-Names and values are those of the arguments in Python and of the fields in saved models; a key that is left
-out has the default of the model. Priors and kernels are described as in saved models (`settings.priors`).
+A key is a parameter of the class that the table makes, or a field of saved models. A key that is left out of
+`[model]` has the default of the model.
 """
 
 from __future__ import annotations
@@ -24,8 +19,9 @@ from pydantic import (
     field_validator,
 )
 
-from forcegp.constraints import Baumgarte, SurfaceSchema
+from forcegp.constraints import Baumgarte
 from forcegp.simulate.config import SimulationConfig
+from forcegp.storage.system import ConnectionFields, ContactFields, Point
 
 
 class Section(BaseModel):
@@ -119,37 +115,22 @@ class ModelFile(Section):
     model: ModelSection
 
 
-Vector = tuple[float, float, float]
-
-
 class RobotSection(Section):
     """`[robot]`: see `forcegp.load_robot`; a path is relative to the scene file."""
 
     model: str
-    base_position: Vector = (0.0, 0.0, 0.0)
-    base_rpy: Vector = (0.0, 0.0, 0.0)
-    gravity: Vector = (0.0, 0.0, -9.81)
+    base_position: Point = (0.0, 0.0, 0.0)
+    base_rpy: Point = (0.0, 0.0, 0.0)
+    gravity: Point = (0.0, 0.0, -9.81)
     locked_joints: dict[str, float] = Field(default_factory=dict)
 
 
-class ContactSection(Section):
+class ContactSection(ContactFields, strict=True):
     """`[[contact]]`: a point of the robot that may touch a surface, or a ball of some `radius` around it."""
 
-    name: str
-    frame: str
-    point: Vector = (0.0, 0.0, 0.0)
-    surface: SurfaceSchema
-    radius: float = 0.0
 
-
-class ConnectionSection(Section):
+class ConnectionSection(ConnectionFields, strict=True):
     """`[[connection]]`: two points that coincide; without `other_frame`, the second is fixed in the world."""
-
-    name: str
-    frame: str
-    point: Vector = (0.0, 0.0, 0.0)
-    other_frame: str | None = None
-    other_point: Vector = (0.0, 0.0, 0.0)
 
 
 class SceneSections(Section):

@@ -19,13 +19,13 @@ from typing import Any, ClassVar, TypeVar
 import safetensors
 import safetensors.torch
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.destination import check_destination
 from forcegp.errors import ModelError
-from forcegp.files import Header, atomic_file
+from forcegp.files import Header, atomic_file, validated
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
 from forcegp.resources import announce_memory
 from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
@@ -254,11 +254,4 @@ def settings_of(header: ModelHeader, kind: type[SettingsT], source: str) -> Sett
     Raises:
         ModelError: a field is missing, unknown or not valid; names file and field.
     """
-    try:
-        return kind.model_validate(header.settings)
-    except ValidationError as cause:
-        first = cause.errors()[0]
-        place = ".".join(str(part) for part in ("settings", *first["loc"]))
-        raise ModelError(
-            f"{source}: field {place!r} is not valid", expected=first["msg"], got=first["input"]
-        ) from cause
+    return validated(kind, header.settings, source, ModelError, ("settings",))

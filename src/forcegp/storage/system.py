@@ -3,18 +3,16 @@
 The robot is saved as the tensors of `RobotModel`, bit for bit. Constraints that the user defines in Python
 (an `ImplicitSurface`, a subclass of `Constraint`) cannot be saved: the file has a placeholder, and reading
 takes them from a system that the caller passes.
-
-Robot, constraints and stabilization as records of a JSON file; surfaces are described as in scenes.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, get_args
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from torch import Tensor
 
 from forcegp.constraints import (
@@ -26,18 +24,27 @@ from forcegp.constraints import (
     SurfaceSchema,
 )
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.files import validated
 from forcegp.robot.model import RobotModel
 
-Point = tuple[float, float, float]
-POINTS = ("point", "other_point")
 SURFACES = get_args(get_args(SurfaceSchema)[0])
 """The surfaces that can be saved."""
+
+
+def _floats(value: object) -> object:
+    """Elements of arrays and tensors as numbers."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        return value
+    return tuple(x.item() if hasattr(x, "item") else x for x in value)
+
+
+Point = Annotated[tuple[float, float, float], BeforeValidator(_floats)]
 
 
 class Record(BaseModel):
     """Base of all records: frozen; unknown fields and numbers that are not finite are errors."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, from_attributes=True)
 
 
 class RobotRecord(Record):
@@ -52,13 +59,12 @@ class RobotRecord(Record):
     remarks: tuple[str, ...]
 
 
-class SurfaceContactRecord(Record):
-    """A point of the robot on a surface."""
+class ContactFields(Record):
+    """A point of the robot that may touch a surface, or a ball of some `radius` around it."""
 
-    type: Literal["surface_contact"] = "surface_contact"
     name: str
     frame: str
-    point: Point
+    point: Point = (0.0, 0.0, 0.0)
     surface: SurfaceSchema
     radius: float = 0.0
 
@@ -67,19 +73,30 @@ class SurfaceContactRecord(Record):
         return SurfaceContact(self.name, self.frame, self.point, self.surface, radius=self.radius)
 
 
-class PointConnectionRecord(Record):
-    """A point of the robot tied to another point."""
+class ConnectionFields(Record):
+    """Two points that coincide; without `other_frame`, the second is fixed in the world."""
 
-    type: Literal["point_connection"] = "point_connection"
     name: str
     frame: str
-    point: Point
-    other_frame: str | None
-    other_point: Point
+    point: Point = (0.0, 0.0, 0.0)
+    other_frame: str | None = None
+    other_point: Point = (0.0, 0.0, 0.0)
 
     def build(self) -> Constraint:
         """The constraint."""
         return PointConnection(self.name, self.frame, self.point, self.other_frame, self.other_point)
+
+
+class SurfaceContactRecord(ContactFields):
+    """A `SurfaceContact`."""
+
+    type: Literal["surface_contact"] = "surface_contact"
+
+
+class PointConnectionRecord(ConnectionFields):
+    """A `PointConnection`."""
+
+    type: Literal["point_connection"] = "point_connection"
 
 
 class UnsavedRecord(Record):
@@ -90,40 +107,25 @@ class UnsavedRecord(Record):
     described_by: str
 
 
-class BaumgarteRecord(Record):
-    """Constraint stabilization."""
-
-    natural_frequency: float
-    damping_ratio: float
+ConstraintRecord = SurfaceContactRecord | PointConnectionRecord | UnsavedRecord
 
 
 class SystemRecord(Record):
     """A `ConstrainedSystem` without the tensors of its robot."""
 
     robot: RobotRecord
-    contacts: tuple[
-        Annotated[SurfaceContactRecord | PointConnectionRecord | UnsavedRecord, Field(discriminator="type")],
-        ...,
-    ]
-    baumgarte: BaumgarteRecord | None
+    contacts: tuple[Annotated[ConstraintRecord, Field(discriminator="type")], ...]
+    baumgarte: Baumgarte | None
 
 
-def fields_of(value: Any, record: type[Record]) -> dict[str, Any]:
-    """The attributes of a value that a record keeps."""
-    names = [name for name in record.model_fields if name not in ("type", "surface")]
-    kept = {name: getattr(value, name) for name in names}
-    return kept | {name: tuple(map(float, kept[name])) for name in POINTS if name in kept}
-
-
-def contact_record(contact: Constraint) -> SurfaceContactRecord | PointConnectionRecord | UnsavedRecord:
-    """The record of a contact, or a placeholder if it is defined in Python code."""
+def _record(contact: Constraint) -> ConstraintRecord:
+    """The record of a constraint, or a placeholder if it is defined in Python code."""
     if type(contact) is PointConnection:
-        return PointConnectionRecord(**fields_of(contact, PointConnectionRecord))
-    if type(contact) is not SurfaceContact:
-        return UnsavedRecord(name=contact.name, described_by=type(contact).__name__)
-    if type(contact.surface) not in SURFACES:
-        return UnsavedRecord(name=contact.name, described_by=type(contact.surface).__name__)
-    return SurfaceContactRecord(**fields_of(contact, SurfaceContactRecord), surface=contact.surface)  # pyright: ignore[reportArgumentType]
+        return PointConnectionRecord.model_validate(contact)
+    described = contact.surface if type(contact) is SurfaceContact else contact
+    if type(described) not in SURFACES:
+        return UnsavedRecord(name=contact.name, described_by=type(described).__name__)
+    return SurfaceContactRecord.model_validate(contact)
 
 
 PREFIX = "system."
@@ -153,16 +155,14 @@ def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Te
     Returns:
         The JSON object, and detached copies of the tensors on the CPU.
     """
-    robot, rule = system.robot, system.baumgarte
     record = SystemRecord(
-        robot=RobotRecord(**fields_of(robot, RobotRecord)),
-        contacts=tuple(contact_record(contact) for contact in system.contacts),
-        baumgarte=None if rule is None else BaumgarteRecord(**fields_of(rule, BaumgarteRecord)),
+        robot=RobotRecord.model_validate(system.robot),
+        contacts=tuple(map(_record, system.contacts)),
+        baumgarte=system.baumgarte,
     )
     tensors = {
-        PREFIX + field.name: value.detach().to("cpu", copy=True).contiguous()
-        for field in dataclasses.fields(robot)
-        if isinstance(value := getattr(robot, field.name), Tensor)
+        PREFIX + name: getattr(system.robot, name).detach().to("cpu", copy=True).contiguous()
+        for name in robot_tensors(system.robot)
     }
     return record.model_dump(mode="json"), tensors
 
@@ -184,33 +184,16 @@ def unpack_system(
     Raises:
         ModelError: a field or tensor is missing or not valid, or a constraint that was not saved is needed.
     """
-    try:
-        record = SystemRecord.model_validate(dict(json))
-    except ValidationError as cause:
-        first = cause.errors()[0]
-        place = ".".join(str(part) for part in ("system", *first["loc"]))
-        if isinstance(reason := first.get("ctx", {}).get("error"), ForceGPError):
-            raise ModelError.at(f"{source}: field {place!r}", reason) from cause
-        raise ModelError(
-            f"{source}: field {place!r} is not valid", expected=first["msg"], got=first["input"]
-        ) from cause
+    record = validated(SystemRecord, dict(json), source, ModelError, ("system",))
     robot = _robot(record.robot, tensors, source)
-    rule = record.baumgarte
     try:
-        return ConstrainedSystem(
-            robot,
-            tuple(_contact(contact, source, fallback) for contact in record.contacts),
-            None if rule is None else Baumgarte(rule.natural_frequency, rule.damping_ratio),
-        )
+        contacts = tuple(_constraint(contact, fallback) for contact in record.contacts)
+        return ConstrainedSystem(robot, contacts, record.baumgarte)
     except ForceGPError as cause:
         raise ModelError.at(f"{source}: field 'system'", cause) from cause
 
 
-def _contact(
-    record: SurfaceContactRecord | PointConnectionRecord | UnsavedRecord,
-    source: str,
-    fallback: ConstrainedSystem | None,
-) -> Constraint:
+def _constraint(record: ConstraintRecord, fallback: ConstrainedSystem | None) -> Constraint:
     if not isinstance(record, UnsavedRecord):
         return record.build()
     if fallback is None:
