@@ -73,7 +73,7 @@ def test_errors_are_the_known_ones() -> None:
     assert found.noisy_mae == pytest.approx(float(noise.abs().mean()), abs=ROUNDING)
     assert found.noisy.rmse_by_joint == pytest.approx((noise**2).mean(0).sqrt().tolist(), abs=ROUNDING)
     assert (found.samples, found.kind, found.joint_names) == (3000, "known_error", data.joint_names)
-    for name in ("coverage_noisy", "coverage_clean", "calibration", "nlpd"):
+    for name in ("coverage_noisy", "coverage_clean", "uncertainty", "nlpd"):
         assert getattr(found, name) is None
 
 
@@ -93,8 +93,8 @@ def test_an_honest_uncertainty_is_calibrated() -> None:
     tolerance = 3.0 * math.sqrt(0.25 / 21000)
     assert found.coverage_noisy == pytest.approx(0.9545, abs=tolerance)
     assert found.coverage_clean == pytest.approx(0.9545, abs=tolerance)
-    assert found.calibration is not None
-    for level, share in found.calibration.items():
+    assert found.uncertainty is not None
+    for level, share in found.uncertainty.calibration.items():
         assert share == pytest.approx(float(level), abs=tolerance)
     total = 0.2**2 + NOISE_STD**2
     # Half the variance of a squared normal variable over 21000 of them.

@@ -1,9 +1,8 @@
 """How a log is prepared for learning: points selected, stretches held out, impacts left out, noise added.
 
-Farthest point sampling selects few points that cover the inputs of a log (section 5.3 of the paper).
-Neighbouring samples of a trajectory are almost the same point. Where training points are drawn from the
-same stretch as the test rows, as in the paper, the test error says how well a model interpolates; held-out
-stretches say how well it predicts motion that it has not seen.
+Farthest point sampling selects few points that cover the inputs of a log (section 5.3 of the paper). If
+training points come from the same stretch as the test rows, as in the paper, the test error measures
+interpolation; held-out stretches measure prediction of unseen motion.
 """
 
 from __future__ import annotations
@@ -62,8 +61,7 @@ def farthest_points(
         DataError: there are fewer than `count` distinct points, or no point `start`.
     """
     n = x.shape[0]
-    if not 0 < count <= n:
-        raise DataError(f"cannot select {count} of {n} points", expected=f"1 to {n}", got=count)
+    _check_count(count, n)
     if start is not None and not 0 <= start < n:
         raise DataError("there is no such starting point", expected=f"0 to {n - 1}", got=start)
     x = x.contiguous()
@@ -78,6 +76,11 @@ def farthest_points(
         if progress is not None:
             progress(number + 1)
     return torch.stack(chosen)
+
+
+def _check_count(count: int, n: int) -> None:
+    if not 0 < count <= n:
+        raise DataError(f"cannot select {count} of {n} points", expected=f"1 to {n}", got=count)
 
 
 def _distance(x: Tensor, point: Tensor) -> Tensor:
@@ -115,10 +118,7 @@ def select_points(
         return rows[farthest_points(standardized_inputs(data)[rows], count, progress=progress)]
     if method not in ("even", "random"):
         raise UnknownNameError("method of selection", method, ["farthest", "even", "random"])
-    if not 0 < count <= len(rows):
-        raise DataError(
-            f"cannot select {count} of {len(rows)} points", expected=f"1 to {len(rows)}", got=count
-        )
+    _check_count(count, len(rows))
     if method == "even":
         return rows[torch.linspace(0, len(rows) - 1, count, dtype=torch.float64).round().long()]
     order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
@@ -175,15 +175,12 @@ def split_by_stretches(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Split:
-    """Hold out whole stretches of motion, and select training points from the rest only.
-
-    Each trajectory is cut into stretches of equal duration, as close to `stretch` as fits; of all of
-    them, a fraction is drawn at random.
+    """Hold out stretches of motion drawn at random, and select training points from the rest only.
 
     Args:
         data: a log in order of time.
         count: how many training points.
-        stretch: duration of a held-out stretch [s].
+        stretch: approximate duration of the equal stretches that each trajectory is cut into [s].
         fraction: part of the stretches that is held out.
         margin: time beside each held-out stretch from which no training point is taken either [s].
         method: see `select_points`.
@@ -251,9 +248,6 @@ def without_marked_impacts(data: Dataset) -> Dataset:
 
     Args:
         data: a log in order of time, or a part of one.
-
-    Returns:
-        The log without the marked rows, with a step in its provenance if there are any.
     """
     marked = torch.zeros(len(data), dtype=torch.bool, device=data.t.device)
     for mask in data.contact_extras.get(IMPACT, {}).values():

@@ -13,7 +13,6 @@ from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines
 from forcegp.evaluation.predicted import (
-    CHUNK_STATES,
     MultiplierScore,
     Predicted,
     Progress,
@@ -55,8 +54,7 @@ class Evaluation:
         predictors: errors by joint of the model and of the trivial predictors.
         verdicts: the model against each trivial predictor; empty if there are too few samples.
         multipliers: λ against the logged one, for models of forces and logs that contain it.
-        sensed: the same with the log's force sensor as a measurement at each state, for models that were
-            fitted to that sensor.
+        sensed: the same with the log's force sensor as a measurement at each state, for models fitted to it.
     """
 
     kind: str
@@ -98,11 +96,6 @@ class Evaluation:
     def coverage_clean(self) -> float | None:
         """±2σ coverage of noise-free accelerations."""
         return None if self.uncertainty is None else self.uncertainty.coverage_clean
-
-    @property
-    def calibration(self) -> dict[str, float] | None:
-        """Coverage of the central interval of each level."""
-        return None if self.uncertainty is None else self.uncertainty.calibration
 
     @property
     def nlpd(self) -> float | None:
@@ -197,8 +190,8 @@ def evaluate(
         seconds_per_state=predicted.seconds / len(data),
         predictors=scores,
         verdicts=verdicts(scores, data.joint_names) if scores else (),
-        multipliers=multiplier_scores(model, data, CHUNK_STATES) if model.force_field() else (),
-        sensed=sensed_scores(model, data, CHUNK_STATES),
+        multipliers=multiplier_scores(model, data) if model.force_field() else (),
+        sensed=sensed_scores(model, data),
     )
 
 

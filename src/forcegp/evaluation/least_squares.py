@@ -10,7 +10,7 @@ projected onto the directions in which the constraint force does not act.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -53,16 +53,18 @@ class LeastSquares:
     @torch.no_grad()
     def predict(self, data: Dataset) -> Tensor:
         """Accelerations `(n, nq)` under the logged torques, on the constraint."""
-        parts = (data[i : i + CHUNK_STATES] for i in range(0, len(data), CHUNK_STATES))
-        return torch.cat([self._predict(part) for part in parts])
-
-    def _predict(self, data: Dataset) -> Tensor:
+        if len(data) > CHUNK_STATES:
+            return torch.cat([self.predict(part) for part in _chunks(data)])
         eom = self.system.equations(data.q, data.qd, data.active(self.system.contact_names))
         return eom.acceleration(eom.Q_K + data.tau - self.losses(data.qd))
 
     def losses(self, qd: Tensor) -> Tensor:
         """Torque that the identified friction and offsets take away `(n, nq)`, at velocities `(n, nq)`."""
         return (_friction_columns(self.system.robot, qd) @ self.friction[:, None])[..., 0]
+
+
+def _chunks(data: Dataset) -> Iterator[Dataset]:
+    return (data[i : i + CHUNK_STATES] for i in range(0, len(data), CHUNK_STATES))
 
 
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
@@ -115,8 +117,8 @@ def _normal_equations(
     """WᵀW `(nq, p, p)`, Wᵀy `(nq, p)` and yᵀy `(nq,)` by joint, with unknowns scaled by the prior."""
     p, nq = len(prior), train.nq
     G, g, y2 = prior.new_zeros(nq, p, p), prior.new_zeros(nq, p), prior.new_zeros(nq)
-    for i in range(0, len(train), CHUNK_STATES):
-        W, y = _rows(system, train[i : i + CHUNK_STATES])
+    for part in _chunks(train):
+        W, y = _rows(system, part)
         W = (W * prior).transpose(0, 1)
         G += W.mT @ W
         g += (W.mT @ y.mT[..., None])[..., 0]
@@ -187,9 +189,8 @@ def _slopes(theta: Tensor) -> Tensor:
     """∂π/∂θ `(nq, 10, 10)` in closed form: J = U Uᵀ, and every entry of U depends on α and one more."""
     scale = theta[:, 0].exp()
     dU = theta.new_zeros(len(theta), 10, 4, 4)
-    for k, (i, j) in enumerate(
-        ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)), start=1
-    ):
+    places = (0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)
+    for k, (i, j) in enumerate(places, start=1):
         dU[:, k, i, j] = scale * (theta[:, k].exp() if i == j else 1.0)
     s12, s23, s13, *t = (scale * theta[:, k] for k in range(4, 10))
     for k, value in (((0, 1), s12), ((1, 2), s23), ((0, 2), s13), *(((i, 3), t[i]) for i in range(3))):
@@ -234,15 +235,15 @@ def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
         The mean, the robot file alone, and least squares.
     """
     mean, nothing = train.qdd.mean(0), train.qdd.new_zeros(3 * train.nq)
-    file, identified = LeastSquares(system, nothing), identify_rigid(system, train)
-    predictors: dict[str, tuple[ConstrainedSystem, Callable[[Dataset], Tensor]]] = {
-        "mean": (system, lambda data: mean.expand_as(data.qdd)),
-        "robot file": (system, file.predict),
-        "least squares": (identified.system, identified.predict),
-    }
+    identified = identify_rigid(system, train)
+
+    def baseline(name: str, mechanics: ConstrainedSystem, predict: Callable[[Dataset], Tensor]) -> Baseline:
+        return Baseline(name, mechanics, predict, ((predict(train) - train.qdd) ** 2).mean(0).sqrt())
+
     return [
-        Baseline(name, mechanics, predict, ((predict(train) - train.qdd) ** 2).mean(0).sqrt())
-        for name, (mechanics, predict) in predictors.items()
+        baseline("mean", system, lambda data: mean.expand_as(data.qdd)),
+        baseline("robot file", system, LeastSquares(system, nothing).predict),
+        baseline("least squares", identified.system, identified.predict),
     ]
 
 

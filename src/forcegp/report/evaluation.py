@@ -58,7 +58,7 @@ def write_evaluation(
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
-    pictures += [draw_calibration(scores)] if scores.calibration else []
+    pictures += [draw_calibration(scores)] if scores.uncertainty else []
     for name, picture in zip(PLOTS, pictures, strict=False):
         write_text(folder / name, picture.svg)
     write_text(folder / WINDOW, window.to_json())
@@ -111,7 +111,8 @@ def _blocks(window: WindowData, pictures: list[Picture]) -> list[PictureBlock]:
 
 def draw_calibration(evaluation: Evaluation) -> Picture:
     """Coverage over nominal probability."""
-    levels = {float(level): share for level, share in (evaluation.calibration or {}).items()}
+    shares = evaluation.uncertainty.calibration if evaluation.uncertainty else {}
+    levels = {float(level): share for level, share in shares.items()}
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
