@@ -29,7 +29,7 @@ from reproduction.results import PAPER_KERNELS, SPLITS, Results
 from reproduction.stages import Say, Stage, run_stages, version_of, write_data
 from reproduction.task import SCENE, Task, simulate_task, summary_of, task_stages
 from reproduction.task_space import TaskSpaceData, make_task_space
-from reproduction.trajectories import make_rollouts
+from reproduction.trajectories import make_rollouts, together
 
 PAGE, RESULTS, MARKDOWN, VIEW = "report.html", "results.json", "results.md", "view.html"
 PACKAGES = ("forcegp", "torch", "numpy", "scipy", "pybullet", "mujoco", "matplotlib")
@@ -112,7 +112,7 @@ class Plan:
             task_space=self.task_space.data(TaskSpaceData),
             windows=[stage.data(report.WindowData) for stage in self.windows],
             identification=together_of,
-            rollouts=report.together([stage.data(report.RolloutData) for stage in self.rollouts]),
+            rollouts=together([stage.data(report.RolloutData) for stage in self.rollouts]),
         )
 
 

@@ -39,9 +39,9 @@ def html_table(
     return f"<div>{''.join(parts)}</div>"
 
 
-def text(value: object) -> str:
-    """A value in a few characters."""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+def text(value: object, digits: int = 4) -> str:
+    """A value as text: floats with significant digits."""
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def _row(cells: Sequence[str], tag: str) -> str:

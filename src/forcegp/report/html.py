@@ -1,13 +1,7 @@
-"""Pages as single HTML files: templates, style and plots in one file that fetches nothing.
-
-Tables as rows of text, for pages and for Markdown.
-
-Numbers in result files: rounded series, and parts of a file that reject unknown fields.
-"""
+"""Pages as single HTML files that fetch nothing: tables, blocks of plots, and series in result files."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jinja2
@@ -15,6 +9,7 @@ import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
+from forcegp.notebook import text
 from forcegp.report.style import Picture
 
 Series = list[float]
@@ -36,11 +31,6 @@ def series(values: Tensor) -> Series:
 def columns(values: Tensor) -> list[Series]:
     """A tensor `(n, d)` as d series."""
     return [series(column) for column in values.unbind(-1)]
-
-
-def matrix(values: Tensor) -> list[Series]:
-    """A tensor `(n, d)` as n rows."""
-    return [series(row) for row in values.unbind(0)]
 
 
 def as_tensor(values: Series | list[Series]) -> Tensor:
@@ -77,21 +67,9 @@ class Table:
         return "\n".join([f"{self.caption}:", "", line(self.head), rule, *map(line, self.rows)])
 
 
-def number(values: Sequence[float | int | None], digits: int = 3) -> str:
-    """The mean of values over seeds, with half their range if there are several."""
-    present = [float(v) for v in values if v is not None]
-    if not present:
-        return NONE
-    mean = sum(present) / len(present)
-    plain = 1e-3 <= abs(mean) < 1e4 or mean == 0.0
-    text = f"{mean:.{digits}f}" if plain else f"{mean:.1e}"
-    spread = (max(present) - min(present)) / 2.0
-    return text if len(present) == 1 or not plain or mean == 0.0 else f"{text} ± {spread:.{digits}f}"
-
-
 def cell(value: object, digits: int = 4) -> str:
     """One value as text: floats with significant digits, a dash for nothing."""
-    return f"{value:.{digits}g}" if isinstance(value, float) else NONE if value is None else str(value)
+    return NONE if value is None else text(value, digits)
 
 
 @dataclass(frozen=True)
@@ -109,28 +87,6 @@ class PictureBlock:
     caption: str
     pictures: tuple[Picture, ...]
     source: str
-
-
-@dataclass(frozen=True)
-class Statement:
-    """A sentence computed from results.
-
-    Attributes:
-        topic: a few words.
-        agrees: whether the claim holds; `None` if none is made.
-        text: the sentence, with its numbers.
-        words: verdict on a claim that holds, and on one that does not.
-    """
-
-    topic: str
-    agrees: bool | None
-    text: str
-    words: tuple[str, str] = ("confirmed", "differs")
-
-    @property
-    def verdict(self) -> str | None:
-        """The verdict, or `None` if no claim is made."""
-        return None if self.agrees is None else self.words[0 if self.agrees else 1]
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -140,42 +139,6 @@ def rollout_data(comparison: Comparison, calibration: Comparison | None = None) 
         bodies=joints.shape[1],
         films=films,
     )
-
-
-def with_bands(paths: RolloutData, bands: RolloutData) -> RolloutData:
-    """Trajectories of mean functions with the bands of another, cheaper comparison of the same models.
-
-    Bands cost one trajectory per sample, so they may cover fewer starts and a shorter time.
-
-    Args:
-        paths: tip errors, drift and multiplier over the whole time.
-        bands: of the models that have function samples, from the same first start.
-    """
-    sampled = {band.model: band for band in bands.models}
-    models = [_with_bands(p, sampled[p.model]) if p.model in sampled else p for p in paths.models]
-    seconds = {"band_starts": bands.starts, "band_seconds": bands.band_seconds}
-    return paths.model_copy(update={"models": models, **seconds})
-
-
-def together(parts: Sequence[RolloutData]) -> RolloutData:
-    """Trajectories of several models, from one comparison each with the same log.
-
-    Args:
-        parts: at least one; each from the same starts.
-    """
-    # Models without function samples have no bands, whose duration is then that of the trajectories.
-    whole = min(parts, key=lambda part: part.band_seconds)
-    models = [model for part in parts for model in part.models]
-    films = [parts[0].films[0], *(film for part in parts for film in part.films[1:])]
-    return whole.model_copy(update={"models": models, "films": films})
-
-
-def _with_bands(path: ModelPath, band: ModelPath) -> ModelPath:
-    drifts = [x.worst_drift for x in (path, band) if x.worst_drift is not None]
-    times = [x.diverged_at for x in (path, band) if x.diverged_at is not None]
-    names = ("tip_bands", "multiplier_band", "lost", "coverage", "inflation", "calibrated_coverage")
-    worst = {"worst_drift": max(drifts, default=None), "diverged_at": min(times, default=None)}
-    return path.model_copy(update={name: getattr(band, name) for name in names} | worst)
 
 
 def _model_path(

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 COLOURS = {
@@ -21,7 +20,6 @@ COLOURS = {
     "sgp-contact": "#007a5e",
 }
 """One colour per model, distinguishable by colour-blind readers and in print."""
-MARKERS = {"analytical": "x", "nn": "v", "gp": "s", "sgp-zero": "o", "sgp-mean": "D", "sgp-contact": "^"}
 DASHES = {"nn-30-20": (1.0, 1.2), "nn-200x4": (5.0, 1.5, 1.0, 1.5)}
 """Dashes and gaps, in line widths, of the networks that share the first one's colour."""
 KINDS = {
@@ -131,9 +129,3 @@ def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, t
         paint(figure)
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return Picture(buffer.getvalue(), alt, title)
-
-
-def shade(axes: Axes, spans: list[tuple[float, float]]) -> None:
-    """Shade spans of time behind the curves."""
-    for first, last in spans:
-        axes.axvspan(first, last, color="#f1ead2", zorder=0, linewidth=0)
