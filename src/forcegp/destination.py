@@ -27,19 +27,12 @@ def check_destination(
     Args:
         path: what will be written.
         folder: whether that is a folder, which may replace an empty one or one of nothing but `own_files`.
-        own_files: names of what such a folder holds, with `*` for any letters; with none, any folder may be
-            replaced.
+        own_files: patterns of the names in such a folder; with none, any folder may be replaced.
         needed_bytes: room that the result takes on the disk [bytes].
 
     Raises:
         DestinationError: a file is to replace a folder or the reverse, the folder holds other files, or the
             place cannot be written or is full.
-
-    Example:
-        >>> check_destination("/proc/model", folder=True)
-        Traceback (most recent call last):
-        forcegp.errors.DestinationError: /proc/model: cannot be written
-          ...
     """
     target = Path(path)
     with writable(target):
@@ -50,11 +43,7 @@ def check_destination(
 
 
 def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
-    """Write a result; if that fails, write it to another place, which the error names.
-
-    Args:
-        write: writes the result to a path, such as `fit.save`.
-        path: where it belongs.
+    """Write a result by `write(path)`; if that fails, write it to another place, which the error names.
 
     Raises:
         DestinationError: the place cannot be written; the message says where the result is instead.

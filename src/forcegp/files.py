@@ -113,10 +113,7 @@ def written_folder(path: str | Path) -> Iterator[Path]:
     """A temporary folder; its files move into the target folder when the block ends without an error.
 
     Each file replaces its namesake in one step, in the order in which they were written, so that the last one
-    is there only with the others; then what else was in the folder is removed.
-
-    Args:
-        path: the folder to write; missing parents are made. A symbolic link is written through.
+    is there only with the others; then what else was in the folder is removed. Symbolic links are followed.
 
     Yields:
         The folder to write the files to.
@@ -129,9 +126,8 @@ def written_folder(path: str | Path) -> Iterator[Path]:
         >>> with tempfile.TemporaryDirectory() as parent:
         ...     with written_folder(f"{parent}/run") as temporary:
         ...         _ = (temporary / "a.txt").write_text("one")
-        ...         _ = (temporary / "b.txt").write_text("two")
-        ...     sorted(os.listdir(f"{parent}/run"))
-        ['a.txt', 'b.txt']
+        ...     os.listdir(f"{parent}/run")
+        ['a.txt']
     """
     target = Path(path).resolve() if Path(path).is_symlink() else Path(path)
     with _temporary(target, folder=True, mode=0o777) as temporary:
@@ -162,10 +158,7 @@ def write_json(path: str | Path, value: object) -> None:
 class Header(BaseModel):
     """A frozen, versioned JSON header; a subclass names its `FORMAT` and `VERSION` and adds fields.
 
-    Larger text than `MAX_BYTES` is not read; a subclass that holds series of numbers may raise it.
-
-    A field that the class does not know is an error: a file that says more than we understand is
-    not read as if it said less.
+    Unknown fields are errors, and text of more than `MAX_BYTES` is not read.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -183,13 +176,8 @@ class Header(BaseModel):
     def from_json(cls: type[H], text: str | bytes, source: str, error: type[ForceGPError]) -> H:
         """Read a header, checking its format, version and fields.
 
-        Args:
-            text: the JSON text.
-            source: name of the file, for the message.
-            error: the class of error to raise.
-
         Raises:
-            ForceGPError: of class `error`; the message names the file and the field.
+            ForceGPError: of class `error`; the message names the file (`source`) and the field.
         """
         fields = _json_object(text, source, error, cls.MAX_BYTES)
         name, version = fields.pop("format", None), fields.pop("version", None)
@@ -218,13 +206,8 @@ def validated(
     Args:
         kind: the model.
         fields: what was read.
-        source: name of the file, for the message.
-        error: the class of error to raise.
-        place: keys in the file that lead to the fields.
-        what: the kind of keys, in words.
-
-    Raises:
-        ForceGPError: of class `error`; the message names the file and the first wrong field.
+        source, place, what: the file, the keys that lead to the fields, and their kind, for the message.
+        error: the class of error to raise; it names the file and the first wrong field.
     """
     try:
         return kind.model_validate(fields)

@@ -15,16 +15,12 @@ _FIRST = "text-align:left;padding:.15em .7em"
 def html_table(
     title: str, head: Sequence[str] = (), rows: Sequence[Sequence[object]] = (), notes: Sequence[str] = ()
 ) -> str:
-    """A titled table as HTML; numbers are shown with four significant digits.
+    """A titled table as HTML without scripts; numbers are shown with four significant digits.
 
     Args:
-        title: one line above.
+        title, notes: lines above and below.
         head: names of the columns; the first column names the rows.
         rows: cells.
-        notes: lines below.
-
-    Returns:
-        HTML without scripts or references.
 
     Example:
         >>> html_table("a <b>")

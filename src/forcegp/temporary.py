@@ -1,8 +1,7 @@
-"""Files and folders under construction: hidden, locked while their writer lives, swept once it is dead.
+"""Files and folders under construction: hidden, locked while their writer lives, deleted once it is dead.
 
 A name is `.forcegp-new-<12 hex digits>-<name of the target>`. Its writer holds a lock (flock) on it, which
-ends with the process however it ends, so that the next writer of the same target knows litter from work.
-Where there is no flock (Windows, some network file systems) litter stays; no reader looks at it.
+ends with the process. Without flock (Windows, some network file systems) such files stay unread.
 """
 
 from __future__ import annotations
@@ -53,16 +52,7 @@ def leftovers_of(target: Path) -> list[Path]:
 
 
 class Temporary:
-    """An empty file or folder under construction, locked until `close`.
-
-    Args:
-        target: what it will replace; its parent folder exists.
-        folder: whether it is a folder.
-        mode: permissions, of which the umask takes away.
-
-    Raises:
-        OSError: it cannot be made.
-    """
+    """An empty file or folder under construction beside an existing target, locked until `close`."""
 
     def __init__(self, target: Path, *, folder: bool, mode: int) -> None:
         while True:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from forcegp.cli.common import (
-    AsJson,
-    Differentiate,
-    RobotName,
-    SceneOrNone,
     check_apart,
     check_data_destination,
     check_robot_named,
@@ -20,6 +17,7 @@ from forcegp.cli.common import (
     show,
     system_of,
 )
+from forcegp.cli.options import AsJson, Differentiate, RobotName, SceneOrNone
 
 if TYPE_CHECKING:
     from forcegp.checks import Report
@@ -72,23 +70,22 @@ def import_(
     from forcegp.logs import import_log
 
     check_robot_named(scene, robot)
-    if guess is not None:
-        check_destination(guess)
-        check_apart(guess, log)
-        show(_guess(log, system_of(scene, robot), guess), as_json)
-        return
-    if out is None or out.suffix.lower() != ".parquet":
+    place = guess or out
+    if place is None or (guess is None and place.suffix.lower() != ".parquet"):
         raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
-    check_destination(out)
-    check_apart(out, log)
+    check_destination(place)
+    check_apart(place, log)
     system = system_of(scene, robot)
+    if guess is not None:
+        show(_guess(log, system, guess), as_json)
+        return
     with progress_bar(f"reading {log.name}", 1) as advance:
         imported = import_log(log, system, mapping, progress=advance)
-    write_or_keep(imported.data.write, out)
+    write_or_keep(imported.data.write, place)
     result = _json(imported) if as_json else _summary(imported)
     if fit_surface is not None:
         result |= _surfaces(imported, system, fit_surface, _tip_radius(tip_radius))
-    show(result | {"file": str(out)}, as_json)
+    show(result | {"file": str(place)}, as_json)
 
 
 def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]:
@@ -97,7 +94,7 @@ def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]
     from forcegp.logs.guess import guess_mapping
 
     with progress_bar(f"looking at {log.name}", 1) as advance:
-        guessed = guess_mapping(log, system, progress=lambda done, total: advance(done, total))
+        guessed = guess_mapping(log, system, progress=advance)
     write_or_keep(lambda path: write_text(path, guessed.toml), out)
     doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
     return {"mapping": str(out), **doubts, "next": f"check {out}, then import with --mapping {out}"}
@@ -116,11 +113,7 @@ def _summary(imported: Imported) -> dict[str, object]:
 
 
 def _tip_radius(text: str | None) -> float | Literal["fit"] | None:
-    """The radius of the tip as it was given.
-
-    Raises:
-        ForceGPError: neither a length nor `fit`.
-    """
+    """The radius of the tip as it was given."""
     from forcegp.errors import ForceGPError
 
     if text is None or text == "fit":
@@ -236,12 +229,8 @@ def _print(report: Report) -> None:
         for heading in ("severity", "kind", "rows", "finding and remedy"):
             table.add_column(heading, no_wrap=heading in ("severity", "kind"), overflow="fold")
         for finding in report.findings:
-            whole = finding.intervals == ((0, report.samples),)
-            rows = (
-                "all"
-                if whole
-                else describe(finding.intervals, most=2).removeprefix("rows ").removeprefix("row ")
-            )
+            rows = re.sub("^rows? ", "", describe(finding.intervals, most=2))
+            rows = "all" if finding.intervals == ((0, report.samples),) else rows
             # Joint and parameter names may hold brackets, which are no markup.
             body = Text(f"{finding.message}\n").append(f"→ {finding.remedy}", style="dim")
             kinds = "\nor ".join(finding.kinds)
@@ -289,7 +278,7 @@ def select(
     check_data_destination(out, log)
     if rest is not None:
         check_data_destination(rest, log, out)
-    whole = read_data(log, differentiate)
+    whole = read_data(log, differentiate=differentiate)
     data = whole if keep_impacts else without_marked_impacts(whole)
     held_out = {"stretch": stretch, "fraction": fraction, "margin": margin}
     with progress_bar("selecting points", count) as progress:

@@ -7,17 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import (
-    AsJson,
-    DataFile,
-    ModelFile,
-    check_data_destination,
-    data_of_robot,
-    progress_bar,
-    read_data,
-    show,
-    warn_beyond,
-)
+from forcegp.cli.common import check_data_destination, progress_bar, read_data, show, warn_beyond
+from forcegp.cli.options import AsJson, DataFile, ModelFile
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -74,7 +65,7 @@ def predict(
 
     check_data_destination(out, data)
     regression = load_model(model)
-    test = data_of_robot(read_data(data), regression.system.robot)
+    test = read_data(data, regression.system.robot)
     if sensor and quantity != "multiplier":
         raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
     with progress_bar(f"predicting {quantity}", len(test)) as progress:
@@ -93,11 +84,7 @@ def predict(
 
 
 def _predicted(model: Predictor, part: Dataset, quantity: str, noise: bool, sensor: bool) -> Moments:
-    """Mean and standard deviation of a quantity at some states.
-
-    Raises:
-        ModelError: the model learned no noise, or was not fitted to a sensor.
-    """
+    """Mean and standard deviation of a quantity at some states."""
     from forcegp.errors import ModelError
     from forcegp.models.sensed import force_from_sensor
     from forcegp.models.structured_fit import StructuredFit
@@ -107,9 +94,11 @@ def _predicted(model: Predictor, part: Dataset, quantity: str, noise: bool, sens
     if sensor:
         mean, std = force_from_sensor(model, part)  # pyright: ignore[reportArgumentType]
         return mean[:, None], std[:, None]
-    options = {"noise": True} if noise else {}
-    active = part.active(model.system.contact_names)
-    prediction = model.predict(part.q, part.qd, part.tau, quantity, active=active, **options)
+    states, active = (part.q, part.qd, part.tau), part.active(model.system.contact_names)
+    if noise and isinstance(model, StructuredFit):
+        prediction = model.predict(*states, quantity, active=active, noise=True)
+    else:
+        prediction = model.predict(*states, quantity, active=active)
     return prediction.mean, prediction.std
 
 

@@ -9,17 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import (
-    AsJson,
-    DataFile,
-    ModelFile,
-    SceneName,
-    check_data_destination,
-    data_of_robot,
-    progress_bar,
-    read_data,
-    show,
-)
+from forcegp.cli.common import check_data_destination, progress_bar, read_data, show, trajectory_from
+from forcegp.cli.options import AsJson, DataFile, ModelFile, SceneName
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -71,26 +62,26 @@ def rollout(
     from forcegp.destination import check_destination, write_or_keep
     from forcegp.files import written_folder
     from forcegp.models.load import load_model
-    from forcegp.rollout import RolloutOptions
+    from forcegp.report.rollout_data import rollout_data
+    from forcegp.report.rollouts import write_rollouts
+    from forcegp.rollout import RolloutOptions, beside_log
     from forcegp.rollout.inputs import sampling_period
 
     check_destination(out, folder=True, own_files=["rollout*", "*.svg", "*.png"])
     regression = load_model(model)
-    log = _stretch(data_of_robot(read_data(data), regression.system.robot), start, duration)
+    log = _stretch(read_data(data, regression.system.robot), start, duration)
     _say_contact(log, unilateral)
     dt = sampling_period(log)
     options = RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
     path = _roll(regression, log, options, samples, seed)
     rolled = _as_data(path, log, dt)
-    title, step = (
-        f"{regression.kind} rolled out on {data}",
-        f"rolled out by the model in {model} from row {start}",
-    )
+    compared = rollout_data(beside_log(regression.kind, path, log, dt))
+    step = f"rolled out by the model in {model} from row {start}"
 
     def write(folder: Path) -> None:
         with written_folder(folder) as temporary:
             rolled.with_step(step).write(temporary / "rollout.parquet")
-            _write_page(temporary, title, regression.kind, path, log, dt)
+            write_rollouts(temporary, f"{regression.kind} rolled out on {data}", compared)
 
     write_or_keep(write, out)
     written = {"page": str(out / "rollout.html"), "file": str(out / "rollout.parquet")}
@@ -112,14 +103,6 @@ def _roll(regression: FittedModel, log: Dataset, options: RolloutOptions, sample
             options=options,
             progress=progress,
         )
-
-
-def _write_page(out: Path, title: str, name: str, path: Rollout, log: Dataset, dt: float) -> None:
-    from forcegp.report.rollout_data import rollout_data
-    from forcegp.report.rollouts import write_rollouts
-    from forcegp.rollout import beside_log
-
-    write_rollouts(out, title, rollout_data(beside_log(name, path, log, dt)))
 
 
 def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:
@@ -159,12 +142,7 @@ def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
     from forcegp.data.derivative import UNIFORM_TOLERANCE
     from forcegp.errors import DataError
 
-    if not data.header.ordered:
-        raise DataError("a rollout needs a log in order of time", got="points in order of selection")
-    if start >= len(data) - 1:
-        raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 2}", got=start)
-    rest = data[start:]
-    stretch = rest[rest.segment == rest.segment[0]]
+    stretch = trajectory_from(data, start, "rollout")
     if duration is not None:
         stretch = stretch[stretch.t <= stretch.t[0] + duration * (1.0 + 1e-9)]
     steps = stretch.t.diff()
@@ -192,21 +170,15 @@ def _spread(q: Tensor) -> Tensor:
 def _as_data(path: Rollout, log: Dataset, dt: float) -> Dataset:
     """The rolled-out motion as a data set beside the log that it started from, up to where it diverged."""
     length = len(path.t) if not path.diverged else round(path.diverged[0].t / dt) + 1
-    spread = _spread(path.samples.q) if path.samples is not None and path.samples.rows > 1 else None
-    if spread is not None:
-        length = min(length, len(spread))
-    extras = {"q_logged": log.q[:length], "qd_logged": log.qd[:length]}
-    if spread is not None:
-        extras["q_std"] = spread[:length]
-    rows = slice(0, length)
-    names = path.system.contact_names
+    extras = {"q_logged": log.q, "qd_logged": log.qd}
+    if path.samples is not None and path.samples.rows > 1:
+        extras["q_std"] = _spread(path.samples.q)
+        length = min(length, len(extras["q_std"]))
+    closed = zip(path.system.contact_names, path.active[:length].unbind(-1), strict=True)
     return log[:length].replace(
-        q=path.q[rows],
-        qd=path.qd[rows],
-        qdd=path.qdd[rows],
-        tau=path.tau[rows],
-        contact={name: path.active[rows, i] for i, name in enumerate(names)},
-        extras=extras,
+        **{name: getattr(path, name)[:length] for name in ("q", "qd", "qdd", "tau")},
+        contact=dict(closed),
+        extras={name: values[:length] for name, values in extras.items()},
         contact_extras={},
     )
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, data_of_robot, progress_bar, read_data, show
+from forcegp.cli.common import progress_bar, read_data, show, trajectory_from
+from forcegp.cli.options import AsJson
 
 if TYPE_CHECKING:
     from forcegp.constraints import ConstrainedSystem
     from forcegp.data import Dataset
     from forcegp.models.base import FittedModel
-    from forcegp.view.motion import Motion
     from forcegp.view.shapes import Shape
 
 Target = Annotated[
@@ -67,6 +67,7 @@ def view(
     """
     from forcegp.destination import check_destination
     from forcegp.errors import ParameterError
+    from forcegp.view.motion import at_rest, of_log, sampled_rollout, with_rollout
     from forcegp.view.page import serve, view_page, write_view
 
     if out is not None:
@@ -74,10 +75,16 @@ def view(
     if data is not None and rollout is not None:
         raise ParameterError("--data and --rollout exclude each other", hint="name one motion to look at")
     system, model, shapes = _target(target)
-    motion = _motion(system, model, data or rollout, start, seconds)
-    if model is not None and data is not None:
-        motion = _with_paths(motion, model, _stretch(data, system, start, seconds), samples, horizon)
-    title = f"{target}: {data or rollout or 'at rest'}"
+    log = data or rollout
+    motion = at_rest(system)
+    if log is not None:
+        stretch = _stretch(log, system, start, seconds)
+        motion = of_log(system, stretch, model)
+        if model is not None and data is not None:
+            with progress_bar("rolling out", 1) as advance:
+                motion = with_rollout(motion, sampled_rollout(model, stretch, samples, horizon))
+                advance(1)
+    title = f"{target}: {log or 'at rest'}"
     if out is None:
         page = view_page(motion, shapes, title)
         serve(page, port, say=lambda address: typer.echo(f"{title}\nopen {address}, end with Ctrl-C"))
@@ -103,42 +110,10 @@ def _target(target: str) -> tuple[ConstrainedSystem, FittedModel | None, list[Sh
     return system, None, shapes_of(system.robot, named if named in BUNDLED else scene.folder / named)
 
 
-def _motion(
-    system: ConstrainedSystem, model: FittedModel | None, log: Path | None, start: int, seconds: float
-) -> Motion:
-    from forcegp.view.motion import at_rest, of_log
-
-    if log is None:
-        return at_rest(system)
-    return of_log(system, _stretch(log, system, start, seconds), model)
-
-
 def _stretch(log: Path, system: ConstrainedSystem, start: int, seconds: float) -> Dataset:
     """The rows of one trajectory from `start` on, up to its first gap, and as long as asked for."""
-    from forcegp.errors import DataError
-
-    data = data_of_robot(read_data(log), system.robot)
-    if not data.header.ordered:
-        raise DataError(
-            "a view needs a log in the order of time",
-            got="points in the order of their selection",
-            hint="pass the log that they were selected from",
-        )
-    if start >= len(data):
-        raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 1}", got=start)
-    rest = data[start:]
-    stretch = rest[rest.segment == rest.segment[0]]
+    stretch = trajectory_from(read_data(log, system.robot), start, "view")
     steps = stretch.t.diff()
     gaps = (steps > 1.5 * steps.median()).nonzero() if len(steps) > 0 else steps  # left by `forcegp select`
     stretch = stretch[: int(gaps[0]) + 1] if len(gaps) > 0 else stretch
     return stretch[stretch.t <= stretch.t[0] + seconds]
-
-
-def _with_paths(motion: Motion, model: FittedModel, data: Dataset, samples: int, horizon: float) -> Motion:
-    """The motion with the paths that the model predicts from its first state."""
-    from forcegp.view.motion import sampled_rollout, with_rollout
-
-    with progress_bar("rolling out", 1) as advance:
-        path = sampled_rollout(model, data, samples, horizon)
-        advance(1)
-    return with_rollout(motion, path)

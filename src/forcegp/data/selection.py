@@ -104,13 +104,12 @@ def select_points(
         count: how many points.
         method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in their order), or
             `"random"` for comparison. Farthest points favour outliers, which a measured log has.
-        seed: of the random choice; farthest points need none.
+        seed: of the random choice.
         candidates: row numbers to choose from; default all.
         progress: called with the number of points chosen so far.
 
     Raises:
-        UnknownNameError: no such method.
-        DataError: there are fewer distinct points.
+        ForceGPError: no such method, or fewer distinct points.
     """
     rows = torch.arange(len(data), device=data.device) if candidates is None else candidates
     if method == "farthest":
@@ -244,11 +243,7 @@ IMPACT = "impact"
 
 
 def without_marked_impacts(data: Dataset) -> Dataset:
-    """The rows that no mask `impact.<contact>` marks; all rows of a log without masks.
-
-    Args:
-        data: a log in order of time, or a part of one.
-    """
+    """The rows that no mask `impact.<contact>` marks; all rows of a log without masks."""
     marked = torch.zeros(len(data), dtype=torch.bool, device=data.t.device)
     for mask in data.contact_extras.get(IMPACT, {}).values():
         marked |= mask > 0.0

@@ -1,7 +1,4 @@
-"""Named numeric columns on disk: Parquet with a JSON header, and CSV.
-
-This file knows files and columns; what the columns mean is in `columns.py`.
-"""
+"""Named numeric columns on disk: Parquet with a JSON header, and CSV."""
 
 from __future__ import annotations
 
@@ -139,13 +136,10 @@ def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], Data
 
 
 def _check_count(file: Path, columns: int) -> None:
+    most = f"at most {limits.COLUMNS}"
     if columns > limits.COLUMNS:
-        raise DataError(
-            f"{file}: too many columns",
-            expected=f"at most {limits.COLUMNS}",
-            got=columns,
-            hint="write only the columns of the robot",
-        )
+        hint = "write only the columns of the robot"
+        raise DataError(f"{file}: too many columns", expected=most, got=columns, hint=hint)
 
 
 def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
@@ -153,10 +147,11 @@ def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
     names = set(usable)
     for path in paths:
         parts = path.split(".") if path not in names else []
-        for n in range(1, len(parts)):
-            if ".".join(parts[:n]) in names:
-                outer = ".".join(parts[:n])
-                raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
+        outer = next(
+            (".".join(parts[:n]) for n in range(1, len(parts)) if ".".join(parts[:n]) in names), None
+        )
+        if outer is not None:
+            raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
 
 
 def _check_size(file: Path, rows: int, columns: int) -> None:
@@ -174,14 +169,8 @@ def _check_size(file: Path, rows: int, columns: int) -> None:
 
 
 def _header(file: Path, metadata: dict[bytes, bytes]) -> DataHeader:
-    if HEADER_KEY not in metadata:
-        return DataHeader()
-    text = metadata[HEADER_KEY]
-    if len(text) > limits.HEADER_BYTES:
-        raise DataError(
-            f"{file}: the header is too large", expected=f"at most {limits.HEADER_BYTES} bytes", got=len(text)
-        )
-    return DataHeader.from_json(text, str(file), DataError)
+    text = metadata.get(HEADER_KEY)
+    return DataHeader() if text is None else DataHeader.from_json(text, str(file), DataError)
 
 
 def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:
@@ -191,10 +180,8 @@ def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:
     with file.open("rb") as opened:
         first, second = (opened.readline(limits.HEADER_BYTES + 1) for _ in range(2))
     if len(first) > limits.HEADER_BYTES:
-        raise DataError(
-            f"{file}: the first line is too long",
-            expected=f"at most {limits.HEADER_BYTES} bytes of column names",
-        )
+        most = f"at most {limits.HEADER_BYTES} bytes of column names"
+        raise DataError(f"{file}: the first line is too long", expected=most)
     columns = first.count(b",") + 1
     _check_count(file, columns)
     rows = file.stat().st_size // max(len(second), 2 * columns)
@@ -220,13 +207,9 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
         raise DataError(f"{file}: column {twice[0]!r} occurs more than once")
     if any(len(name) > limits.COLUMN_NAME for name in names):
         raise DataError(f"{file}: a column's name is longer than {limits.COLUMN_NAME} characters")
-    numeric = [
-        field.name
-        for field in schema
-        if kinds.is_floating(field.type) or kinds.is_integer(field.type) or kinds.is_boolean(field.type)
-    ]
-    numeric_names = set(numeric)
-    ignored = [name for name in names if name not in numeric_names]
+    kept = (kinds.is_floating, kinds.is_integer, kinds.is_boolean)
+    numeric = [field.name for field in schema if any(kind(field.type) for kind in kept)]
+    ignored = sorted(set(names) - set(numeric), key=names.index)
     # A text column that should be numbers is reported by name once it is missed; the rest is harmless.
     if ignored:
         warnings.warn(

@@ -70,12 +70,7 @@ def _chunks(data: Dataset) -> Iterator[Dataset]:
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
     """Identify inertial parameters, friction and offsets from measured torques and accelerations.
 
-    Args:
-        system: robot and contacts of the robot file.
-        train: the log.
-
-    Returns:
-        The identified robot; what the motion does not excite stays as in the robot file.
+    What the motion does not excite stays as in the robot file.
     """
     rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
     train, robot = train[rows.unique()], system.robot
@@ -225,15 +220,7 @@ class Baseline:
 
 
 def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
-    """The trivial predictors, fitted to training data.
-
-    Args:
-        system: robot and contacts as known before any learning.
-        train: at least `FEWEST_TRAINING` samples.
-
-    Returns:
-        The mean, the robot file alone, and least squares.
-    """
+    """Mean, robot file and least squares, fitted to at least `FEWEST_TRAINING` samples."""
     mean, nothing = train.qdd.mean(0), train.qdd.new_zeros(3 * train.nq)
     identified = identify_rigid(system, train)
 

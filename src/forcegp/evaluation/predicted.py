@@ -46,13 +46,7 @@ Moments = tuple[Tensor, Tensor | None]
 def in_chunks(
     predict: Callable[[Dataset], Moments], data: Dataset, progress: Progress | None = None
 ) -> Moments:
-    """What `predict` returns for all samples, asked for `CHUNK_STATES` at a time.
-
-    Args:
-        predict: called with each part of the data.
-        data: the states, at least one.
-        progress: called with the number of states predicted and their total number.
-    """
+    """What `predict` returns for all samples, asked for `CHUNK_STATES` at a time."""
     parts = []
     for first in range(0, len(data), CHUNK_STATES):
         parts.append(predict(data[first : first + CHUNK_STATES]))
@@ -65,14 +59,7 @@ def in_chunks(
 def predict_all(
     model: Predictor, data: Dataset, system: ConstrainedSystem, progress: Progress | None
 ) -> Predicted:
-    """Predict the accelerations of a data set.
-
-    Args:
-        model: a fitted model.
-        data: the states.
-        system: the constraint that predictions are held against.
-        progress: called with the number of states predicted and their total number.
-    """
+    """Predict the accelerations of a data set, and their residual on the constraint of a system."""
     residuals, seconds = [], []
 
     def predict(part: Dataset) -> Moments:
@@ -130,14 +117,9 @@ class MultiplierScore:
 
 @torch.no_grad()
 def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Compare λ with what a simulator or another sensor logged as `multiplier`, contact by contact.
+    """Compare λ with what a simulator or another sensor logged as `multiplier`, for contacts of one row each.
 
-    Args:
-        model: a fitted model that predicts forces.
-        data: with `multiplier` of some contacts of the model that have one row each.
-
-    Returns:
-        One score per contact with a logged multiplier and at least two samples in contact.
+    There is one score per contact with a logged multiplier and at least two samples in contact.
     """
 
     def predict(part: Dataset) -> Moments:
@@ -153,11 +135,7 @@ def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore,
 
 @torch.no_grad()
 def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """The same where the log's force sensor is a measurement at the predicted states too.
-
-    Returns:
-        Nothing for a model that was not fitted to a sensor, or a log without one.
-    """
+    """The same with the log's force sensor as a measurement at each state; empty without a sensor."""
     if not isinstance(model, StructuredFit) or "multiplier" not in model.noise:
         return ()
     if not _comparable(model, data) or not has_sensor(data, model.system):

@@ -38,23 +38,20 @@ def write_evaluation(
     folder: Path,
     model: str,
     data: str,
+    fitted_to: str | None,
     scores: Evaluation,
     window: WindowData,
-    fitted_to: str | None = None,
     comparison: Sequence[Compared] = (),
 ) -> Path:
-    """Write the page on one model, with its plots and their data.
+    """Write the page on one model, with its plots and their data, and return its path.
 
     Args:
         folder: where the files go.
         model, data: the model file and the data file, as the page names them.
+        fitted_to: the file that the trivial predictors were fitted to, if not halves of the data.
         scores: of the model.
         window: predictions over a few seconds of the data.
-        fitted_to: the file that the trivial predictors were fitted to, if not halves of the data.
         comparison: sets of force priors that the training log chose between.
-
-    Returns:
-        The path of the page.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]

@@ -43,14 +43,7 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Table:
-    """A table as text.
-
-    Attributes:
-        caption: what it contains, with units.
-        head: names of the columns; the first column names the rows.
-        rows: the cells of each row.
-        bad: `(row, column)` of cells to print in red.
-    """
+    """A table as text; the first column names the rows, `bad` holds `(row, column)` of cells in red."""
 
     caption: str
     head: tuple[str, ...]
@@ -74,14 +67,7 @@ def cell(value: object, digits: int = 4) -> str:
 
 @dataclass(frozen=True)
 class PictureBlock:
-    """Pictures under one heading and caption.
-
-    Attributes:
-        heading: the title, with the paper's figure number if it has one.
-        caption: what the pictures show.
-        pictures: the panels.
-        source: file with the data.
-    """
+    """Pictures under one heading and caption; `source` is the file with their data."""
 
     heading: str
     caption: str
@@ -90,13 +76,7 @@ class PictureBlock:
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:
-    """Fill in a template; a missing value is an error.
-
-    Args:
-        template: file name under `templates/` of the package, or of this one.
-        package: where to look first.
-        values: what the template refers to.
-    """
+    """Fill in a template under `templates/` of the package, or of this one; a missing value is an error."""
     packages = dict.fromkeys((package, "forcegp.report"))
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in packages]),

@@ -15,11 +15,7 @@ from forcegp.rollout.comparison import HORIZONS, LEVEL, Comparison
 
 
 class Band(Part):
-    """A central band over function samples.
-
-    Attributes:
-        lower, upper: bounds.
-    """
+    """Bounds of a central band over function samples."""
 
     lower: Series
     upper: Series
@@ -62,12 +58,7 @@ class ModelPath(Part):
 
 
 class Film(Part):
-    """Joint positions in space for an animation.
-
-    Attributes:
-        label: whose motion.
-        points: frames × points × 3, flat [m].
-    """
+    """Points of an arm for an animation: frames × points × 3, flat [m]; `label` names the model."""
 
     label: str
     points: Series
@@ -149,6 +140,7 @@ def _model_path(
     samples, contacts = rolled.samples, rolled.system.m > 0
     multiplier = rolled.multiplier[0, :n, 0] if contacts else rolled.multiplier.new_zeros(0)
     has_multiplier = bool(torch.isfinite(multiplier).all()) and len(multiplier) > 0
+    tip_error = comparison.tip_error(name).median(0).values
     errors = [comparison.error_at(name, horizon) for horizon in horizons]
     times = [d.t for d in (*rolled.diverged, *(samples.diverged if samples else ()))]
     factor = calibration.inflation(name) if samples and calibration else math.inf
@@ -158,7 +150,7 @@ def _model_path(
         model=name,
         tip=[series(x) for x in comparison.predicted_tip(name)[0, :n].T],
         tip_bands=[] if samples is None else _bands(rolled, comparison.sampled_tip(name)[:, 0], n),
-        tip_error=series(_finite(comparison.tip_error(name).median(0).values)),
+        tip_error=series(tip_error[torch.isfinite(tip_error)]),
         drift=series(rolled.drift[0, :n, 0]) if contacts else [],
         multiplier=series(multiplier) if has_multiplier else [],
         multiplier_band=_bands(rolled, samples.multiplier[:, 0], n)[0] if samples and contacts else None,
@@ -175,17 +167,11 @@ def _model_path(
 def _bands(rolled, values: Tensor, n: int) -> list[Band]:
     """Bands `(S, T, d)` of each component over the first n times, as far as any sample goes."""
     band = rolled.bands(values[:, :n], LEVEL)
-    last = int(torch.isfinite(band.lower).all(-1).sum())
-    return [
-        Band(lower=series(low), upper=series(high))
-        for low, high in zip(band.lower[:last].T, band.upper[:last].T, strict=True)
-    ]
+    last = _sound(band.lower)
+    pairs = zip(band.lower[:last].T, band.upper[:last].T, strict=True)
+    return [Band(lower=series(low), upper=series(high)) for low, high in pairs]
 
 
 def _sound(q: Tensor) -> int:
     """How many leading times `(T, nq)` hold a finite state."""
     return int(torch.isfinite(q).all(-1).sum())
-
-
-def _finite(values: Tensor) -> Tensor:
-    return values[torch.isfinite(values)]

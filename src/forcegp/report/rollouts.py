@@ -58,25 +58,27 @@ def draw_tip(data: RolloutData) -> Picture:
 
 def draw_tip_error(data: RolloutData) -> Picture:
     """Distance between predicted and logged tip over time, on a logarithmic scale."""
-    curves = [(path, _logarithmic(path.tip_error, 1e-9)) for path in data.models]
+    curves = [(path, path.tip_error) for path in data.models]
     alt = f"Tip error over time, median over {data.starts} starts, logarithmic scale, one curve per model."
-    return _draw_logarithmic(data, curves, "tip error [m]", alt, "Tip error over time")
+    return _draw_logarithmic(data, curves, 1e-9, "tip error [m]", alt, "Tip error over time")
 
 
 def draw_drift(data: RolloutData) -> Picture:
     """Constraint error of the predicted trajectories."""
-    curves = [(path, _logarithmic(path.drift, 1e-16)) for path in data.models if path.drift]
+    curves = [(path, path.drift) for path in data.models if path.drift]
     alt = "Distance of the predicted tip from the surface over time, logarithmic scale, one curve per model."
-    return _draw_logarithmic(data, curves, "|c(q)| [m]", alt, "Drift off the surface")
+    return _draw_logarithmic(data, curves, 1e-16, "|c(q)| [m]", alt, "Drift off the surface")
 
 
 def _draw_logarithmic(
-    data: RolloutData, curves: list[tuple[ModelPath, Series]], name: str, alt: str, title: str
+    data: RolloutData, curves: list[tuple[ModelPath, Series]], least: float, name: str, alt: str, title: str
 ) -> Picture:
+    """Magnitudes on a logarithmic scale; the first, at the logged start, is zero and left out."""
+
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         for path, values in curves:
-            _curve(axes, data, path, values)
+            _curve(axes, data, path, [math.nan, *(max(abs(value), least) for value in values[1:])])
         axes.set_yscale("log")
         axes.set_xlabel("time [s]")
         axes.set_ylabel(name)
@@ -121,18 +123,11 @@ def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band:
     axes.plot(data.t[: len(values)], values, label=label(path.model), **style)
 
 
-def _logarithmic(values: Series, least: float) -> Series:
-    """Magnitudes for a logarithmic scale; the first, at the logged start, is zero and left out."""
-    return [math.nan, *(max(abs(value), least) for value in values[1:])]
-
-
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
     """The plots of the section for which there are data."""
     pictures = [draw_tip(data), draw_tip_error(data)]
-    if any(path.drift for path in data.models):
-        pictures.append(draw_drift(data))
-    if any(path.multiplier for path in data.models):
-        pictures.append(draw_contact_force(data))
+    pictures += [draw_drift(data)] if any(path.drift for path in data.models) else []
+    pictures += [draw_contact_force(data)] if any(path.multiplier for path in data.models) else []
     return tuple(pictures)
 
 
@@ -160,14 +155,7 @@ def rollout_table(data: RolloutData) -> Table:
 
 @dataclass(frozen=True)
 class RolloutSection:
-    """The section on trajectories, of any page.
-
-    Attributes:
-        block: the plots under their caption.
-        table: tip errors, coverage and drift.
-        animation: the arm in motion.
-        script: hash of the animation's script for the page's content security policy.
-    """
+    """Plots, table and animation of trajectories; `script` is the hash for the page's security policy."""
 
     block: PictureBlock
     table: Table
@@ -190,16 +178,7 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
 
 
 def write_rollouts(folder: Path, title: str, data: RolloutData) -> Path:
-    """Write the page on trajectories, its plots and their data.
-
-    Args:
-        folder: where the files go.
-        title: models and data.
-        data: what was predicted.
-
-    Returns:
-        The path of the page.
-    """
+    """Write the page on trajectories, its plots and their data to a folder; returns the path of the page."""
     section = rollout_section(data)
     for i, picture in enumerate(section.block.pictures):
         write_text(folder / f"rollout-{i + 1}.svg", picture.svg)

@@ -81,13 +81,7 @@ SETTINGS: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn plot.
-
-    Attributes:
-        svg: the file's text.
-        alt: what it shows, for readers who cannot see it.
-        title: short heading, such as the model's name.
-    """
+    """A drawn plot as the text of an SVG file; `alt` describes it for readers who cannot see it."""
 
     svg: str
     alt: str

@@ -63,16 +63,7 @@ def opening(data: Dataset, seconds: float) -> Dataset:
 
 @torch.no_grad()
 def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
-    """Mean and standard deviation of the accelerations at the samples of a window.
-
-    Args:
-        model: a fitted model.
-        data: the window, sorted by time.
-        name: what the plots call the model.
-
-    Returns:
-        The data of both plots.
-    """
+    """Predictions at the samples of a window, sorted by time; the plots call the model `name`."""
     predicted = model.predict(data.q, data.qd, data.tau, active=data.active(model.system.contact_names))
     clean, variance = data.extras.get("qdd_clean"), predicted.variance
     if variance is not None and isinstance(model, StructuredFit) and model.torque_std is not None:

@@ -41,9 +41,6 @@ class Document:
         content: the bytes of the file.
         source: its name, for messages.
         error: the class of error to raise, also by the methods.
-
-    Raises:
-        ForceGPError: of class `error`, if the file is not TOML; the message names file and line.
     """
 
     def __init__(self, content: bytes, source: str, error: type[ForceGPError] = SceneError) -> None:
@@ -67,10 +64,7 @@ class Document:
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
-        """The content as an instance of a schema.
-
-        Args:
-            schema: a pydantic model, whose fields may be models, data classes or unions with a `type`.
+        """The content as an instance of a pydantic model.
 
         Raises:
             ForceGPError: the first error in the content, with its line and key.
@@ -86,11 +80,7 @@ class Document:
             raise self._error(schema, errors[0]) from error
 
     def at(self, key: Key, make: Callable[..., T], *args: object, **options: object) -> T:
-        """The result of `make(*args, **options)`, whose errors are reported at a key of this file.
-
-        Raises:
-            ForceGPError: `make` raised an error of this library.
-        """
+        """The result of `make(*args, **options)`, whose errors are reported at a key of this file."""
         try:
             return make(*args, **options)
         except ForceGPError as error:

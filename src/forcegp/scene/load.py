@@ -31,12 +31,7 @@ BUNDLED = (
 
 @dataclass(frozen=True)
 class ModelTable:
-    """The table `[model]` of a file; `forcegp.models.configured` makes what it describes.
-
-    Attributes:
-        section: its keys.
-        document: the file, for messages.
-    """
+    """The table `[model]` of a file, for `forcegp.models.configured`, and the file, for messages."""
 
     section: ModelSection
     document: Document
@@ -44,13 +39,7 @@ class ModelTable:
 
 @dataclass(frozen=True)
 class Scene:
-    """A validated scene file; `system` makes what it describes.
-
-    Attributes:
-        sections: the tables.
-        document: the file, for messages.
-        folder: where relative paths start.
-    """
+    """A validated scene file; relative paths start at `folder`."""
 
     sections: SceneSections
     document: Document
@@ -111,13 +100,9 @@ def _is_file(path: Path) -> bool:
 
 
 def load_scene(source: str | Path) -> Scene:
-    """Read a scene file.
+    """Read a scene file: a path, or the name of a bundled scene, one of `BUNDLED`.
 
-    Args:
-        source: a path, or the name of a bundled scene, one of `BUNDLED`.
-
-    Returns:
-        The scene; nothing but its file has been read yet.
+    Nothing but the file is read yet.
 
     Example:
         >>> load_scene("kuka_plane").system().contact_names
@@ -145,10 +130,7 @@ def default_model_table() -> ModelTable:
 
 
 def load_model_table(path: str | Path) -> ModelTable:
-    """Read a file with the table `[model]` alone.
-
-    Args:
-        path: a TOML file.
+    """Read a TOML file with the table `[model]` alone.
 
     Raises:
         SceneError: the file does not exist or is not valid; the message names file, line and key.

@@ -39,17 +39,11 @@ _POSITIVE = re.compile(r"(data\.\d+|training)\.noise_std|std\.[^.]+|scale\..+\.s
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
-    """Check the number, types and values of tensors that were read.
-
-    Only joint limits may be infinite, nothing may be NaN, and standard deviations are positive. Which
-    tensors a model has, and their shapes, its loader checks.
-
-    Args:
-        tensors: by name.
-        source: name of the file, for messages.
+    """Check the number, types and values of tensors that were read; their shapes the loader checks.
 
     Raises:
-        ModelError: a tensor is of another type, not finite, or not positive where it must be.
+        ModelError: a tensor is of another type, NaN, infinite but no joint limit, or a standard deviation
+            that is not positive.
     """
     if len(tensors) > TENSORS:
         raise ModelError(f"{source}: too many tensors", expected=f"at most {TENSORS}", got=len(tensors))
@@ -113,14 +107,7 @@ def model_path(path: str | Path) -> Path:
 def model_bytes(
     kind: str, system: ConstrainedSystem, settings: Settings, tensors: Mapping[str, Tensor]
 ) -> bytes:
-    """The content of the file of a model.
-
-    Args:
-        kind: `Model.kind`.
-        system: written beside the model.
-        settings: of the kind.
-        tensors: of the model, by names that do not begin with `system.`.
-    """
+    """The content of the file of a model; no tensor has a name that begins with `system.`."""
     record, robot = pack_system(system)
     copies = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
     header = ModelHeader(kind=kind, settings=settings.model_dump(mode="json"), system=record)
@@ -231,15 +218,7 @@ def _content(file: Path, most: int) -> bytes:
 
 
 def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:
-    """Check, before a long fit, that `write_model` will be able to write a model.
-
-    Args:
-        path: the file.
-        needed_bytes: room that the model takes, where it is known [bytes].
-
-    Raises:
-        DestinationError: the place cannot be written.
-    """
+    """Check, before a long fit, that `write_model` will be able to write a model."""
     check_destination(model_path(path), needed_bytes=needed_bytes)
 
 

@@ -147,14 +147,7 @@ MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
 def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """A system as a JSON object and named tensors (`system.<field>` of the robot).
-
-    Args:
-        system: robot and constraints.
-
-    Returns:
-        The JSON object, and detached copies of the tensors on the CPU.
-    """
+    """A system as a JSON object, and copies of the tensors of its robot on the CPU (`system.<field>`)."""
     record = SystemRecord(
         robot=RobotRecord.model_validate(system.robot),
         contacts=tuple(map(_record, system.contacts)),
@@ -173,11 +166,10 @@ def unpack_system(
     source: str,
     fallback: ConstrainedSystem | None = None,
 ) -> ConstrainedSystem:
-    """The system that `pack_system` wrote.
+    """The system that `pack_system` wrote, from its JSON object and the tensors named `system.<field>`.
 
     Args:
-        json: the JSON object.
-        tensors: at least the tensors named `system.<field>`.
+        json, tensors: what was read.
         source: name of the file, for messages.
         fallback: system that provides the constraints that cannot be saved.
 
@@ -246,18 +238,10 @@ def take(
     *,
     finite: bool = True,
 ) -> Tensor:
-    """A named tensor of a saved model, checked.
-
-    Args:
-        tensors: what the file holds.
-        name: the tensor's name.
-        shape: what its shape must be, or `None` for any.
-        dtype: what its type must be.
-        source: name of the file, for messages.
-        finite: whether its values must be finite.
+    """A named tensor of a saved model, checked; a shape of `None` is any.
 
     Raises:
-        ModelError: it is missing, of another shape or type, or not finite.
+        ModelError: it is missing, of another shape or type, or not finite where it must be.
     """
     if name not in tensors:
         raise ModelError(f"{source}: tensor {name!r} is missing")
@@ -280,11 +264,7 @@ def robot_tensors(robot: RobotModel) -> list[str]:
 
 
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
-    """A robot with tensors named `<prefix><field>`, and everything else as in another one.
-
-    Raises:
-        ModelError: a tensor is missing, of another shape or type, or not finite.
-    """
+    """A robot with tensors named `<prefix><field>`, checked by `take`, and all else as in another one."""
     fields = {
         name: take(
             tensors,

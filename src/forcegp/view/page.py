@@ -36,12 +36,7 @@ LOCAL, PORT = "127.0.0.1", 8080
 
 
 def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
-    """What `report.animation` draws of a motion: robot, surfaces, paths, forces and their texts.
-
-    Args:
-        motion: what to show.
-        shapes: what the robot looks like.
-    """
+    """What `report.animation` draws of a motion: robot, surfaces, paths, forces and their texts."""
     system, frames = motion.system, range(len(motion.t))
     robot, poses = system.robot, kinematics.link_poses(system.robot, motion.q)
     R = torch.cat([robot.base_rotation.expand(len(frames), 1, 3, 3), poses.rotation], dim=1)
@@ -90,7 +85,7 @@ def _patch(surface: Surface, points: Array) -> Array:
         low, high = local.min(axis=0) - MARGIN, local.max(axis=0) + MARGIN
         middle = 0.5 * (low + high)
         middle[2] = surface.offset - 0.005
-        return (box(*(high - low)[:2], 0.01) + middle) @ R.T
+        return (box(high[0] - low[0], high[1] - low[1], 0.01) + middle) @ R.T
     if isinstance(surface, Sphere):
         return sphere(surface.radius) + np.asarray(surface.center)
     if isinstance(surface, Cylinder):
@@ -131,29 +126,13 @@ def view_page(motion: Motion, shapes: Sequence[Shape], title: str) -> str:
 
 
 def write_view(path: str | Path, motion: Motion, shapes: Sequence[Shape], title: str = "forcegp") -> Path:
-    """Write a motion as one HTML file that needs no other and no network.
-
-    Args:
-        path: where it goes.
-        motion: what to show.
-        shapes: what the robot looks like.
-        title: of the page.
-
-    Returns:
-        The path.
-    """
+    """Write a motion as one HTML file that needs no other and no network."""
     write_text(path, view_page(motion, shapes, title))
     return Path(path)
 
 
 def serve(page: str, port: int = PORT, say: Callable[[str], None] = print) -> None:
-    """Show a page in a browser on this computer until interrupted.
-
-    Args:
-        page: HTML.
-        port: of the server; if it is taken, the system chooses one.
-        say: called with the address.
-    """
+    """Show a page in a browser on this computer until interrupted; `say` gets its address."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
