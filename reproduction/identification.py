@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from forcegp import report
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.files import Header
+from forcegp.files import Header, Record
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.sets import contact_priors, default_priors
 from forcegp.gp.optimise import LearningOptions, minimise
@@ -65,7 +65,7 @@ def wrong_parameters(robot: RobotModel) -> LastLink:
     return LastLink(robot.replace(mass=mass, placement_position=position))
 
 
-class IdentificationRun(report.Part):
+class IdentificationRun(Record):
     """Analytical parameters over the iterations of one model.
 
     Attributes:

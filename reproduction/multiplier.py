@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forcegp import report
-from forcegp.files import Header
+from forcegp.files import Header, Record
 from forcegp.models.load import load_model
 from reproduction.fits import MODEL
 from reproduction.stages import write_data
@@ -26,7 +26,7 @@ INSIDE = 0.90
 WIDTH = 4.6
 
 
-class MultiplierBand(report.Part):
+class MultiplierBand(Record):
     """The multiplier as one model predicts it.
 
     Attributes:

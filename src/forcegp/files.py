@@ -155,13 +155,17 @@ def write_json(path: str | Path, value: object) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
-class Header(BaseModel):
+class Record(BaseModel):
+    """A frozen part of a file: unknown fields and numbers that are not finite are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, from_attributes=True)
+
+
+class Header(Record):
     """A frozen, versioned JSON header; a subclass names its `FORMAT` and `VERSION` and adds fields.
 
     Unknown fields are errors, and text of more than `MAX_BYTES` is not read.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     FORMAT: ClassVar[str]
     VERSION: ClassVar[int]

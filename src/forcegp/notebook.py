@@ -41,16 +41,15 @@ def text(value: object, digits: int = 4) -> str:
 
 
 def _row(cells: Sequence[str], tag: str) -> str:
-    styles = (_CELL if i else _FIRST for i in range(len(cells)))
-    pairs = zip(styles, map(escape, cells), strict=True)
-    parts = (f'<{tag} style="{style}">{cell}</{tag}>' for style, cell in pairs)
+    styles = [_FIRST, *[_CELL] * len(cells)][: len(cells)]
+    parts = (
+        f'<{tag} style="{style}">{escape(cell)}</{tag}>' for style, cell in zip(styles, cells, strict=True)
+    )
     return f"<tr>{''.join(parts)}</tr>"
 
 
 class FitBar:
-    """A progress bar in the output of a notebook cell, for `fit(…, progress=FitBar())`.
-
-    Outside a notebook it prints nothing; the commands have a bar of their own.
+    """A progress bar in the output of a notebook cell, for `fit(…, progress=FitBar())`; silent elsewhere.
 
     Example:
         >>> bar = FitBar()

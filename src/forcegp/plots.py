@@ -80,8 +80,7 @@ class Timeline:
     """Positions of samples on the time axis.
 
     Attributes:
-        x: `(n,)` time, increasing [s].
-        order: `(n,)` row of each position.
+        x, order: `(n,)` increasing time [s], and the row of each position.
         breaks: positions before which a curve is interrupted.
         ordered: whether the samples are a time series, which is drawn as a curve.
         label: of the axis.
@@ -95,12 +94,11 @@ class Timeline:
 
     @classmethod
     def of(cls, t: Tensor, segment: Tensor | None = None, ordered: bool = True) -> Timeline:
-        """Place samples on the time axis.
+        """Place samples on the time axis; segments whose times overlap are placed one after another.
 
         Args:
             t: `(n,)` [s].
-            segment: `(n,)` trajectory of each sample; default one. Segments whose times overlap are placed
-                one after another.
+            segment: `(n,)` trajectory of each sample; default one.
             ordered: whether the rows follow time within each segment.
         """
         x, segments = as_array(t), np.zeros(len(t)) if segment is None else as_array(segment)
@@ -230,11 +228,7 @@ def _draw(axes: Axes, curve: Curve, time: Timeline) -> None:
 
 
 def chosen(wanted: Sequence[str] | None, names: Sequence[str], kind: str) -> list[int]:
-    """Indices of the wanted names, by default all of them.
-
-    Raises:
-        UnknownNameError: a name does not exist.
-    """
+    """Indices of the wanted names, by default all; an unknown name raises `UnknownNameError`."""
     for name in wanted or ():
         if name not in names:
             raise UnknownNameError(kind, name, names)

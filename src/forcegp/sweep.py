@@ -71,12 +71,10 @@ def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
     split = split_by_stretches(data, 1, seed=fit.seed)
     model = configured(scene.model, system, name=fit.model, seed=fit.seed)
     fitted = model.fit(data[complement(split.test, len(data))])
-    evaluation = evaluate(fitted, data[split.test], compare=False)
+    scores = evaluate(fitted, data[split.test], compare=False).summary()
     score = {
         **asdict(fit),
-        "noisy_mae": evaluation.noisy_mae,
-        "clean_mae": evaluation.clean_mae,
-        "coverage_noisy": evaluation.coverage_noisy,
+        **{name: scores[name] for name in ("noisy_mae", "clean_mae", "coverage_noisy")},
         "samples": fitted.result.samples,
         "seconds": fitted.seconds,
         "converged": fitted.converged,

@@ -25,13 +25,8 @@ NEW = ".forcegp-new-"
 """Prefix of what is under construction."""
 
 
-def hidden_name(target: Path) -> Path:
-    """A hidden, unused path beside a target with the same ending, as some writers go by the ending."""
-    return target.with_name(f"{NEW}{secrets.token_hex(6)}-{_short(target)}")
-
-
 def _short(target: Path) -> str:
-    """The name of a target, or a digest with the same ending in the place of a long one."""
+    """The name of a target, or for a long one a digest with the same ending, which some writers go by."""
     name = os.fsencode(target.name)
     if len(name) <= LONGEST:
         return target.name
@@ -39,24 +34,12 @@ def _short(target: Path) -> str:
     return hashlib.sha256(name).hexdigest() + ending
 
 
-def leftovers_of(target: Path) -> list[Path]:
-    """Everything beside a target that has a hidden name of it, the latest first."""
-    form = re.compile(re.escape(NEW) + "[0-9a-f]{12}-" + re.escape(_short(target)))
-    try:
-        with os.scandir(target.parent) as entries:
-            matches = [entry for entry in entries if form.fullmatch(entry.name)]
-        matches.sort(key=lambda entry: entry.stat(follow_symlinks=False).st_mtime_ns, reverse=True)
-    except OSError:
-        return []
-    return [Path(entry.path) for entry in matches]
-
-
 class Temporary:
     """An empty file or folder under construction beside an existing target, locked until `close`."""
 
     def __init__(self, target: Path, *, folder: bool, mode: int) -> None:
         while True:
-            self.path = hidden_name(target)
+            self.path = target.with_name(f"{NEW}{secrets.token_hex(6)}-{_short(target)}")
             if folder:
                 self.path.mkdir(mode=mode)
             else:
@@ -76,7 +59,12 @@ class Temporary:
 
 def sweep(target: Path) -> None:
     """Delete temporary files of crashed writers of a target."""
-    for path in leftovers_of(target) if fcntl is not None else []:
+    form = re.compile(re.escape(NEW) + "[0-9a-f]{12}-" + re.escape(_short(target)))
+    try:
+        matches = [path for path in target.parent.iterdir() if form.fullmatch(path.name)]
+    except OSError:
+        return
+    for path in matches if fcntl is not None else []:
         locked, descriptor = _lock(path)
         if descriptor is not None:
             if locked:

@@ -28,11 +28,7 @@ class Advance(Protocol):
 
 @contextmanager
 def progress_bar(description: str, total: int) -> Iterator[Advance]:
-    """A progress bar on stderr.
-
-    Yields:
-        A function to call with the number of steps done so far, their total where it has changed, and a note.
-    """
+    """A progress bar on stderr; its function takes the steps done, their total if it changed, a note."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -58,10 +54,12 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
         typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
 
 
-def check_apart(out: Path, *inputs: Path) -> None:
-    """Refuse to write a result over a file that it is made from, or over another result."""
+def check_output(out: Path, *inputs: Path) -> None:
+    """Check, before long work, that a file can be written and is none that the result is made from."""
+    from forcegp.destination import check_destination
     from forcegp.errors import DestinationError
 
+    check_destination(out)
     if out.resolve() in (path.resolve() for path in inputs):
         raise DestinationError(f"{out} would be overwritten", hint="name another file for the result")
 
@@ -69,11 +67,9 @@ def check_apart(out: Path, *inputs: Path) -> None:
 def check_data_destination(path: Path, *inputs: Path) -> None:
     """Check, before long work, that a data set can be written without losing what it is made from."""
     from forcegp.data.table import check_ending
-    from forcegp.destination import check_destination
 
     check_ending(path)
-    check_destination(path)
-    check_apart(path, *inputs)
+    check_output(path, *inputs)
 
 
 def derivatives(window: int | None) -> SavitzkyGolay | None:
@@ -84,10 +80,7 @@ def derivatives(window: int | None) -> SavitzkyGolay | None:
 
 
 def read_data(path: Path, robot: RobotModel | None = None, differentiate: int | None = None) -> Dataset:
-    """Read a data set, computing derivatives that it lacks where a window is given.
-
-    For a robot, the joints are in its order; further logged joints are left out.
-    """
+    """Read a data set with the joints of a robot in its order, computing derivatives if a window is given."""
     from forcegp.data import Dataset
 
     data = Dataset.read(path, differentiate=derivatives(differentiate))
@@ -147,7 +140,7 @@ def system_of(scene: str | None, robot: str | None) -> ConstrainedSystem:
 
 
 def model_table(config: Path | None, scene: str | None) -> ModelTable:
-    """The table [model] of a file of its own where one is given, else that of the scene, if there is one."""
+    """The table [model] of a file of its own if one is given, else that of the scene, if there is one."""
     from forcegp.scene import default_model_table, load_model_table, load_scene
 
     if config is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from forcegp.cli.common import (
-    check_apart,
+    check_output,
     derivatives,
     fitted,
     model_table,
@@ -76,9 +76,11 @@ def fit(
     from forcegp.destination import write_or_keep
     from forcegp.models.configured import configured
     from forcegp.storage.checkpoint import beside
-    from forcegp.storage.model_file import model_path
+    from forcegp.storage.model_file import check_model_destination, model_path
 
-    _check_places(out, checkpoint, data)
+    check_model_destination(out)
+    if checkpoint is not None:
+        check_output(checkpoint, model_path(out), *data)
     system = system_of(scene, robot)
     regression = configured(model_table(config, scene), system, name=model, noise_std=noise_std, seed=seed)
     training = _training(regression.model, data, differentiate, system.robot)
@@ -99,18 +101,6 @@ def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
         return figures
     figures["comparison"] = "".join(f"\n  {each}" for each in result.comparison)
     return {name: value for name, value in figures.items() if name != "warnings" and value != ""}
-
-
-def _check_places(out: Path, checkpoint: Path | None, data: list[Path]) -> None:
-    """Check that the model and the checkpoint can be written, apart from the data and from each other."""
-    from forcegp.destination import check_destination
-    from forcegp.storage.model_file import check_model_destination, model_path
-
-    check_model_destination(out)
-    if checkpoint is None:
-        return
-    check_destination(checkpoint)
-    check_apart(checkpoint, model_path(out), *data)
 
 
 def _training(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from forcegp.cli.common import (
-    check_apart,
     check_data_destination,
+    check_output,
     check_robot_named,
     progress_bar,
     read_data,
@@ -65,7 +66,7 @@ def import_(
 
     forcegp import run.bag --robot ur3.urdf --mapping ur3_bag --out log.parquet
     """
-    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.destination import write_or_keep
     from forcegp.errors import ForceGPError
     from forcegp.logs import import_log
 
@@ -73,8 +74,7 @@ def import_(
     place = guess or out
     if place is None or (guess is None and place.suffix.lower() != ".parquet"):
         raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
-    check_destination(place)
-    check_apart(place, log)
+    check_output(place, log)
     system = system_of(scene, robot)
     if guess is not None:
         show(_guess(log, system, guess), as_json)
@@ -103,11 +103,8 @@ def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]
 def _summary(imported: Imported) -> dict[str, object]:
     """Rows, trajectories and period, then what was found and done."""
     data, report = imported.data, imported.report
-    result: dict[str, object] = {
-        "rows": f"{len(data)} from {report.rows_read} logged",
-        "segments": int(data.segment[-1]) + 1,
-        "period_s": data.header.dt,
-    }
+    rows, segments = f"{len(data)} from {report.rows_read} logged", int(data.segment[-1]) + 1
+    result: dict[str, object] = {"rows": rows, "segments": segments, "period_s": data.header.dt}
     result |= {f"found_{i + 1}": finding.message for i, finding in enumerate(report.findings)}
     return result | {f"step_{i + 1}": step for i, step in enumerate(report.steps)}
 
@@ -118,13 +115,10 @@ def _tip_radius(text: str | None) -> float | Literal["fit"] | None:
 
     if text is None or text == "fit":
         return text
-    try:
-        radius = float(text)
-    except ValueError:
-        radius = -1.0
-    if not 0.0 <= radius < float("inf"):
-        raise ForceGPError("no such radius of the tip", expected="a length in metres, or fit", got=text)
-    return radius
+    with suppress(ValueError):
+        if 0.0 <= float(text) < float("inf"):
+            return float(text)
+    raise ForceGPError("no such radius of the tip", expected="a length in metres, or fit", got=text)
 
 
 def _surfaces(
@@ -137,8 +131,8 @@ def _surfaces(
     from forcegp.logs.surface_fit import fit_surface
 
     touched = [name for name, closed in imported.data.contact.items() if bool(closed.any())]
-    fits = {name: fit_surface(imported.data, system, name, kind, tip_radius) for name in touched}
-    return {name: fit.toml().strip() for name, fit in fits.items()}
+    fits = ((name, fit_surface(imported.data, system, name, kind, tip_radius)) for name in touched)
+    return {name: fit.toml().strip() for name, fit in fits}
 
 
 def _json(imported: Imported) -> dict[str, object]:
@@ -183,19 +177,16 @@ def check(
 
     forcegp check --scene kuka_plane --data run.parquet
 
-    forcegp check -s my_scene.toml -d run.parquet --out check.html --json
-
-    forcegp check --robot ur3.urdf --data run.parquet
+    forcegp check --robot ur3.urdf -d run.parquet --out check.html --json
     """
     from threadpoolctl import threadpool_limits
 
     from forcegp.checks import check as run
     from forcegp.checks import read_log
-    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.destination import write_or_keep
 
     if out is not None:
-        check_destination(out)
-        check_apart(out, data)
+        check_output(out, data)
     system = system_of(scene, robot)
     log = read_log(data)
     # Matrices are small: threads of BLAS cost more than they save, and two checks at once would fight.
@@ -297,12 +288,13 @@ def _written(data: Dataset, parts: Split, how: str, out: Path, rest: Path | None
     """Write training and test points, and say what was written."""
     from forcegp.destination import write_or_keep
 
-    count = len(parts.train)
-    write_or_keep(data[parts.train].with_step(f"selected {count} training points {how}").write, out)
-    result: dict[str, object] = {"training_points": count, "training_file": str(out)}
-    if rest is not None:
-        write_or_keep(data[parts.test].with_step(f"kept {len(parts.test)} test points {how}").write, rest)
-        result |= {"test_points": len(parts.test), "test_file": str(rest)}
+    result: dict[str, object] = {}
+    files = ("selected", "training", parts.train, out), ("kept", "test", parts.test, rest)
+    for done, kind, rows, path in files:
+        if path is not None:
+            step = f"{done} {len(rows)} {kind} points {how}"
+            write_or_keep(data[rows].with_step(step).write, path)
+            result |= {f"{kind}_points": len(rows), f"{kind}_file": str(path)}
     if parts.stretches:
         result["held_out_rows"] = [list(rows) for rows in parts.stretches]
     return result

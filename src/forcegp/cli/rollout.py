@@ -20,31 +20,23 @@ if TYPE_CHECKING:
     from forcegp.rollout import Rollout, RolloutOptions
 
 
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the page.")]
-Start = Annotated[int, typer.Option(min=0, help="Row of the data to start from.")]
-Duration = Annotated[
-    float | None, typer.Option(help="Time to roll out in seconds; default: to the end of the trajectory.")
-]
-Samples = Annotated[int, typer.Option(min=0, help="Functions to draw from the model's posterior.")]
-Stabilization = Annotated[str, typer.Option(help="none, baumgarte or projection.")]
-Method = Annotated[str, typer.Option(help="semi_implicit_euler, rk4, rk45 or dop853.")]
-Unilateral = Annotated[
-    bool, typer.Option("--unilateral", help="Let contacts open where they would pull, and close again.")
-]
-Seed = Annotated[int, typer.Option(help="Seed of the samples.")]
-
-
 def rollout(
     model: ModelFile,
     data: DataFile,
-    out: Out,
-    start: Start = 0,
-    duration: Duration = None,
-    samples: Samples = 0,
-    stabilization: Stabilization = "baumgarte",
-    method: Method = "semi_implicit_euler",
-    unilateral: Unilateral = False,
-    seed: Seed = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the page.")],
+    start: Annotated[int, typer.Option(min=0, help="Row of the data to start from.")] = 0,
+    duration: Annotated[
+        float | None, typer.Option(help="Time to roll out in seconds; default: to the end of the trajectory.")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=0, help="Functions to draw from the model's posterior.")] = 0,
+    stabilization: Annotated[str, typer.Option(help="none, baumgarte or projection.")] = "baumgarte",
+    method: Annotated[
+        str, typer.Option(help="semi_implicit_euler, rk4, rk45 or dop853.")
+    ] = "semi_implicit_euler",
+    unilateral: Annotated[
+        bool, typer.Option("--unilateral", help="Let contacts open where they would pull, and close again.")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Simulate forward with a model, from a logged state and under the logged torques.
@@ -156,15 +148,13 @@ def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
 
 def _spread(q: Tensor) -> Tensor:
     """Standard deviation `(T, nq)` over samples `(S, T, nq)` that have not diverged, while two are left."""
+    import numpy as np
     import torch
 
     finite = q.isfinite().all(-1)
     length = int((finite.sum(0) >= 2).to(torch.int64).cumprod(0).sum())
-    q, finite = q[:, :length], finite[:, :length, None]
-    count = finite.sum(0)
-    mean = torch.where(finite, q, 0.0).sum(0) / count
-    square = torch.where(finite, (q - mean).square(), 0.0).sum(0)
-    return (square / (count - 1)).sqrt()
+    sound = torch.where(finite[..., None], q, torch.nan)[:, :length]
+    return torch.from_numpy(np.nanstd(sound.numpy(), axis=0, ddof=1))
 
 
 def _as_data(path: Rollout, log: Dataset, dt: float) -> Dataset:

@@ -16,37 +16,30 @@ if TYPE_CHECKING:
     from forcegp.models.base import FittedModel
     from forcegp.view.shapes import Shape
 
-Target = Annotated[
-    str, typer.Argument(help="Scene file, name of a bundled scene, or file of a fitted model.")
-]
-Data = Annotated[Path | None, typer.Option("--data", "-d", help="Log whose motion is shown.")]
-RolloutFile = Annotated[
-    Path | None,
-    typer.Option("--rollout", "-r", help="The rollout.parquet of `forcegp rollout`, shown as it predicts."),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option("--out", "-o", help="HTML file that works offline; default: serve the page."),
-]
-Seconds = Annotated[float, typer.Option(min=0.05, help="Length of the motion in seconds.")]
-Start = Annotated[int, typer.Option(min=0, help="Row of the log to start from.")]
-Samples = Annotated[
-    int, typer.Option(min=0, help="Function samples whose paths of the tip are drawn, of a structured model.")
-]
-Horizon = Annotated[float, typer.Option(min=0.01, help="How far ahead the paths reach in seconds.")]
-Port = Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page.")]
-
 
 def view(
-    target: Target,
-    data: Data = None,
-    rollout: RolloutFile = None,
-    out: Out = None,
-    start: Start = 0,
-    seconds: Seconds = 10.0,
-    samples: Samples = 8,
-    horizon: Horizon = 1.0,
-    port: Port = 8080,
+    target: Annotated[
+        str, typer.Argument(help="Scene file, name of a bundled scene, or file of a fitted model.")
+    ],
+    data: Annotated[Path | None, typer.Option("--data", "-d", help="Log whose motion is shown.")] = None,
+    rollout: Annotated[
+        Path | None,
+        typer.Option(
+            "--rollout", "-r", help="The rollout.parquet of `forcegp rollout`, shown as it predicts."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="HTML file that works offline; default: serve the page."),
+    ] = None,
+    start: Annotated[int, typer.Option(min=0, help="Row of the log to start from.")] = 0,
+    seconds: Annotated[float, typer.Option(min=0.05, help="Length of the motion in seconds.")] = 10.0,
+    samples: Annotated[
+        int,
+        typer.Option(min=0, help="Function samples whose paths of the tip are drawn, of a structured model."),
+    ] = 8,
+    horizon: Annotated[float, typer.Option(min=0.01, help="How far ahead the paths reach in seconds.")] = 1.0,
+    port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page.")] = 8080,
     as_json: AsJson = False,
 ) -> None:
     """Look at a robot, its surfaces, contact forces and predicted paths in three dimensions.

@@ -201,10 +201,7 @@ class Dataset:
         )
 
     def select(self, joints: Sequence[str]) -> Dataset:
-        """The data set with its joints reordered, or only some of them.
-
-        Args:
-            joints: the joints wanted, such as `robot.joint_names`.
+        """The data set with its joints reordered, or only some of them, such as `robot.joint_names`.
 
         Raises:
             UnknownNameError: a joint is not in the data set; the message has the nearest name.
@@ -232,7 +229,7 @@ class Dataset:
     def plot(
         self, quantity: str | None = None, *, joints: Sequence[str] | None = None, ax: Target = None
     ) -> list[Axes]:
-        """Draw the log over time; the time in contact is shaded.
+        """Draw the log over time, with the time in contact shaded, and return the axes.
 
         Args:
             quantity: a logged quantity, such as `"tau"` or `"multiplier"`, with one panel per joint or
@@ -240,12 +237,8 @@ class Dataset:
             joints: which joints; default all.
             ax: matplotlib axes to draw on, one per panel; default a new figure.
 
-        Returns:
-            The axes, one per panel.
-
         Raises:
-            UnknownNameError: no such quantity or joint.
-            ParameterError: the number of axes is not that of the panels.
+            ForceGPError: no such quantity or joint, or the number of axes is not that of the panels.
         """
         from forcegp.data.plot import plot
 

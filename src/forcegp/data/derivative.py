@@ -26,10 +26,6 @@ class SavitzkyGolay:
         window: number of samples, odd.
         order: degree of the polynomial, at least 2 and less than `window`.
 
-    Example:
-        >>> SavitzkyGolay(window=11, order=3).window
-        11
-
     Raises:
         DataError: a parameter is out of range.
     """

@@ -126,12 +126,8 @@ def select_points(
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Rows to train on and rows to test on.
-
-    Attributes:
-        train: `(count,)` row numbers in the order of selection.
-        test: row numbers, increasing.
-        stretches: the held-out stretches as (first row, one past the last).
+    """Rows to train on, in the order of selection, rows to test on, increasing, and the held-out stretches as
+    (first row, one past the last).
     """
 
     train: Int[Tensor, " count"]
@@ -154,11 +150,7 @@ def split_by_selection(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Split:
-    """The paper's split: training points selected from the whole log, the rest for testing.
-
-    Raises:
-        DataError: there are fewer distinct points.
-    """
+    """The paper's split: training points selected from the whole log, the rest for testing."""
     train = select_points(data, count, method=method, seed=seed, progress=progress)
     return Split(train, complement(train, len(data)))
 
@@ -256,7 +248,7 @@ def without_marked_impacts(data: Dataset) -> Dataset:
 def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset:
     """Gaussian noise on q̈, beside the noise-free value: q̈ = q̈_clean + std ε, ε ~ N(0, I).
 
-    Where the data hold `qdd_clean`, the noise is added to that, so that it never adds up.
+    If the data hold `qdd_clean`, the noise is added to that, so that it never adds up.
 
     Args:
         data: the log.

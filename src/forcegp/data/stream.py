@@ -41,15 +41,11 @@ class Piece:
 
 
 def shape_of(path: Path) -> tuple[int, DataHeader]:
-    """Number of rows and header of a Parquet file; `DataError` if there is none."""
+    """Number of rows and header of a Parquet file."""
     file = existing(path)
     if file.suffix.lower() != ".parquet":
-        raise DataError(
-            f"{file}: only Parquet files are read piece by piece",
-            expected="a name that ends in .parquet",
-            got=file.suffix,
-            hint="write the log as Parquet: Dataset.read(path).write('run.parquet')",
-        )
+        hint = "write the log as Parquet: Dataset.read(path).write('run.parquet')"
+        raise DataError(f"{file}: only Parquet files are read piece by piece", got=file.suffix, hint=hint)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Columns that are left out are reported when they are read.
         with opened_parquet(file) as (parquet, _, header):
@@ -57,13 +53,9 @@ def shape_of(path: Path) -> tuple[int, DataHeader]:
 
 
 def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece]:
-    """The pieces of a file, of `size` rows each but for the last.
+    """The pieces of a file, of `size` rows each but for the last; `number` is that of its first trajectory.
 
-    Args:
-        path: the file.
-        size: rows of a piece.
-        window: rows before and after a piece that are read with it, within its trajectories.
-        number: of the first trajectory.
+    A piece is read with `window` rows before and after it, within its trajectories.
 
     Raises:
         DataError: the file is damaged, a value is missing, or rows of a trajectory are not together.
@@ -101,8 +93,7 @@ def _tables(parquet: pq.ParquetFile, usable: list[str], size: int) -> Iterator[p
 
 
 def _columns(file: Path, table: pa.Table) -> Columns:
-    pairs = zip(table.column_names, table.columns, strict=True)
-    columns = {name: numeric(file, name, column, "refuse") for name, column in pairs}
+    columns = {name: numeric(file, name, table[name], "refuse") for name in table.column_names}
     return columns | {"segment": columns.get("segment", np.zeros(table.num_rows, np.int64))}
 
 
@@ -123,26 +114,23 @@ class _Trajectories:
     """Numbers trajectories throughout, and checks that each is in one run and in order of time."""
 
     def __init__(self, source: str, number: int) -> None:
-        self.source, self.last_number = source, number
-        self.raw: float | None = None
-        self.time = -np.inf
-        self.segments: set[float] = set()
+        self.source, self.last_number = source, number - 1
+        self.raw, self.time, self.segments = np.nan, -np.inf, set[float]()
 
     def number(self, columns: Columns, ordered: bool) -> None:
         """Replace the segments of the next rows by numbers that go on from those before."""
         raw, t = columns["segment"], columns.get("t")
-        if ordered and self.raw is not None and t is not None and raw[0] == self.raw and t[0] <= self.time:
+        if ordered and t is not None and raw[0] == self.raw and t[0] <= self.time:
             raise DataError(
                 f"{self.source}: column 't' does not increase",
                 expected=f"more than {self.time:.9g} s",
                 got=f"{t[0]:.9g} s",
                 hint="sort the log by time, or number its trajectories in a column 'segment'",
             )
-        starts = np.append(self.raw is not None and raw[0] != self.raw, raw[1:] != raw[:-1])
-        fresh = {float(raw[0])} if self.raw is None else set()
-        fresh |= set(raw[starts].astype(float).tolist())
+        starts = self._starts(raw)
+        fresh = set(raw[starts].astype(float).tolist())
         repeated = fresh & self.segments
-        if ordered and (repeated or len(fresh) < int(starts.sum()) + (self.raw is None)):
+        if ordered and (repeated or len(fresh) < int(starts.sum())):
             which = next(iter(repeated), None)
             raise DataError(
                 f"{self.source}: the rows of a segment are not together",
@@ -150,17 +138,16 @@ class _Trajectories:
                 hint="sort the log by 'segment' and 't'",
             )
         self.segments |= fresh
-        columns["segment"] = self._counted(starts)
+        columns["segment"] = self.last_number + np.cumsum(starts)
         self.raw, self.last_number = float(raw[-1]), int(columns["segment"][-1])
         self.time = -np.inf if t is None else float(t[-1])
 
     def peek(self, columns: Columns) -> None:
         """Number rows that come next, without passing on to them."""
-        raw = columns["segment"]
-        columns["segment"] = self._counted(np.append(raw[0] != self.raw, raw[1:] != raw[:-1]))
+        columns["segment"] = self.last_number + np.cumsum(self._starts(columns["segment"]))
 
-    def _counted(self, starts: NDArray[np.bool_]) -> NDArray[np.int64]:
-        return (self.last_number + np.cumsum(starts)).astype(np.int64)
+    def _starts(self, raw: NDArray[np.generic]) -> NDArray[np.bool_]:
+        return np.append(raw[0] != self.raw, raw[1:] != raw[:-1])
 
 
 PIECE_ROWS = 8192
@@ -171,10 +158,9 @@ Keep = Callable[[Dataset], Tensor]
 
 @dataclass(frozen=True)
 class StreamedDataset:
-    """A log of any length in one or several Parquet files, one after another.
+    """A log of any length in one or several Parquet files, one after another, with trajectories of their own.
 
-    Each file has trajectories of its own. Velocities and accelerations that the files lack are computed as by
-    `Dataset.read`; the noise of what is computed is estimated piece by piece.
+    What the files lack is computed as by `Dataset.read`; its noise is estimated piece by piece.
 
     Args:
         paths: the files; their joints, contacts and further columns must agree.
@@ -183,9 +169,6 @@ class StreamedDataset:
         dtype, device: of the tensors.
         distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each of them
             makes the same call and gets the same fit.
-
-    Raises:
-        DataError: there is not a file, one does not exist, or one is not Parquet.
 
     Example:
         >>> import tempfile, torch
@@ -255,15 +238,12 @@ class StreamedDataset:
         for path in self.files:
             for piece in pieces_of(path, PIECE_ROWS, window, number):
                 number = piece.last_segment
+                in_share = count >= start and count % share[1] == share[0]
+                data = self._dataset(path, piece, first) if in_share or first is None else first
+                first = data[:1] if first is None else first
+                if count >= start:
+                    yield data if in_share else first[:0]
                 count += 1
-                in_share = count > start and (count - 1) % share[1] == share[0]
-                if in_share or first is None:
-                    data = self._dataset(path, piece, first)
-                    first = data[:1] if first is None else first
-                    if in_share:
-                        yield data
-                if count > start and not in_share:
-                    yield first[:0]
             number += 1
 
     def _dataset(self, path: Path, piece: Piece, first: Dataset | None) -> Dataset:

@@ -79,8 +79,7 @@ def read_table(
             f"{file}: not a kind of data file that is read", expected=" or ".join(readers), got=file.suffix
         )
     table, header = readers[file.suffix.lower()](file)
-    pairs = zip(table.column_names, table.columns, strict=True)
-    return {name: numeric(file, name, column, missing) for name, column in pairs}, header
+    return {name: numeric(file, name, table[name], missing) for name in table.column_names}, header
 
 
 def existing(path: str | Path) -> Path:
@@ -90,16 +89,14 @@ def existing(path: str | Path) -> Path:
         DataError: no such file; the hint names the nearest one.
     """
     file = Path(path)
-    if not file.is_file():
-        raise DataError(f"{file}: no such file", hint=_files_beside(file))
-    return file
-
-
-def _files_beside(file: Path) -> str | None:
+    if file.is_file():
+        return file
     if not file.parent.is_dir():
-        return f"the folder {file.parent} does not exist"
-    near = near_names(file.name, (other.name for other in file.parent.iterdir()))
-    return f"did you mean {file.with_name(near[0])}?" if near else None
+        hint = f"the folder {file.parent} does not exist"
+    else:
+        near = near_names(file.name, (other.name for other in file.parent.iterdir()))
+        hint = f"did you mean {file.with_name(near[0])}?" if near else None
+    raise DataError(f"{file}: no such file", hint=hint)
 
 
 def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:

@@ -40,11 +40,9 @@ POINT = 1e-4
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """An identified rigid robot.
+    """An identified rigid robot, and its friction beyond the robot file's.
 
-    Attributes:
-        system: robot with the identified inertial parameters, and the contacts.
-        friction: `(3 nq,)` viscous friction, Coulomb friction and offset of every joint, beyond the file's.
+    `friction` `(3 nq,)` holds viscous friction, Coulomb friction and offset of every joint.
     """
 
     system: ConstrainedSystem
@@ -207,8 +205,7 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name: what it is called.
-        system: robot and contacts by whose mass matrix its errors become torques.
+        name, system: what it is called, and the robot by whose mass matrix its errors become torques.
         predict: accelerations `(n, nq)` of a data set.
         std: `(nq,)` root-mean-square error on its training data, its constant uncertainty.
     """

@@ -85,11 +85,7 @@ def _rmse(error: Tensor, rows: Tensor, fewest: int) -> ByJoint:
 
 
 def moving_joints(qd: Tensor) -> Tensor:
-    """Whether each joint moves, `(n, nq)` bool: |q̇| > max(`REST` · its 95 % quantile, `SLOWEST`).
-
-    Args:
-        qd: `(n, nq)` joint velocities [rad/s, m/s].
-    """
+    """Whether each joint moves, `(n, nq)` bool: |q̇| > max(`REST` · its 95 % quantile, `SLOWEST`)."""
     fast = qd.abs().quantile(0.95, dim=0) if len(qd) < 1_000_000 else qd.abs().amax(0)
     return qd.abs() > (REST * fast).clamp(min=SLOWEST)
 
@@ -197,12 +193,7 @@ class Verdict:
 
 
 def verdicts(scores: Sequence[PredictorScores], joint_names: Sequence[str]) -> tuple[Verdict, ...]:
-    """The first predictor, the model, against each of the others.
-
-    Args:
-        scores: the model's, then those of the trivial predictors.
-        joint_names: one per error.
-    """
+    """The first predictor, the model, against each of the others."""
     model, *others = scores
     result = []
     for other in others:

@@ -3,7 +3,6 @@
 from forcegp.report.check import write_check
 from forcegp.report.html import (
     NONE,
-    Part,
     PictureBlock,
     Series,
     Table,
@@ -23,7 +22,6 @@ __all__ = [
     "INK",
     "NONE",
     "ModelPath",
-    "Part",
     "Picture",
     "PictureBlock",
     "RolloutData",

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import jinja2
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from forcegp.notebook import text
@@ -15,12 +14,6 @@ from forcegp.report.style import Picture
 Series = list[float]
 DIGITS = 7
 """Significant digits kept in series that are only drawn."""
-
-
-class Part(BaseModel):
-    """A part of a result file: frozen, no unknown field, no NaN."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def series(values: Tensor) -> Series:

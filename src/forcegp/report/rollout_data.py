@@ -8,20 +8,20 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from forcegp.files import Header
+from forcegp.files import Header, Record
 from forcegp.report.animation import FRAMES_PER_SECOND, arm_points, rounded
-from forcegp.report.html import Part, Series, series
+from forcegp.report.html import Series, series
 from forcegp.rollout.comparison import HORIZONS, LEVEL, Comparison
 
 
-class Band(Part):
+class Band(Record):
     """Bounds of a central band over function samples."""
 
     lower: Series
     upper: Series
 
 
-class ModelPath(Part):
+class ModelPath(Record):
     """The first predicted trajectory of one model, up to where it diverged.
 
     Attributes:
@@ -57,7 +57,7 @@ class ModelPath(Part):
     diverged_at: float | None
 
 
-class Film(Part):
+class Film(Record):
     """Points of an arm for an animation: frames × points × 3, flat [m]; `label` names the model."""
 
     label: str

@@ -6,7 +6,7 @@ import base64
 import io
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import matplotlib
 from matplotlib.figure import Figure
@@ -50,33 +50,8 @@ LABELS = {
 }
 """What a model is called in plots and tables."""
 
-SETTINGS: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.labelsize": 9.0,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#666666",
-    "axes.linewidth": 0.7,
-    "axes.grid": True,
-    "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "axes.unicode_minus": True,
-    "lines.linewidth": 1.1,
-    "figure.facecolor": "white",
-    "figure.constrained_layout.use": True,
-    "figure.constrained_layout.h_pad": 0.02,
-    "figure.constrained_layout.w_pad": 0.03,
-    "path.simplify_threshold": 0.5,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "forcegp",
-}
+STYLE = Path(__file__).parent / "templates" / "forcegp.mplstyle"
+"""Fonts, sizes and lines of plots."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +93,7 @@ def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, t
         title: short heading.
     """
     buffer = io.StringIO()
-    with matplotlib.rc_context(SETTINGS):
+    with matplotlib.rc_context({"svg.hashsalt": "forcegp"}, fname=STYLE):
         figure = Figure(figsize=size)
         paint(figure)
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})

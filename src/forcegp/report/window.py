@@ -21,14 +21,9 @@ GREY = "#9a9a9a"
 
 
 class WindowData(Header):
-    """Predictions of one model over a window of time.
+    """Predictions of one model over a window of time, by joint [rad/s²]; `clean` and `std` may be unknown.
 
-    Attributes:
-        model: registry name or kind.
-        noise_std: of the measured accelerations [rad/s²], if known.
-        t: time from the first sample [s].
-        joint_names: one per series.
-        measured, clean, mean, std: accelerations by joint [rad/s²]; `clean` and `std` may be unknown.
+    `noise_std` is that of the measured accelerations [rad/s²]; `t` is the time from the first sample [s].
     """
 
     FORMAT: ClassVar[str] = "forcegp-window"

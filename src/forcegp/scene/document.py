@@ -94,9 +94,8 @@ class Document:
             members: Any = dict(enumerate(value)) if isinstance(value, list) else value
             if isinstance(members, dict) and part in members:
                 prefix, value = (*prefix, part), members[part]
-        line = next(
-            (self._lines[prefix[:n]] for n in range(len(prefix), 0, -1) if prefix[:n] in self._lines), None
-        )
+        known = (prefix[:n] for n in range(len(prefix), 0, -1) if prefix[:n] in self._lines)
+        line = self._lines.get(next(known, ()))
         where = self.source if line is None else f"{self.source}:{line}"
         return f"{where}: {dotted(prefix)}" if prefix else where
 
@@ -109,10 +108,9 @@ class Document:
         if kind == "json_invalid":  # well-formed, as it was just written, but too deep for the validator
             return self.error(f"{self.source}: nested too deeply", got=context.get("error"))
         if kind in _UNKNOWN_KEY:
-            allowed = _allowed_keys(schema, key)
-            return self.error(
-                f"{place}: unknown key", expected=_one_of(allowed), hint=did_you_mean(last, allowed)
-            )
+            allowed = list(dict.fromkeys(name for t in _tables_at(schema, key[:-1]) for name in _hints(t)))
+            hint = did_you_mean(last, allowed)
+            return self.error(f"{place}: unknown key", expected=_one_of(allowed), hint=hint)
         if kind == "missing" and isinstance(key[-1], int):
             return self.error(f"{place}: too few numbers", expected=f"more than {last}")
         if kind == "missing":
@@ -158,11 +156,6 @@ def _check_keys(text: str, source: str, error: type[ForceGPError]) -> None:
 
 def _one_of(names: list[str]) -> str:
     return f"one of {', '.join(names)}"
-
-
-def _allowed_keys(schema: type, key: Key) -> list[str]:
-    """The keys of the table that contains a key."""
-    return list(dict.fromkeys(name for table in _tables_at(schema, key[:-1]) for name in _hints(table)))
 
 
 def _tags(schema: type, key: Key) -> list[str]:

@@ -8,26 +8,16 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    field_validator,
-)
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, field_validator
 
 from forcegp.constraints import Baumgarte
+from forcegp.files import Record
 from forcegp.simulate.config import SimulationConfig
 from forcegp.storage.system import ConnectionFields, ContactFields, Point
 
 
-class Section(BaseModel):
-    """A table of a TOML file: unknown keys and numbers that are not finite are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+class Section(Record, strict=True):
+    """A table of a TOML file."""
 
     def given(self) -> dict[str, Any]:
         """The keys that are in the file, with their values."""
@@ -89,7 +79,7 @@ class ModelSection(Section):
     standardize: bool = True
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: str | tuple[dict[str, Any], ...] = ()
-    analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = {}
+    analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = Field(default_factory=dict)
     hidden: tuple[PositiveInt, ...] = ()
     window: WindowSection = WindowSection()
     seed: NonNegativeInt | None = None

@@ -19,13 +19,12 @@ from typing import Any, ClassVar, TypeVar
 import safetensors
 import safetensors.torch
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.destination import check_destination
 from forcegp.errors import ModelError
-from forcegp.files import Header, atomic_file, validated
+from forcegp.files import Header, Record, atomic_file, validated
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
 from forcegp.resources import announce_memory
 from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
@@ -89,10 +88,8 @@ class ModelHeader(Header):
     system: dict[str, Any]
 
 
-class Settings(BaseModel):
-    """Base of what a kind of models keeps in `ModelHeader.settings`: frozen, no unknown field."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+class Settings(Record):
+    """Base of what a kind of models keeps in `ModelHeader.settings`."""
 
 
 SettingsT = TypeVar("SettingsT", bound=Settings)
@@ -144,7 +141,15 @@ def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
         if Path(path).is_dir():
             hint = "models were folders before version 3: fit the model again with this release"
         raise ModelError(f"{file} is not a saved model", expected="a file that Fit.save wrote", hint=hint)
-    return parse_model(_content(file, MODEL_BYTES), str(file))
+    try:
+        size = file.stat().st_size
+        if size > MODEL_BYTES:
+            raise ModelError(f"{file}: too large", expected=f"at most {MODEL_BYTES:,} bytes", got=f"{size:,}")
+        announce_memory(COPIES * size, f"reading {file}")
+        data = file.read_bytes()
+    except OSError as cause:
+        raise ModelError(f"{file}: cannot be read", got=cause.strerror or str(cause)) from cause
+    return parse_model(data, str(file))
 
 
 def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor]]:
@@ -203,18 +208,6 @@ def _digest(data: bytes, stated: str) -> str:
 def _entry(digest: str) -> bytes:
     """The hash in the header; within the text of another entry its quotes would be escaped."""
     return f'"{HEADER}":"{digest}'.encode()
-
-
-def _content(file: Path, most: int) -> bytes:
-    """The bytes of a file of bounded size."""
-    try:
-        size = file.stat().st_size
-        if size > most:
-            raise ModelError(f"{file}: too large", expected=f"at most {most:,} bytes", got=f"{size:,}")
-        announce_memory(COPIES * size, f"reading {file}")
-        return file.read_bytes()
-    except OSError as cause:
-        raise ModelError(f"{file}: cannot be read", got=cause.strerror or str(cause)) from cause
 
 
 def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, get_args
 
 import torch
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, Field
 from torch import Tensor
 
 from forcegp.constraints import (
@@ -24,7 +24,7 @@ from forcegp.constraints import (
     SurfaceSchema,
 )
 from forcegp.errors import ForceGPError, ModelError
-from forcegp.files import validated
+from forcegp.files import Record, validated
 from forcegp.robot.model import RobotModel
 
 SURFACES = get_args(get_args(SurfaceSchema)[0])
@@ -39,12 +39,6 @@ def _floats(value: object) -> object:
 
 
 Point = Annotated[tuple[float, float, float], BeforeValidator(_floats)]
-
-
-class Record(BaseModel):
-    """Base of all records: frozen; unknown fields and numbers that are not finite are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, from_attributes=True)
 
 
 class RobotRecord(Record):
@@ -206,7 +200,12 @@ def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> R
                 expected=length,
                 got=len(getattr(record, name)),
             )
-    _check_parents(record, source)
+    # Parents come before their children, and frames belong to joints that exist.
+    limits = {"parents": range(sizes["nq"]), "frame_parents": [sizes["nq"]] * sizes["nf"]}
+    for name, limit in limits.items():
+        for i, (parent, below) in enumerate(zip(getattr(record, name), limit, strict=True)):
+            if not -1 <= parent < below:
+                raise ModelError(f"{source}: field 'system.robot.{name}.{i}' names no joint", got=parent)
     axis = tensors.get(PREFIX + "axis")
     dtype = axis.dtype if axis is not None and axis.is_floating_point() else torch.float64
     arrays = {}
@@ -216,17 +215,6 @@ def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> R
             finite = field.name not in MAY_BE_INFINITE
             arrays[field.name] = take(tensors, PREFIX + field.name, shape, dtype, source, finite=finite)
     return RobotModel(**{name: getattr(record, name) for name in type(record).model_fields}, **arrays)
-
-
-def _check_parents(record: RobotRecord, source: str) -> None:
-    """Parents come before their children, and frames belong to joints that exist."""
-    for name, parents, limit in (
-        ("parents", record.parents, None),
-        ("frame_parents", record.frame_parents, len(record.parents)),
-    ):
-        for i, parent in enumerate(parents):
-            if not -1 <= parent < (i if limit is None else limit):
-                raise ModelError(f"{source}: field 'system.robot.{name}.{i}' names no joint", got=parent)
 
 
 def take(
@@ -265,15 +253,9 @@ def robot_tensors(robot: RobotModel) -> list[str]:
 
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
     """A robot with tensors named `<prefix><field>`, checked by `take`, and all else as in another one."""
-    fields = {
-        name: take(
-            tensors,
-            prefix + name,
-            tuple(getattr(like, name).shape),
-            getattr(like, name).dtype,
-            source,
-            finite=name not in MAY_BE_INFINITE,
-        )
-        for name in robot_tensors(like)
-    }
+    fields = {}
+    for name in robot_tensors(like):
+        value, finite = getattr(like, name), name not in MAY_BE_INFINITE
+        shape = tuple(value.shape)
+        fields[name] = take(tensors, prefix + name, shape, value.dtype, source, finite=finite)
     return like.replace(**fields)

@@ -30,12 +30,7 @@ SIZES = {"box": {"size": 3}, "cylinder": {"radius": 1, "length": 1}, "sphere": {
 
 @dataclass(frozen=True)
 class Shape:
-    """A rigid convex part of a link.
-
-    Attributes:
-        link: index of the joint that moves it, −1 for the base.
-        points: `(k, 3)` its corners in the link frame [m].
-    """
+    """A convex part of the link that joint `link` moves (−1: base): corners `(k, 3)` in its frame [m]."""
 
     link: int
     points: Array
@@ -71,12 +66,9 @@ def turn_z(direction: Array) -> Array:
 
 
 def shapes_of(robot: RobotModel, source: str | Path | None = None) -> list[Shape]:
-    """The parts of a robot.
+    """The parts of a robot, from its file or a bundled one; without a URDF file, rods between its joints.
 
-    Args:
-        robot: the robot.
-        source: its file, or the name of a bundled robot; by default a bundled robot of the same name and
-            frames is recognised. Without a URDF file the robot is made of rods between its joints.
+    By default a bundled robot of the same name and frames is recognised.
 
     Raises:
         RobotFileError: the shapes of the file are not valid.
@@ -163,10 +155,7 @@ def _hull(file: Path) -> Array:
 
 
 def _mesh_file(name: str, folder: Path) -> Path | None:
-    """A mesh that a robot file names, below its folder or the package that it names; `None` if none is found.
-
-    A name never leads out of these folders.
-    """
+    """A mesh that a robot file names, never outside of its folder or the package; `None` if none is found."""
     package, _, rest = name.removeprefix("package://").partition("/")
     if name.startswith("package://"):
         roots = [parent / package for parent in (folder, *folder.resolve().parents)] + [folder]
