@@ -46,16 +46,13 @@ def farthest_points(
     """Indices of points each of which is farthest from those before it, by exact Euclidean distance.
 
     i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}|; of equal distances the lowest index wins, so the result
-    is deterministic, and the first k of it are the result for k points. O(n d) a point, O(n) memory.
+    is deterministic, and the first k of it are the result for k points. O(n d) per point, O(n) memory.
 
     Args:
         x: `(n, d)` points.
         count: how many to choose.
         start: the first point; default the one closest to the mean.
         progress: called after each point with the number chosen so far.
-
-    Returns:
-        `(count,)` indices in the order of selection.
 
     Raises:
         DataError: there are fewer than `count` distinct points, or no point `start`.

@@ -65,9 +65,7 @@ def read_table(
 ) -> tuple[Columns, DataHeader]:
     """Read the numeric columns of a Parquet or CSV file, and its header (defaults where it has none).
 
-    Args:
-        path: the file.
-        missing: whether an empty value is an error or becomes a NaN.
+    An empty value is an error, or a NaN where `missing` is `"nan"`.
 
     Raises:
         DataError: no such file, a kind of file that is not read, or one that is damaged or too large.
@@ -83,11 +81,7 @@ def read_table(
 
 
 def existing(path: str | Path) -> Path:
-    """The path of a file that exists.
-
-    Raises:
-        DataError: no such file; the hint names the nearest one.
-    """
+    """The path of a file that exists, else a `DataError` whose hint names the nearest one."""
     file = Path(path)
     if file.is_file():
         return file
@@ -218,11 +212,7 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
 
 
 def numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
-    """The values of a column.
-
-    Raises:
-        DataError: a value is missing, and that is refused.
-    """
+    """The values of a column; a missing one is a `DataError`, or a NaN."""
     if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(

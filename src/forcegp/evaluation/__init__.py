@@ -122,12 +122,8 @@ def evaluate(
             predictors; by default those of the model, before it learned any parameters of theirs.
         progress: called with the number of states predicted and their total number.
 
-    Returns:
-        Scores over all joints and by joint, and the verdict.
-
     Raises:
-        DataError: the data are empty, or their joints are not the robot's.
-        UnknownNameError: a contact is not in the data.
+        ForceGPError: the data are empty, their joints are not the robot's, or they lack a contact.
     """
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")

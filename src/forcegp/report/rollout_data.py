@@ -69,16 +69,12 @@ class RolloutData(Header):
 
     Attributes:
         t: time since the start [s].
-        tip: logged x, y and z of the tip [m].
-        multiplier: logged λ of the first contact [N]; empty if it is not logged.
+        tip, multiplier: logged x, y, z of the tip [m]; λ of the first contact [N], empty if not logged.
         starts: number of starts of the medians.
-        band_starts, band_seconds: number of starts and duration of the bands and their coverage.
-        level: nominal coverage of the bands.
+        band_starts, band_seconds, level: starts, duration and nominal coverage of the bands.
         horizons: times of `ModelPath.errors` [s].
         models: one per model.
-        frame_times: of the animation [s].
-        bodies: number of points of the arm in each frame.
-        films: the logged motion and one per model.
+        frame_times, bodies, films: animation times [s], points of the arm, and arms, the logged one first.
     """
 
     FORMAT: ClassVar[str] = "forcegp-rollout"
@@ -102,9 +98,7 @@ class RolloutData(Header):
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
     """The data of the section from a comparison; curves are those of its first start.
 
-    Args:
-        comparison: the comparison.
-        calibration: the same models on another motion, on which the bands are calibrated.
+    Bands are calibrated on `calibration`, the same models on another motion.
     """
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))

@@ -84,14 +84,7 @@ def line(model: str) -> str | tuple[float, tuple[float, ...]]:
 
 
 def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, title: str = "") -> Picture:
-    """Draw a plot as SVG in the style of this project, without changing global settings.
-
-    Args:
-        paint: fills the empty canvas.
-        size: width and height [inch]; a page column is 4.6 wide.
-        alt: what the plot shows.
-        title: short heading.
-    """
+    """Draw a plot of a size [inch] as SVG in the style of this project, without changing global settings."""
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "forcegp"}, fname=STYLE):
         figure = Figure(figsize=size)

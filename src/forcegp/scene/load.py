@@ -56,11 +56,7 @@ class Scene:
         return ModelTable(self.sections.model, self.document)
 
     def robot(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> RobotModel:
-        """The robot.
-
-        Raises:
-            SceneError: the robot cannot be loaded; the message names the key and line.
-        """
+        """The robot; a `SceneError` names the key and line."""
         section = self.sections.robot
         bundled = section.model in BUNDLED_ROBOTS
         source = section.model if bundled else self.folder / section.model
@@ -77,11 +73,7 @@ class Scene:
     def system(
         self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
     ) -> ConstrainedSystem:
-        """The robot with its contacts.
-
-        Raises:
-            SceneError: a part is not valid; the message names the key and line.
-        """
+        """The robot with its contacts; a `SceneError` names the key and line."""
         robot, sections, at = self.robot(dtype, device), self.sections, self.document.at
         tables = [(("contact", i), table) for i, table in enumerate(sections.contact)]
         tables += [(("connection", i), table) for i, table in enumerate(sections.connection)]

@@ -72,13 +72,7 @@ COPIES = 3
 
 
 class ModelHeader(Header):
-    """What a saved model says of itself.
-
-    Attributes:
-        kind: class of models, `Model.kind`.
-        settings: what the kind needs beside its tensors.
-        system: the system, as written by `pack_system`.
-    """
+    """Header of a saved model: `Model.kind`, its settings, and its system as `pack_system` wrote it."""
 
     FORMAT: ClassVar[str] = "forcegp-model"
     VERSION: ClassVar[int] = 3

@@ -66,12 +66,10 @@ def at_rest(system: ConstrainedSystem) -> Motion:
 
 
 def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = None) -> Motion:
-    """The logged motion of one trajectory, with the contact force.
+    """The logged motion of one trajectory, with the force of a model or else the logged multiplier.
 
-    Args:
-        system: robot and contacts.
-        data: rows of one trajectory in the order of time.
-        model: predicts the force with its uncertainty; without one it is the logged multiplier, if any.
+    Raises:
+        DataError: no rows, or they do not fit the robot.
     """
     data = data.select(system.robot.joint_names)
     if not len(data):
