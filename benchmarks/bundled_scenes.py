@@ -31,8 +31,9 @@ def simulated(name: str, duration: float) -> tuple[ConstrainedSystem, Dataset]:
 
 def report(name: str, before: Evaluation, after: Evaluation) -> str:
     """One line of results."""
-    assert before.clean is not None and after.clean is not None and after.coverage_noisy is not None
-    line = f"{name:16} {before.clean.rmse:12.4f} {after.clean.rmse:12.4f} {after.coverage_noisy:10.0%}"
+    assert before.clean is not None and after.clean is not None and after.uncertainty is not None
+    coverage = after.uncertainty.coverage_noisy
+    line = f"{name:16} {before.clean.rmse:12.4f} {after.clean.rmse:12.4f} {coverage:10.0%}"
     for force in after.multipliers:
         line += f"   {force.contact}: {force.bias:+.2f} ± {force.spread:.2f} N"
     return line

@@ -91,7 +91,7 @@ def run(case: dict[str, Any]) -> dict[str, Any]:
         result |= {"converged": fit.result.converged, "warnings": list(fit.result.warnings)}
         result |= {"evaluations": fit.result.evaluations, "objective": fit.result.objective}
         result["not_positive"] = sum(_not_positive(fit, part) for part in (train, test))
-        result["coverage"] = evaluate(fit, test, compare=False).coverage_noisy
+        result["coverage"] = evaluate(fit, test, compare=False).uncertainty.coverage_noisy
         if _comparable(fit, case):
             near, far = train[:REFERENCES], test[:: len(test) // REFERENCES]
             result["deviation"] = deviation_errors(fit, forcegp.Dataset.concatenate([near, far]))

@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 import typer
 
 from forcegp.cli import main
-from forcegp.cli.common import AsJson, progress_bar, show
+from forcegp.cli.common import progress_bar, show
+from forcegp.cli.options import AsJson
 
 INTERRUPTED = 130
 """Exit code after an interrupt."""

@@ -94,9 +94,9 @@ def covariance_blocks(model: StructuredFit, data: Dataset, name: str) -> Covaria
         model=name,
         t=report.series(data.t),
         nq=system.robot.nq,
-        operators=[report.matrix(H) for H in at.eom.H],
-        force=report.matrix(k_Q),
-        acceleration=report.matrix(k_qdd),
+        operators=[_matrix(H) for H in at.eom.H],
+        force=_matrix(k_Q),
+        acceleration=_matrix(k_qdd),
         rank=int((eigenvalues > RANK_TOLERANCE * eigenvalues[-1]).sum()),
     )
 
@@ -151,3 +151,7 @@ def _grid(axes: Axes, states: int, nq: int) -> None:
     axes.xaxis.tick_top()
     for spine in axes.spines.values():
         spine.set_visible(True)
+
+
+def _matrix(values: Tensor) -> list[report.Series]:
+    return [report.series(row) for row in values]

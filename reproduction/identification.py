@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from forcegp import report
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.files import Header
+from forcegp.files import Header, Record
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.sets import contact_priors, default_priors
 from forcegp.gp.optimise import LearningOptions, minimise
@@ -23,6 +23,7 @@ from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.robot.model import RobotModel
 from reproduction.stages import write_data
+from reproduction.statements import Statement
 from reproduction.task import Task
 
 WRONG_MASS = 2.5
@@ -64,7 +65,7 @@ def wrong_parameters(robot: RobotModel) -> LastLink:
     return LastLink(robot.replace(mass=mass, placement_position=position))
 
 
-class IdentificationRun(report.Part):
+class IdentificationRun(Record):
     """Analytical parameters over the iterations of one model.
 
     Attributes:
@@ -260,7 +261,7 @@ def _legend(figure: Figure, axes: Axes, columns: int) -> None:
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=min(columns, len(unique)))
 
 
-def identification_finding(data: IdentificationData) -> report.Statement | None:
+def identification_finding(data: IdentificationData) -> Statement | None:
     """Whether mass and offset are found."""
     words, good = [], []
     for model in dict.fromkeys(run.model for run in data.runs):
@@ -273,7 +274,7 @@ def identification_finding(data: IdentificationData) -> report.Statement | None:
             + (f", within tolerance from evaluation {max(_settled(r, data) for r in runs)} on" if ok else "")
         )
     text = f"After learning from {data.points} points without knowing the friction (worst seed): "
-    return report.Statement("Identification", all(good), text + "; ".join(words) + ".") if data.runs else None
+    return Statement("Identification", all(good), text + "; ".join(words) + ".") if data.runs else None
 
 
 def _settled(run: IdentificationRun, data: IdentificationData) -> int:

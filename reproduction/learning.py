@@ -15,8 +15,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from forcegp import report
 from reproduction.results import GP_MODELS, PAPER_KERNELS, SPLITS, PaperNumbers, Results, like
+from reproduction.statements import Statement, number
 
 WIDTH = 4.6
+MARKERS = {"analytical": "x", "nn": "v", "gp": "s", "sgp-zero": "o", "sgp-mean": "D", "sgp-contact": "^"}
 FLOOR = (2.0 / torch.pi) ** 0.5
 """Mean magnitude of standard normal noise, a lower bound on the error against noisy accelerations."""
 PAPER_LINE, KERNEL_LINE = (0, (2, 1.5)), (0, (6, 1.5))
@@ -120,7 +122,7 @@ def _curves(axes: Axes, results: Results, split: str, measure: str) -> None:
     for model in GP_MODELS:
         style = {
             "color": report.colour(model),
-            "marker": report.MARKERS[model],
+            "marker": MARKERS[model],
             "markersize": 4.0,
             "label": report.label(model),
         }
@@ -170,7 +172,7 @@ def curve_table(results: Results, paper: PaperNumbers, kind: str) -> report.Tabl
     rows = []
     for model in (m for m in (*GP_MODELS, *PAPER_KERNELS.values()) if m in results.models):
         for split in SPLITS:
-            values = [report.number(results.values(model, split, n, f"{kind}_mae"), 4) for n in sizes]
+            values = [number(results.values(model, split, n, f"{kind}_mae"), 4) for n in sizes]
             rows.append((f"{report.label(model)}, {SPLITS[split]}", *values))
         theirs = paper.beside(results, model) if kind == "noisy" else None
         if theirs is not None:
@@ -190,7 +192,7 @@ def residual_table(results: Results, paper: PaperNumbers) -> report.Table:
     rows = []
     for model in (m for m in GP_MODELS if m in results.models):
         ends = results.sizes(model)[0], results.sizes(model)[-1]
-        ours = [report.number(results.values(model, "stretches", n, "residual")) for n in ends]
+        ours = [number(results.values(model, "stretches", n, "residual")) for n in ends]
         theirs = [f"{v:.0e}" for v in paper.residual.get(model, ())] or [report.NONE, report.NONE]
         rows.append((report.label(model), f"{ends[0]}, {ends[1]}", " to ".join(ours), " to ".join(theirs)))
     return report.Table(
@@ -200,7 +202,7 @@ def residual_table(results: Results, paper: PaperNumbers) -> report.Table:
     )
 
 
-def against_paper(results: Results, paper: PaperNumbers, model: str) -> report.Statement | None:
+def against_paper(results: Results, paper: PaperNumbers, model: str) -> Statement | None:
     """Our error on the paper's split against the paper's at every N, with the paper's kernel first."""
     same = like(results, model)
     pairs = {
@@ -222,12 +224,10 @@ def against_paper(results: Results, paper: PaperNumbers, model: str) -> report.S
     if same != model:
         n, best = max(results.sizes(model)), results.mean(model, "selection", None, "noisy_mae")
         text += "" if best is None else f". With our default kernels {best:.3f} at N = {n}"
-    return report.Statement(
-        f"{report.label(model)} against the paper", not above, f"{text}. {UNKNOWN}", ERROR_WORDS
-    )
+    return Statement(f"{report.label(model)} against the paper", not above, f"{text}. {UNKNOWN}", ERROR_WORDS)
 
 
-def efficiency(results: Results, paper: PaperNumbers) -> report.Statement | None:
+def efficiency(results: Results, paper: PaperNumbers) -> Statement | None:
     """How many points the zero-mean structured model needs to reach the paper's best error."""
     target, words, reached = paper.noisy_mae["sgp-zero"][-1], [], []
     for model in (m for m in (PAPER_KERNELS["sgp-zero"], "sgp-zero") if m in results.models):
@@ -245,4 +245,4 @@ def efficiency(results: Results, paper: PaperNumbers) -> report.Statement | None
         f"noise, {FLOOR * results.noise_std:.4f} rad/s²; close to it, only the error against noise-free "
         f"accelerations separates models. {UNKNOWN}"
     )
-    return report.Statement("Points needed", reached[0], text, POINTS_WORDS)
+    return Statement("Points needed", reached[0], text, POINTS_WORDS)

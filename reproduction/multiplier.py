@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forcegp import report
-from forcegp.files import Header
+from forcegp.files import Header, Record
 from forcegp.models.load import load_model
 from reproduction.fits import MODEL
 from reproduction.stages import write_data
+from reproduction.statements import Statement
 from reproduction.task import Task, motion_of
 
 STEP = 4
@@ -25,7 +26,7 @@ INSIDE = 0.90
 WIDTH = 4.6
 
 
-class MultiplierBand(report.Part):
+class MultiplierBand(Record):
     """The multiplier as one model predicts it.
 
     Attributes:
@@ -160,7 +161,8 @@ def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> report.Pictur
         both, error = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         filled: dict[str, Any] = {"color": shown, "alpha": 0.3, "linewidth": 0, "label": "±2σ"}
         for axes, centre in ((both, torch.zeros_like(mean)), (error, simulated)):
-            report.shade(axes, data.held_out)
+            for first, last in data.held_out:
+                axes.axvspan(first, last, color="#f1ead2", zorder=0, linewidth=0)
             axes.fill_between(data.t, mean - spread - centre, mean + spread - centre, **filled)
             axes.plot(data.t, simulated - centre, color=report.INK, linewidth=1.0, label="simulator")
             axes.plot(data.t, mean - centre, color=shown, linewidth=1.1, label="predicted")
@@ -180,7 +182,7 @@ def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> report.Pictur
     return report.draw(paint, (WIDTH, 4.2), alt, report.label(band.model))
 
 
-def multiplier_finding(data: MultiplierData) -> report.Statement | None:
+def multiplier_finding(data: MultiplierData) -> Statement | None:
     """Whether the multiplier is positive and within its band."""
     listed = "; ".join(
         f"{report.label(b.model)}: ±2σ coverage {100 * b.inside:.0f} %"
@@ -199,4 +201,4 @@ def multiplier_finding(data: MultiplierData) -> report.Statement | None:
             " Accelerations do not show the force along the surface normal, as H Aᵀ = 0; with a zero mean "
             "nothing else does, so only models with the analytical mean (eq. 25) can predict λ."
         )
-    return report.Statement("Multiplier", agrees, text) if data.bands else None
+    return Statement("Multiplier", agrees, text) if data.bands else None

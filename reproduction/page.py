@@ -11,6 +11,7 @@ from reproduction.covariance import CovarianceData, covariance_block
 from reproduction.identification import IdentificationData, identification_block, identification_finding
 from reproduction.multiplier import MultiplierData, draw_multiplier, multiplier_block, multiplier_finding
 from reproduction.results import PaperNumbers, Results, paper_numbers
+from reproduction.statements import Statement
 from reproduction.task_space import TaskSpaceData, task_space_block
 from reproduction.trajectories import bands, tip_error
 
@@ -32,7 +33,15 @@ class FigureData:
     rollouts: report.RolloutData
 
 
-def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list[report.Statement]:
+def common_limit(windows: Sequence[report.WindowData]) -> float:
+    """A half height [rad/s²] that fits the noise and the errors of the better half of the models."""
+    if not windows:
+        return 0.5
+    largest = sorted(float(window.error.abs().quantile(0.995)) for window in windows)
+    return max(4.0 * (windows[0].noise_std or 0.0), 1.3 * largest[(len(largest) - 1) // 2])
+
+
+def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list[Statement]:
     """All findings that the results allow."""
     found = [learning.against_paper(results, paper, model) for model in paper.noisy_mae]
     found += [
@@ -103,7 +112,7 @@ def prediction_blocks(
     windows: Sequence[report.WindowData],
 ) -> tuple[report.PictureBlock, report.PictureBlock]:
     """Both figures under their captions."""
-    seconds, limit = f"{windows[0].seconds:.1f} s" if windows else "", report.common_limit(windows)
+    seconds, limit = f"{windows[0].seconds:.1f} s" if windows else "", common_limit(windows)
     predictions = report.PictureBlock(
         "Figure 4: predictions",
         f"Accelerations of all joints over the same {seconds} of held-out motion without training points: "

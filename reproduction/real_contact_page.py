@@ -16,6 +16,7 @@ from forcegp.scene import load_scene
 from reproduction import real_contact
 from reproduction.multiplier import MultiplierBand, MultiplierData, draw_multiplier, spans
 from reproduction.stages import Say, Stage, run_stages
+from reproduction.statements import Statement
 
 PROFILE, PAGE, RESULTS, MARKDOWN = "real-contact", "report.html", "results.json", "results.md"
 DURATION = 60.0
@@ -130,22 +131,22 @@ def tables(results: dict[str, dict[str, Any]]) -> tuple[report.Table, report.Tab
     return first, report.Table("Normal force against MuJoCo's, held-out rows in contact", head, tuple(rows))
 
 
-def findings(results: dict[str, dict[str, Any]]) -> list[report.Statement]:
+def findings(results: dict[str, dict[str, Any]]) -> list[Statement]:
     """What was asked, and whether it holds."""
     shares = [share for numbers in results.values() for share in numbers["rows_right"].values()]
     text = f"At least {100 * min(shares):.2f} % of rows are right; asked: {100 * ROWS_RIGHT:.0f} %."
-    said = [report.Statement("Contact detection", min(shares) >= ROWS_RIGHT, text)]
+    said = [Statement("Contact detection", min(shares) >= ROWS_RIGHT, text)]
     surface = [numbers["surface"] for numbers in results.values()]
     offset, tilt = (max(one[name] for one in surface) for name in ("offset_mm", "tilt_degrees"))
     text = f"Offset within {offset:.2f} mm, tilt within {tilt:.3f}°; asked: {OFFSET_MM} mm, {TILT_DEGREES}°."
-    said.append(report.Statement("Surface", offset <= OFFSET_MM and tilt <= TILT_DEGREES, text))
+    said.append(Statement("Surface", offset <= OFFSET_MM and tilt <= TILT_DEGREES, text))
     for scene, numbers in results.items():
         for variant in ("torques", "sensor"):
             said.append(_force_finding(f"{scene}, {NAMES[variant]}", numbers[variant]))
     return said
 
 
-def _force_finding(topic: str, score: dict[str, Any]) -> report.Statement:
+def _force_finding(topic: str, score: dict[str, Any]) -> Statement:
     low, high = COVERAGE
     agrees = (
         abs(score["bias"]) <= BIAS
@@ -158,7 +159,7 @@ def _force_finding(topic: str, score: dict[str, Any]) -> report.Statement:
         f"{score['correlation']:.3f}; ±2σ hold {100 * score['coverage']:.0f} %. Asked: {BIAS} ± {SPREAD} N, "
         f"{CORRELATION}, {100 * low:.0f} to {100 * high:.0f} %."
     )
-    return report.Statement(topic, agrees, text)
+    return Statement(topic, agrees, text)
 
 
 @torch.no_grad()

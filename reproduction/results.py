@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from forcegp.errors import DataError
-from forcegp.files import Header
-from forcegp.report import Part
+from forcegp.files import Header, Record
 
 GP_MODELS = ("gp", "sgp-zero", "sgp-mean", "sgp-contact")
 PAPER_KERNELS = {"sgp-zero": "sgp-zero-se", "sgp-mean": "sgp-mean-se", "sgp-contact": "sgp-contact-se"}
@@ -16,7 +15,7 @@ SPLITS = {"stretches": "held-out stretches", "selection": "paper's split"}
 """The two ways of choosing test samples, and what they are called."""
 
 
-class Score(Part):
+class Score(Record):
     """How one fitted model does on one set of test samples.
 
     Attributes:

@@ -7,6 +7,7 @@ from itertools import pairwise
 from forcegp import report
 from reproduction.learning import paper_value
 from reproduction.results import GP_MODELS, SPLITS, PaperNumbers, Results, like
+from reproduction.statements import Statement, number
 
 RESIDUAL = 1e-11
 """Mean constraint residual below which only rounding is left [m/s²]."""
@@ -23,7 +24,7 @@ def error_table(results: Results, paper: PaperNumbers) -> report.Table:
     for model in results.models:
         points = results.sizes(model)[-1]
         cells = [
-            report.number(results.values(model, split, points, f"{kind}_mae"), 4)
+            number(results.values(model, split, points, f"{kind}_mae"), 4)
             for split in SPLITS
             for kind in ("noisy", "clean")
         ]
@@ -40,9 +41,7 @@ def overview_table(results: Results) -> report.Table:
     for model in (m for m in results.models if m not in ("nn-30-20", "nn-200x4") and not m.endswith("-se")):
         points = results.sizes(model)[-1]
         measures = (("clean_mae", 4), ("coverage_noisy", 3), ("residual", 3))
-        cells = [
-            report.number(results.values(model, "stretches", points, m), digits) for m, digits in measures
-        ]
+        cells = [number(results.values(model, "stretches", points, m), digits) for m, digits in measures]
         rows.append((report.label(model), str(points), *cells))
     return report.Table(
         "Motion without training points: error against noise-free q̈, coverage of noisy q̈",
@@ -58,12 +57,12 @@ def quality_table(results: Results) -> report.Table:
         points = results.sizes(model)[-1]
         own = [s for s in results.scores if (s.model, s.split, s.points) == (model, "stretches", points)]
         measures = ("coverage_noisy", "coverage_clean", "nlpd", "residual")
-        cells = [report.number(results.values(model, "stretches", points, name)) for name in measures]
+        cells = [number(results.values(model, "stretches", points, name)) for name in measures]
         memory = [None if s.peak_memory is None else s.peak_memory / MEGABYTE for s in own]
         cost = [
-            report.number([s.fit_seconds for s in own], 1),
-            report.number([1e3 * s.predict_seconds / s.test_samples for s in own], 2),
-            report.number(memory, 0),
+            number([s.fit_seconds for s in own], 1),
+            number([1e3 * s.predict_seconds / s.test_samples for s in own], 2),
+            number(memory, 0),
         ]
         rows.append((report.label(model), str(points), *cells, *cost))
     coverage = ("±2σ coverage (noisy)", "±2σ coverage (clean)")
@@ -72,7 +71,7 @@ def quality_table(results: Results) -> report.Table:
     return report.Table("Uncertainty, constraint and cost, held-out stretches", head, tuple(rows))
 
 
-def order(results: Results) -> report.Statement | None:
+def order(results: Results) -> Statement | None:
     """The order of the models by their error on held-out stretches, pair by pair as the paper has it.
 
     Structured models and the GP are compared at their largest common number of training points, with the
@@ -97,7 +96,7 @@ def order(results: Results) -> report.Statement | None:
             pairs.append(_pair(results, ("analytical", results.sizes("analytical")[-1]), gp))
     listed = "; ".join(text for _, text in pairs)
     text = f"Error on held-out stretches [rad/s²], beside the paper's order: {listed}."
-    return report.Statement("Order of the models", all(same for same, _ in pairs), text)
+    return Statement("Order of the models", all(same for same, _ in pairs), text)
 
 
 def _pair(
@@ -116,7 +115,7 @@ def _pair(
     return found == wanted, text
 
 
-def splits(results: Results) -> report.Statement | None:
+def splits(results: Results) -> Statement | None:
     """How much the paper's split flatters."""
     rows = []
     for model in (m for m in GP_MODELS if m in results.models):
@@ -126,10 +125,10 @@ def splits(results: Results) -> report.Statement | None:
         "Clean error on stretches of motion without any training point, against the paper's split, whose "
         f"test samples lie next to training points: {'; '.join(rows)} rad/s²."
     )
-    return report.Statement("Held-out stretches", None, text) if rows else None
+    return Statement("Held-out stretches", None, text) if rows else None
 
 
-def calibration(results: Results) -> report.Statement | None:
+def calibration(results: Results) -> Statement | None:
     """Whether the ±2σ bands have the right coverage."""
     models = (m for m in GP_MODELS if m in results.models)
     found = {m: results.mean(m, "stretches", None, "coverage_noisy") for m in models}
@@ -138,10 +137,10 @@ def calibration(results: Results) -> report.Statement | None:
     listed = ", ".join(f"{report.label(m)} {share:.3f}" for m, share in shares.items())
     verdict = f"not calibrated: {', '.join(outside)}" if outside else "all are calibrated"
     text = f"±2σ coverage of noisy accelerations (nominal 0.954): {listed}; {verdict}."
-    return report.Statement("Uncertainty", not outside, text) if shares else None
+    return Statement("Uncertainty", not outside, text) if shares else None
 
 
-def constraint(results: Results) -> report.Statement | None:
+def constraint(results: Results) -> Statement | None:
     """Whether predictions obey the constraint."""
     found = {m: [s.residual for s in results.scores if s.model == m and s.residual] for m in GP_MODELS}
     worst = {m: max(values) for m, values in found.items() if values}
@@ -153,4 +152,4 @@ def constraint(results: Results) -> report.Statement | None:
         else f"a structured model is above {RESIDUAL:.0e}, which should not happen"
     )
     text = f"Largest mean |A q̈ − b| over all fits: {listed} m/s²; {verdict}."
-    return report.Statement("Constraint", agrees, text) if worst else None
+    return Statement("Constraint", agrees, text) if worst else None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -30,7 +29,7 @@ from reproduction.results import PAPER_KERNELS, SPLITS, Results
 from reproduction.stages import Say, Stage, run_stages, version_of, write_data
 from reproduction.task import SCENE, Task, simulate_task, summary_of, task_stages
 from reproduction.task_space import TaskSpaceData, make_task_space
-from reproduction.trajectories import make_rollouts
+from reproduction.trajectories import make_rollouts, together
 
 PAGE, RESULTS, MARKDOWN, VIEW = "report.html", "results.json", "results.md", "view.html"
 PACKAGES = ("forcegp", "torch", "numpy", "scipy", "pybullet", "mujoco", "matplotlib")
@@ -113,7 +112,7 @@ class Plan:
             task_space=self.task_space.data(TaskSpaceData),
             windows=[stage.data(report.WindowData) for stage in self.windows],
             identification=together_of,
-            rollouts=report.together([stage.data(report.RolloutData) for stage in self.rollouts]),
+            rollouts=together([stage.data(report.RolloutData) for stage in self.rollouts]),
         )
 
 
@@ -235,10 +234,8 @@ def shown(sizes: Profile, fits: Sequence[Fit]) -> list[Fit]:
 
 
 def viewed(fits: Sequence[Fit]) -> list[Fit]:
-    """The fit that the view shows: the largest structured one; none if viser is not installed."""
+    """The fit that the view shows: the largest structured one."""
     fits = [fit for fit in fits if fit.name.startswith("sgp") and fit.name not in PAPER_KERNELS.values()]
-    if find_spec("viser") is None:
-        return []
     return sorted(fits, key=lambda fit: (fit.points, fit.name == "sgp-mean"))[-1:]
 
 

@@ -58,7 +58,7 @@ def task_space_motion(t: Tensor, motion: Mapping[str, Tensor], rows: Tensor) -> 
     vectors = [prefix + name for prefix in ("planned_", "") for name in UNITS]
     return TaskSpaceData(
         t=report.series(t[rows]),
-        waypoints=report.matrix(motion["waypoints"][torch.arange(first + 1, last + 1)]),
+        waypoints=[report.series(row) for row in motion["waypoints"][torch.arange(first + 1, last + 1)]],
         **{name: report.columns(motion[name][rows]) for name in vectors},
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -13,6 +14,7 @@ from forcegp.models.load import load_model
 from forcegp.rollout import compare
 from reproduction.fits import MODEL
 from reproduction.stages import write_data
+from reproduction.statements import Statement
 from reproduction.task import LOG, Task
 
 OTHER_MOTION = 1000
@@ -64,7 +66,7 @@ def make_rollouts(
         seconds = min(seconds, stretch)
         chosen = _calibration_starts(task, seconds, CALIBRATION_STARTS * starts)
         calibration = compare(models, task.data, seconds, chosen, samples, system=task.system)
-        found = report.with_bands(found, report.rollout_data(bands, calibration))
+        found = with_bands(found, report.rollout_data(bands, calibration))
     write_data(folder, found)
 
 
@@ -82,7 +84,43 @@ def _calibration_starts(task: Task, seconds: float, most: int) -> torch.Tensor:
     return torch.tensor(rows)
 
 
-def tip_error(data: report.RolloutData) -> report.Statement | None:
+def with_bands(paths: report.RolloutData, bands: report.RolloutData) -> report.RolloutData:
+    """Trajectories of mean functions with the bands of another, cheaper comparison of the same models.
+
+    Bands cost one trajectory per sample, so they may cover fewer starts and a shorter time.
+
+    Args:
+        paths: tip errors, drift and multiplier over the whole time.
+        bands: of the models that have function samples, from the same first start.
+    """
+    sampled = {band.model: band for band in bands.models}
+    models = [_with_bands(p, sampled[p.model]) if p.model in sampled else p for p in paths.models]
+    seconds = {"band_starts": bands.starts, "band_seconds": bands.band_seconds}
+    return paths.model_copy(update={"models": models, **seconds})
+
+
+def together(parts: Sequence[report.RolloutData]) -> report.RolloutData:
+    """Trajectories of several models, from one comparison each with the same log.
+
+    Args:
+        parts: at least one; each from the same starts.
+    """
+    # Models without function samples have no bands, whose duration is then that of the trajectories.
+    whole = min(parts, key=lambda part: part.band_seconds)
+    models = [model for part in parts for model in part.models]
+    films = [parts[0].films[0], *(film for part in parts for film in part.films[1:])]
+    return whole.model_copy(update={"models": models, "films": films})
+
+
+def _with_bands(path: report.ModelPath, band: report.ModelPath) -> report.ModelPath:
+    drifts = [x.worst_drift for x in (path, band) if x.worst_drift is not None]
+    times = [x.diverged_at for x in (path, band) if x.diverged_at is not None]
+    names = ("tip_bands", "multiplier_band", "lost", "coverage", "inflation", "calibrated_coverage")
+    worst = {"worst_drift": max(drifts, default=None), "diverged_at": min(times, default=None)}
+    return path.model_copy(update={name: getattr(band, name) for name in names} | worst)
+
+
+def tip_error(data: report.RolloutData) -> Statement | None:
     """The S-GP with analytical mean against models that do not learn forces, one second ahead."""
     if HORIZON not in data.horizons:
         return None
@@ -102,12 +140,10 @@ def tip_error(data: report.RolloutData) -> report.Statement | None:
         f"Open loop, median over {data.starts} starts, {HORIZON:g} s ahead: {report.label(OURS)} "
         f"{_millimetres(ours)} (target: at most a fifth of each of the following); {listed}{beside}."
     )
-    return report.Statement(
-        "Tip error of trajectories", all(ratio <= FIFTH for ratio in ratios.values()), text
-    )
+    return Statement("Tip error of trajectories", all(ratio <= FIFTH for ratio in ratios.values()), text)
 
 
-def bands(data: report.RolloutData) -> report.Statement | None:
+def bands(data: report.RolloutData) -> Statement | None:
     """Whether bands over function samples have the right coverage of the simulated motion."""
     sampled = [path for path in data.models if path.coverage is not None]
     if not sampled:
@@ -128,7 +164,7 @@ def bands(data: report.RolloutData) -> report.Statement | None:
         + "; ".join(listed)
         + (f"; outside: {', '.join(outside)}." if outside else ".")
     )
-    return report.Statement("Bands of trajectories", not outside, text)
+    return Statement("Bands of trajectories", not outside, text)
 
 
 def _millimetres(error: float) -> str:

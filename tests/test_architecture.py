@@ -47,8 +47,8 @@ LAYERS = (
     ("rollout",),
     ("models",),
     ("evaluation",),
-    ("view",),
     ("report", "sweep"),
+    ("view",),
     ("cli",),
     ("__main__",),
 )

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from forcegp.errors import DestinationError
-from forcegp.files import atomic_file, is_other_than_folder, write_text, written_folder
+from forcegp.files import atomic_file, check_kind, write_text, written_folder
 from forcegp.temporary import NEW
 
 
@@ -93,11 +93,12 @@ def test_a_folder_that_another_writer_moves_is_never_taken_for_a_file(tmp_path: 
                 os.rename(target, tmp_path / "elsewhere")
             return there
 
-    assert not is_other_than_folder(Moved(target))
-    assert is_other_than_folder(Path(os.devnull))
-    assert not is_other_than_folder(tmp_path / "none")
+    check_kind(Moved(target), folder=True)
+    check_kind(tmp_path / "none", folder=True)
     (tmp_path / "file").write_text("")
-    assert is_other_than_folder(tmp_path / "file")
+    for taken in (tmp_path / "file", Path(os.devnull)):
+        with pytest.raises(DestinationError, match="is a file"):
+            check_kind(taken, folder=True)
 
 
 def test_a_link_is_written_through(tmp_path: Path) -> None:

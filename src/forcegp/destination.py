@@ -11,7 +11,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from forcegp.errors import DestinationError, ForceGPError
-from forcegp.files import is_other_than_file, is_other_than_folder, kind_of
+from forcegp.files import check_kind, writable
 
 PROBE_BYTES = 1 << 16
 """Written and removed again to see whether there is room, and whether a quota allows it."""
@@ -27,46 +27,23 @@ def check_destination(
     Args:
         path: what will be written.
         folder: whether that is a folder, which may replace an empty one or one of nothing but `own_files`.
-        own_files: names of what such a folder holds, with `*` for any letters; with none, any folder may be
-            replaced.
+        own_files: patterns of the names in such a folder; with none, any folder may be replaced.
         needed_bytes: room that the result takes on the disk [bytes].
 
     Raises:
         DestinationError: a file is to replace a folder or the reverse, the folder holds other files, or the
             place cannot be written or is full.
-
-    Example:
-        >>> check_destination("/proc/model", folder=True)
-        Traceback (most recent call last):
-        forcegp.errors.DestinationError: /proc/model: cannot be written
-          ...
     """
     target = Path(path)
-    try:
-        if not folder and is_other_than_file(target):
-            raise DestinationError(f"{target} is {kind_of(target)}, and a file is to be written there")
-        if folder and is_other_than_folder(target):
-            raise DestinationError(f"{target} is a file, and a folder is to be written there")
+    with writable(target):
+        check_kind(target, folder=folder)
         if folder and target.is_dir():
             _check_replaceable(target, tuple(own_files))
-        parent = _existing_parent(target)
-        _probe(parent, needed_bytes)
-    except DestinationError:
-        raise
-    except OSError as cause:
-        raise DestinationError(
-            f"{target}: cannot be written",
-            got=cause.strerror or str(cause),
-            hint="name a place that exists, is not full and can be written",
-        ) from cause
+        _probe(next(parent for parent in target.absolute().parents if parent.exists()), needed_bytes)
 
 
 def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
-    """Write a result; if that fails, write it to another place, which the error names.
-
-    Args:
-        write: writes the result to a path, such as `fit.save`.
-        path: where it belongs.
+    """Write a result by `write(path)`; if that fails, write it to another place, which the error names.
 
     Raises:
         DestinationError: the place cannot be written; the message says where the result is instead.
@@ -113,14 +90,6 @@ def _check_replaceable(folder: Path, own_files: tuple[str, ...]) -> None:
             got=", ".join(foreign[:5]),
             hint="name another folder, or move these files",
         )
-
-
-def _existing_parent(target: Path) -> Path:
-    """The nearest folder above a target that exists."""
-    parent = target.absolute().parent
-    while not parent.exists() and parent != parent.parent:
-        parent = parent.parent
-    return parent
 
 
 def _probe(parent: Path, needed_bytes: int) -> None:

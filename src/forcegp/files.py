@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -18,6 +17,38 @@ from forcegp.limits import HEADER_BYTES, HEADER_DEPTH
 from forcegp.temporary import Temporary, discard, sweep
 
 H = TypeVar("H", bound="Header")
+M = TypeVar("M", bound=BaseModel)
+
+
+@contextmanager
+def writable(target: Path) -> Iterator[None]:
+    """Errors of the system in the block, which writes to `target`, as `DestinationError`."""
+    try:
+        yield
+    except DestinationError:
+        raise
+    except OSError as cause:
+        raise DestinationError(
+            f"{target}: cannot be written",
+            got=cause.strerror or str(cause),
+            hint="name a place that exists, is not full and can be written",
+        ) from cause
+
+
+def check_kind(target: Path, *, folder: bool) -> None:
+    """Check that nothing but a folder, or nothing but a regular file, would be replaced.
+
+    The path is looked at once: between `exists` and `is_dir` another writer can change it.
+    """
+    try:
+        mode = os.stat(target).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    if folder and not stat.S_ISDIR(mode):
+        raise DestinationError(f"{target} is a file, and a folder is to be written there")
+    if not folder and not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
+        raise DestinationError(f"{target} is {kind}, and a file is to be written there")
 
 
 def _sync(path: Path) -> None:
@@ -29,29 +60,14 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def _sync_names(folder: Path) -> None:
-    """Force the names in a folder to disk, where the system can."""
-    with contextlib.suppress(OSError):
-        _sync(folder)
-
-
-def _refused(target: Path, cause: OSError) -> DestinationError:
-    return DestinationError(
-        f"{target}: cannot be written",
-        got=cause.strerror or str(cause),
-        hint="name a place that exists, is not full and can be written",
-    )
-
-
 @contextmanager
 def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
     """What a target is written to; gone when the block ends, unless it was moved."""
-    try:
+    with writable(target):
+        check_kind(target, folder=folder)
         target.parent.mkdir(parents=True, exist_ok=True)
         sweep(target)
         temporary = Temporary(target, folder=folder, mode=mode)
-    except OSError as cause:
-        raise _refused(target, cause) from cause
     try:
         yield temporary.path
     finally:
@@ -62,11 +78,11 @@ def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
 def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
     """A temporary path beside `path` that takes its place when the block ends without an error.
 
-    What a killed writer of the same file left is removed.
+    Temporary files of crashed writers of the same file are removed.
 
     Args:
         path: the file to write; missing parent folders are made.
-        mode: permissions of the new file, of which the umask takes away.
+        mode: permissions of the new file, less the umask.
 
     Yields:
         Where to write. A reader of `path` sees the old file or the whole new one.
@@ -83,20 +99,13 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
         ['a.txt']
     """
     target = Path(path)
-    try:
-        taken = is_other_than_file(target)
-    except OSError as cause:
-        raise _refused(target, cause) from cause
-    if taken:
-        raise DestinationError(f"{target} is {kind_of(target)}, and a file is to be written there")
     with _temporary(target, folder=False, mode=mode) as temporary:
         yield temporary
-        try:
+        with writable(target):
             _sync(temporary)
             os.replace(temporary, target)
-        except OSError as cause:
-            raise _refused(target, cause) from cause
-        _sync_names(target.parent)
+        with suppress(OSError):  # not every system can
+            _sync(target.parent)
 
 
 @contextmanager
@@ -104,10 +113,7 @@ def written_folder(path: str | Path) -> Iterator[Path]:
     """A temporary folder; its files move into the target folder when the block ends without an error.
 
     Each file replaces its namesake in one step, in the order in which they were written, so that the last one
-    is there only with the others; then what else was in the folder is removed.
-
-    Args:
-        path: the folder to write; missing parents are made. A symbolic link is written through.
+    is there only with the others; then what else was in the folder is removed. Symbolic links are followed.
 
     Yields:
         The folder to write the files to.
@@ -120,20 +126,13 @@ def written_folder(path: str | Path) -> Iterator[Path]:
         >>> with tempfile.TemporaryDirectory() as parent:
         ...     with written_folder(f"{parent}/run") as temporary:
         ...         _ = (temporary / "a.txt").write_text("one")
-        ...         _ = (temporary / "b.txt").write_text("two")
-        ...     sorted(os.listdir(f"{parent}/run"))
-        ['a.txt', 'b.txt']
+        ...     os.listdir(f"{parent}/run")
+        ['a.txt']
     """
     target = Path(path).resolve() if Path(path).is_symlink() else Path(path)
-    try:
-        taken = is_other_than_folder(target)
-    except OSError as cause:
-        raise _refused(target, cause) from cause
-    if taken:
-        raise DestinationError(f"{target} is a file, and a folder is to be written there")
     with _temporary(target, folder=True, mode=0o777) as temporary:
         yield temporary
-        try:
+        with writable(target):
             written = sorted(temporary.iterdir(), key=lambda file: file.stat().st_mtime_ns)
             target.mkdir(exist_ok=True)
             for file in written:
@@ -141,33 +140,8 @@ def written_folder(path: str | Path) -> Iterator[Path]:
                 os.replace(file, target / file.name)
             for old in set(target.iterdir()) - {target / file.name for file in written}:
                 discard(old)
-        except OSError as cause:
-            raise _refused(target, cause) from cause
-        _sync_names(target)
-
-
-def is_other_than_folder(path: Path) -> bool:
-    """Whether a path is taken by something that is not a folder.
-
-    The path is looked at once: between `exists` and `is_dir` another writer can change it.
-    """
-    try:
-        return not stat.S_ISDIR(os.stat(path).st_mode)
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-
-
-def is_other_than_file(path: Path) -> bool:
-    """Whether a path is taken by something that is not a regular file: a folder, a pipe, a device."""
-    try:
-        return not stat.S_ISREG(os.stat(path).st_mode)
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-
-
-def kind_of(path: Path) -> str:
-    """What is at a path, in words."""
-    return "a folder" if path.is_dir() else "not a regular file"
+        with suppress(OSError):
+            _sync(target)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -181,16 +155,17 @@ def write_json(path: str | Path, value: object) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
-class Header(BaseModel):
+class Record(BaseModel):
+    """A frozen part of a file: unknown fields and numbers that are not finite are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, from_attributes=True)
+
+
+class Header(Record):
     """A frozen, versioned JSON header; a subclass names its `FORMAT` and `VERSION` and adds fields.
 
-    Larger text than `MAX_BYTES` is not read; a subclass that holds series of numbers may raise it.
-
-    A field that the class does not know is an error: a file that says more than we understand is
-    not read as if it said less.
+    Unknown fields are errors, and text of more than `MAX_BYTES` is not read.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     FORMAT: ClassVar[str]
     VERSION: ClassVar[int]
@@ -205,13 +180,8 @@ class Header(BaseModel):
     def from_json(cls: type[H], text: str | bytes, source: str, error: type[ForceGPError]) -> H:
         """Read a header, checking its format, version and fields.
 
-        Args:
-            text: the JSON text.
-            source: name of the file, for the message.
-            error: the class of error to raise.
-
         Raises:
-            ForceGPError: of class `error`; the message names the file and the field.
+            ForceGPError: of class `error`; the message names the file (`source`) and the field.
         """
         fields = _json_object(text, source, error, cls.MAX_BYTES)
         name, version = fields.pop("format", None), fields.pop("version", None)
@@ -224,14 +194,33 @@ class Header(BaseModel):
                 got=f"version {version!r}",
                 hint="read it with the release of forcegp that wrote it, or update forcegp",
             )
-        try:
-            return cls.model_validate(fields)
-        except ValidationError as cause:
-            first = cause.errors()[0]
-            place = ".".join(str(part) for part in first["loc"])
-            raise error(
-                f"{source}: header field {place!r} is not valid", expected=first["msg"], got=first["input"]
-            ) from cause
+        return validated(cls, fields, source, error, what="header field")
+
+
+def validated(
+    kind: type[M],
+    fields: object,
+    source: str,
+    error: type[ForceGPError],
+    place: tuple[str, ...] = (),
+    what: str = "field",
+) -> M:
+    """What was read as an instance of a pydantic model.
+
+    Args:
+        kind: the model.
+        fields: what was read.
+        source, place, what: the file, the keys that lead to the fields, and their kind, for the message.
+        error: the class of error to raise; it names the file and the first wrong field.
+    """
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as cause:
+        first = cause.errors()[0]
+        where = f"{source}: {what} {'.'.join(map(str, (*place, *first['loc'])))!r}"
+        if isinstance(reason := first.get("ctx", {}).get("error"), ForceGPError):
+            raise error.at(where, reason) from cause
+        raise error(f"{where} is not valid", expected=first["msg"], got=first["input"]) from cause
 
 
 def _json_object(text: str | bytes, source: str, error: type[ForceGPError], most: int) -> dict[str, Any]:

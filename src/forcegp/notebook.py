@@ -15,16 +15,12 @@ _FIRST = "text-align:left;padding:.15em .7em"
 def html_table(
     title: str, head: Sequence[str] = (), rows: Sequence[Sequence[object]] = (), notes: Sequence[str] = ()
 ) -> str:
-    """A titled table as HTML; numbers are shown with four significant digits.
+    """A titled table as HTML without scripts; numbers are shown with four significant digits.
 
     Args:
-        title: one line above.
+        title, notes: lines above and below.
         head: names of the columns; the first column names the rows.
         rows: cells.
-        notes: lines below.
-
-    Returns:
-        HTML without scripts or references.
 
     Example:
         >>> html_table("a <b>")
@@ -39,22 +35,21 @@ def html_table(
     return f"<div>{''.join(parts)}</div>"
 
 
-def text(value: object) -> str:
-    """A value in a few characters."""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+def text(value: object, digits: int = 4) -> str:
+    """A value as text: floats with significant digits."""
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def _row(cells: Sequence[str], tag: str) -> str:
-    styles = (_CELL if i else _FIRST for i in range(len(cells)))
-    pairs = zip(styles, map(escape, cells), strict=True)
-    parts = (f'<{tag} style="{style}">{cell}</{tag}>' for style, cell in pairs)
+    styles = [_FIRST, *[_CELL] * len(cells)][: len(cells)]
+    parts = (
+        f'<{tag} style="{style}">{escape(cell)}</{tag}>' for style, cell in zip(styles, cells, strict=True)
+    )
     return f"<tr>{''.join(parts)}</tr>"
 
 
 class FitBar:
-    """A progress bar in the output of a notebook cell, for `fit(…, progress=FitBar())`.
-
-    Outside a notebook it prints nothing; the commands have a bar of their own.
+    """A progress bar in the output of a notebook cell, for `fit(…, progress=FitBar())`; silent elsewhere.
 
     Example:
         >>> bar = FitBar()

@@ -45,14 +45,9 @@ CARTESIAN = {"multiplier": "N", "contact_force": "N", "c": "m", "cd": "m/s"}
 
 
 def unit(quantity: str, kinds: Sequence[str] = ()) -> str:
-    """The unit of a quantity of joints.
+    """The unit of a quantity of `SYMBOLS`, without brackets; empty for an unknown quantity.
 
-    Args:
-        quantity: a name of `SYMBOLS`.
-        kinds: `"revolute"` or `"prismatic"` for each joint on the axis; without them both units are given.
-
-    Returns:
-        The unit without brackets; empty for an unknown quantity.
+    Without the kinds of the joints on the axis (`"revolute"` or `"prismatic"`) both units are given.
 
     Example:
         >>> unit("qdd", ["revolute"]), unit("tau"), unit("multiplier")
@@ -85,8 +80,7 @@ class Timeline:
     """Positions of samples on the time axis.
 
     Attributes:
-        x: `(n,)` time, increasing [s].
-        order: `(n,)` row of each position.
+        x, order: `(n,)` increasing time [s], and the row of each position.
         breaks: positions before which a curve is interrupted.
         ordered: whether the samples are a time series, which is drawn as a curve.
         label: of the axis.
@@ -100,12 +94,11 @@ class Timeline:
 
     @classmethod
     def of(cls, t: Tensor, segment: Tensor | None = None, ordered: bool = True) -> Timeline:
-        """Place samples on the time axis.
+        """Place samples on the time axis; segments whose times overlap are placed one after another.
 
         Args:
             t: `(n,)` [s].
-            segment: `(n,)` trajectory of each sample; default one. Segments whose times overlap are placed
-                one after another.
+            segment: `(n,)` trajectory of each sample; default one.
             ordered: whether the rows follow time within each segment.
         """
         x, segments = as_array(t), np.zeros(len(t)) if segment is None else as_array(segment)
@@ -152,15 +145,7 @@ WIDTH, ROW, MARGIN = 7.0, 1.25, 0.9
 
 @dataclass(frozen=True)
 class Curve:
-    """Values over time.
-
-    Attributes:
-        values: `(n,)`.
-        label: in the legend.
-        colour: of the curve.
-        std: `(n,)` standard deviation, drawn as a band of ±2.
-        width: of the line [pt].
-    """
+    """Values over time `(n,)`, with their standard deviation as a band of ±2, and the line's `width` [pt]."""
 
     values: Tensor
     label: str
@@ -171,13 +156,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot.
-
-    Attributes:
-        title: above it.
-        ylabel: name and unit of its values.
-        curves: what it shows.
-    """
+    """One plot: its title, the name and unit of its values, and its curves."""
 
     title: str
     ylabel: str
@@ -187,16 +166,13 @@ class Panel:
 def draw_panels(
     panels: Sequence[Panel], time: Timeline, closed: Sequence[Tensor] = (), ax: Target = None
 ) -> list[Axes]:
-    """Draw panels one above the other.
+    """Draw panels one above the other, and return their axes.
 
     Args:
         panels: from top to bottom.
         time: of the samples.
         closed: flags `(n,)` of contacts; the time in which any of them is closed is shaded.
         ax: axes to draw on, one per panel; default a new figure.
-
-    Returns:
-        The axes, one per panel.
 
     Raises:
         ParameterError: another number of axes is given.
@@ -252,11 +228,7 @@ def _draw(axes: Axes, curve: Curve, time: Timeline) -> None:
 
 
 def chosen(wanted: Sequence[str] | None, names: Sequence[str], kind: str) -> list[int]:
-    """Indices of the wanted names, by default all of them.
-
-    Raises:
-        UnknownNameError: a name does not exist.
-    """
+    """Indices of the wanted names, by default all; an unknown name raises `UnknownNameError`."""
     for name in wanted or ():
         if name not in names:
             raise UnknownNameError(kind, name, names)

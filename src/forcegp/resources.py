@@ -29,11 +29,7 @@ class MemoryNeedWarning(UserWarning):
 
 
 def free_memory() -> int | None:
-    """Memory that can be allocated without swapping [bytes]: what is available, within the container's limit.
-
-    Returns:
-        `None` where the system does not say.
-    """
+    """Memory that can be allocated without swapping, within the container's limit [bytes], if known."""
     limits = [value for value in (_available(), _container_memory()) if value is not None]
     return min(limits) if limits else None
 
@@ -46,7 +42,7 @@ def announce_memory(
     certain: int | None = None,
     hint: str = "use less data or a smaller model, or free memory",
 ) -> None:
-    """Say how much memory work will need if that is more than half of what is free, and refuse what is more.
+    """Announce work that needs more than half of the free memory, and refuse what needs more than all of it.
 
     Call it before the allocation, with an upper bound.
 
@@ -59,9 +55,6 @@ def announce_memory(
 
     Raises:
         MemoryLimitError: it certainly needs more than is free.
-
-    Example:
-        >>> announce_memory(1000, "a small matrix")
     """
     free = free_memory()
     if free is None or needed <= LARGE * free:
@@ -111,9 +104,8 @@ def _container_memory() -> int | None:
 def one_thread() -> Iterator[None]:
     """PyTorch on one thread within the block, for the calling thread alone.
 
-    Handing a seven-by-seven matrix to a second thread costs more than the work on it, and many times
-    more where the processor is shared. OpenMP keeps the number per thread; `torch.set_num_threads` would
-    change it for threads that start meanwhile too, and for good.
+    Threads cost more than they save on small matrices. OpenMP keeps the number per thread;
+    `torch.set_num_threads` would change it for other threads too, and for good.
     """
     if torch.get_num_threads() == 1:
         yield
@@ -126,9 +118,8 @@ def one_thread() -> Iterator[None]:
 def threads_of_pytorch() -> Iterator[None]:
     """SciPy's and NumPy's BLAS on as many threads as PyTorch within the block.
 
-    OpenBLAS keeps threads of its own, one per processor, that spin while they wait. With two processes on two
-    processors, each told to take one thread, a Cholesky inverse took twelve times as long as alone. OpenBLAS
-    keeps the number per process, so blocks of several threads take turns.
+    OpenBLAS starts one spinning thread per processor, which slows several processes down a lot. It keeps the
+    number per process, so blocks of several threads take turns.
     """
     threads = torch.get_num_threads()
     with _TURN:

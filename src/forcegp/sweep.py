@@ -29,13 +29,9 @@ SCORE, MODEL = "score.json", "model"
 
 @dataclass(frozen=True)
 class SweptFit:
-    """One fit of a sweep.
+    """One fit of a sweep: a scene with its simulated motion, a model, and a seed of everything random.
 
-    Attributes:
-        scene: scene file or name of a bundled one: the robot, its contacts and its simulated motion.
-        model: name of the model.
-        seed: of the simulated motion, its noise, the held-out stretches, and random initial values.
-        duration: simulated time [s]; `None` for the scene's.
+    `duration` is the simulated time [s]; `None` for the scene's.
     """
 
     scene: str
@@ -62,15 +58,7 @@ def fits_of(
 
 
 def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
-    """Simulate, fit and score, unless that has been done; runs on a worker, in one thread.
-
-    Args:
-        fit: what is fitted.
-        out: folder of the sweep, which all workers see.
-
-    Returns:
-        The scores on held-out stretches by name, and how long the fit took.
-    """
+    """Simulate, fit and score, unless that has been done; runs on a worker, in one thread."""
     folder = Path(out) / fit.name
     if (folder / SCORE).is_file():
         return json.loads((folder / SCORE).read_text(encoding="utf-8"))
@@ -83,12 +71,10 @@ def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
     split = split_by_stretches(data, 1, seed=fit.seed)
     model = configured(scene.model, system, name=fit.model, seed=fit.seed)
     fitted = model.fit(data[complement(split.test, len(data))])
-    evaluation = evaluate(fitted, data[split.test], compare=False)
+    scores = evaluate(fitted, data[split.test], compare=False).summary()
     score = {
         **asdict(fit),
-        "noisy_mae": evaluation.noisy_mae,
-        "clean_mae": evaluation.clean_mae,
-        "coverage_noisy": evaluation.coverage_noisy,
+        **{name: scores[name] for name in ("noisy_mae", "clean_mae", "coverage_noisy")},
         "samples": fitted.result.samples,
         "seconds": fitted.seconds,
         "converged": fitted.converged,
@@ -118,9 +104,6 @@ def sweep(
 
     Returns:
         The scores, in the order of the fits.
-
-    Raises:
-        MissingDependencyError: Dask is not installed.
     """
     dask = optional_module("distributed", "A sweep", "sweep")
     root, scores = str(Path(out).resolve()), {}

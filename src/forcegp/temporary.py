@@ -1,8 +1,7 @@
-"""Files and folders under construction: hidden, locked while their writer lives, swept once it is dead.
+"""Files and folders under construction: hidden, locked while their writer lives, deleted once it is dead.
 
 A name is `.forcegp-new-<12 hex digits>-<name of the target>`. Its writer holds a lock (flock) on it, which
-ends with the process however it ends, so that the next writer of the same target knows litter from work.
-Where there is no flock (Windows, some network file systems) litter stays; no reader looks at it.
+ends with the process. Without flock (Windows, some network file systems) such files stay unread.
 """
 
 from __future__ import annotations
@@ -26,13 +25,8 @@ NEW = ".forcegp-new-"
 """Prefix of what is under construction."""
 
 
-def hidden_name(target: Path) -> Path:
-    """A hidden, unused path beside a target with the same ending, as some writers go by the ending."""
-    return target.with_name(f"{NEW}{secrets.token_hex(6)}-{_short(target)}")
-
-
 def _short(target: Path) -> str:
-    """The name of a target, or a digest with the same ending in the place of a long one."""
+    """The name of a target, or for a long one a digest with the same ending, which some writers go by."""
     name = os.fsencode(target.name)
     if len(name) <= LONGEST:
         return target.name
@@ -40,33 +34,12 @@ def _short(target: Path) -> str:
     return hashlib.sha256(name).hexdigest() + ending
 
 
-def leftovers_of(target: Path) -> list[Path]:
-    """Everything beside a target that has a hidden name of it, the latest first."""
-    form = re.compile(re.escape(NEW) + "[0-9a-f]{12}-" + re.escape(_short(target)))
-    try:
-        with os.scandir(target.parent) as entries:
-            matches = [entry for entry in entries if form.fullmatch(entry.name)]
-        matches.sort(key=lambda entry: entry.stat(follow_symlinks=False).st_mtime_ns, reverse=True)
-    except OSError:
-        return []
-    return [Path(entry.path) for entry in matches]
-
-
 class Temporary:
-    """An empty file or folder under construction, locked until `close`.
-
-    Args:
-        target: what it will replace; its parent folder exists.
-        folder: whether it is a folder.
-        mode: permissions, of which the umask takes away.
-
-    Raises:
-        OSError: it cannot be made.
-    """
+    """An empty file or folder under construction beside an existing target, locked until `close`."""
 
     def __init__(self, target: Path, *, folder: bool, mode: int) -> None:
         while True:
-            self.path = hidden_name(target)
+            self.path = target.with_name(f"{NEW}{secrets.token_hex(6)}-{_short(target)}")
             if folder:
                 self.path.mkdir(mode=mode)
             else:
@@ -85,8 +58,13 @@ class Temporary:
 
 
 def sweep(target: Path) -> None:
-    """Remove what killed writers of a target left beside it."""
-    for path in leftovers_of(target) if fcntl is not None else []:
+    """Delete temporary files of crashed writers of a target."""
+    form = re.compile(re.escape(NEW) + "[0-9a-f]{12}-" + re.escape(_short(target)))
+    try:
+        matches = [path for path in target.parent.iterdir() if form.fullmatch(path.name)]
+    except OSError:
+        return
+    for path in matches if fcntl is not None else []:
         locked, descriptor = _lock(path)
         if descriptor is not None:
             if locked:
@@ -116,12 +94,7 @@ def _lock(path: Path) -> tuple[bool, int | None]:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return os.path.samestat(os.fstat(descriptor), path.lstat()), descriptor
-    except BlockingIOError:
+    except OSError as error:
         os.close(descriptor)
-        return False, None
-    except FileNotFoundError:
-        os.close(descriptor)
-        return False, None
-    except OSError:  # no flock on this file system
-        os.close(descriptor)
-        return True, None
+        # Any other error: no flock on this file system.
+        return not isinstance(error, BlockingIOError | FileNotFoundError), None

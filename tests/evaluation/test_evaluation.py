@@ -65,25 +65,25 @@ def gaussian(std: float, seed: int = 5) -> Tensor:
 def test_errors_are_the_known_ones() -> None:
     error = torch.tensor([0.1, -0.2, 0.3, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(3000, 7)
     found = evaluate(KnownError(error, None), data, compare=False)
-    assert found.clean is not None and found.clean_mae == found.clean.mae
+    assert found.clean is not None and found.summary()["clean_mae"] == found.clean.mae
     assert found.clean.mae_by_joint == pytest.approx([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0], abs=ROUNDING)
     assert found.clean.mae == pytest.approx(1.6 / 7, abs=ROUNDING)
     assert found.clean.rmse == pytest.approx(math.sqrt(1.14 / 7), abs=ROUNDING)
     noise = data.qdd_clean + error - data.qdd
-    assert found.noisy_mae == pytest.approx(float(noise.abs().mean()), abs=ROUNDING)
+    assert found.noisy.mae == pytest.approx(float(noise.abs().mean()), abs=ROUNDING)
     assert found.noisy.rmse_by_joint == pytest.approx((noise**2).mean(0).sqrt().tolist(), abs=ROUNDING)
     assert (found.samples, found.kind, found.joint_names) == (3000, "known_error", data.joint_names)
-    for name in ("coverage_noisy", "coverage_clean", "calibration", "nlpd"):
-        assert getattr(found, name) is None
+    for name in ("coverage_noisy", "coverage_clean", "nlpd"):
+        assert found.summary()[name] is None
 
 
 def test_a_perfect_model_has_the_floor_of_the_paper() -> None:
     found = evaluate(KnownError(gaussian(0.0), None), data, compare=False)
     # The mean of 21000 absolute values with standard deviation 0.06: three standard errors.
-    assert found.noisy_mae == pytest.approx(
+    assert found.noisy.mae == pytest.approx(
         NOISE_STD * math.sqrt(2.0 / math.pi), abs=3 * 0.06 / math.sqrt(21000)
     )
-    assert found.clean_mae == 0.0
+    assert found.clean.mae == 0.0
     assert found.residual_max is not None and found.residual_max < 1e-11
 
 
@@ -91,24 +91,27 @@ def test_an_honest_uncertainty_is_calibrated() -> None:
     found = evaluate(KnownError(gaussian(0.2), 0.2), data, compare=False)
     # Shares among 21000 numbers: three standard errors of at most sqrt(0.25 / 21000).
     tolerance = 3.0 * math.sqrt(0.25 / 21000)
-    assert found.coverage_noisy == pytest.approx(0.9545, abs=tolerance)
-    assert found.coverage_clean == pytest.approx(0.9545, abs=tolerance)
-    assert found.calibration is not None
-    for level, share in found.calibration.items():
+    assert found.uncertainty is not None
+    assert found.uncertainty.coverage_noisy == pytest.approx(0.9545, abs=tolerance)
+    assert found.uncertainty.coverage_clean == pytest.approx(0.9545, abs=tolerance)
+    for level, share in found.uncertainty.calibration.items():
         assert share == pytest.approx(float(level), abs=tolerance)
     total = 0.2**2 + NOISE_STD**2
     # Half the variance of a squared normal variable over 21000 of them.
     expected = 0.5 * math.log(2.0 * math.pi * total) + 0.5
-    assert found.nlpd == pytest.approx(expected, abs=3.0 * math.sqrt(0.5 / 21000))
+    assert found.uncertainty.nlpd == pytest.approx(expected, abs=3.0 * math.sqrt(0.5 / 21000))
     assert found.noise_std == pytest.approx((NOISE_STD,) * 7, rel=1e-12)  # a root of a mean of squares
 
 
 @pytest.mark.parametrize(("claimed", "coverage"), [(0.02, 0.6), (2.0, 1.0)])
 def test_a_dishonest_uncertainty_shows(claimed: float, coverage: float) -> None:
     honest, other = (evaluate(KnownError(gaussian(0.2), std), data, compare=False) for std in (0.2, claimed))
-    assert other.nlpd is not None and honest.nlpd is not None and other.nlpd > honest.nlpd + 0.3
-    assert other.coverage_noisy is not None
-    assert other.coverage_noisy > 0.999 if coverage == 1.0 else other.coverage_noisy < coverage + 0.1
+    assert other.uncertainty.nlpd > honest.uncertainty.nlpd + 0.3
+    assert (
+        other.uncertainty.coverage_noisy > 0.999
+        if coverage == 1.0
+        else other.uncertainty.coverage_noisy < coverage + 0.1
+    )
 
 
 def test_the_residual_is_that_of_closed_contacts() -> None:
@@ -138,14 +141,14 @@ def test_chunks_do_not_matter_and_progress_is_reported(monkeypatch: pytest.Monke
 
 def test_without_clean_accelerations() -> None:
     found = evaluate(forcegp.AnalyticalModel(system).nominal(), data[:20].replace(extras={}))
-    assert found.clean is None and found.clean_mae is None and found.coverage_clean is None
+    assert found.clean is None and found.summary()["clean_mae"] is None
     assert found.noise_std == pytest.approx((NOISE_STD,) * 7, rel=1e-12)  # a root of a mean of squares
 
 
 def test_everything_fits_into_json() -> None:
     found = evaluate(KnownError(gaussian(0.2), 0.2), data, compare=False)
     read = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert read["noisy"]["mae"] == found.noisy_mae
+    assert read["noisy"]["mae"] == found.noisy.mae
     assert set(found.summary()) >= {"noisy_mae", "clean_mae", "nlpd", "residual"}
 
 
@@ -182,7 +185,7 @@ def test_a_perfect_model_is_better_than_every_trivial_predictor() -> None:
     torque = torch.einsum("nij,nj->ni", M, error).square().mean(0).sqrt()
     model = found.predictors[0]
     assert model.torque.all == pytest.approx(torque.tolist(), rel=1e-9)
-    assert model.nlpd == found.nlpd
+    assert model.nlpd == found.uncertainty.nlpd
 
 
 def test_the_robot_file_is_not_better_than_itself() -> None:

@@ -23,7 +23,7 @@ window = predicted_window(model, opening(data, 0.2), model.kind)
 
 def page(folder: Path, name: str = "model", log: str = "logs/test.parquet") -> str:
     """The text of the page."""
-    return write_evaluation(folder, name, log, found, window).read_text(encoding="utf-8")
+    return write_evaluation(folder, name, log, None, found, window).read_text(encoding="utf-8")
 
 
 def test_the_page_opens_with_the_kind_of_model_the_data_and_the_verdict(tmp_path: Path) -> None:
@@ -77,6 +77,6 @@ def test_the_comparison_of_force_priors_is_on_the_page(tmp_path: Path) -> None:
         Compared("friction", -8.1, 0.88, 0.2, note="dropped after the first half"),
         Compared("friction, inertia identified", -7.2, 0.0, 0.0, chosen=True),
     )
-    text = write_evaluation(tmp_path, "m", "d", found, window, comparison=compared).read_text("utf-8")
+    text = write_evaluation(tmp_path, "m", "d", None, found, window, compared).read_text("utf-8")
     assert re.search(r"friction, inertia identified(.|\n)*-7\.2(.|\n)*chosen", text)
     assert "nats per sample" in text and "nats per sample" not in page(tmp_path / "named")

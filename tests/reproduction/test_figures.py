@@ -10,12 +10,13 @@ import pytest
 
 from forcegp.report.rollouts import rollout_pictures
 from forcegp.report.style import COLOURS, INK, KINDS, LABELS, OTHER, Picture, colour, label
-from forcegp.report.window import common_limit, draw_errors, draw_predictions
+from forcegp.report.window import draw_errors, draw_predictions
 from report_samples import MODELS, figures, identification, multiplier, results, rollouts, window
 from reproduction.covariance import covariance_block
 from reproduction.identification import identification_block
 from reproduction.learning import learning_block
 from reproduction.multiplier import multiplier_block
+from reproduction.page import common_limit
 from reproduction.results import paper_numbers
 from reproduction.task_space import task_space_block
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from forcegp.report.html import Statement, number
-from forcegp.report.rollout_data import with_bands
 from forcegp.report.rollouts import rollout_table
 from report_samples import band, figures, identification, model_path, multiplier, results, rollouts, score
 from reproduction.learning import FLOOR, TASK, UNKNOWN, curve_table
 from reproduction.page import findings, render_markdown, render_page
 from reproduction.results import Results, paper_numbers
 from reproduction.scores import error_table, overview_table
-from reproduction.trajectories import bands, tip_error
+from reproduction.statements import Statement, number
+from reproduction.trajectories import bands, tip_error, with_bands
 
 PAPER = paper_numbers()
 

@@ -12,8 +12,8 @@ from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.models.load import load_model
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.report.rollout_data import RolloutData, together
-from forcegp.report.rollouts import animation_source
+from forcegp.report.animation import animation_source
+from forcegp.report.rollout_data import RolloutData
 from forcegp.report.window import WindowData
 from reproduction.covariance import CovarianceData
 from reproduction.multiplier import MultiplierData
@@ -23,6 +23,7 @@ from reproduction.scores import RESIDUAL
 from reproduction.stages import DATA
 from reproduction.study import Reproduction, run
 from reproduction.task import LOG
+from reproduction.trajectories import together
 
 TEN_SECONDS = Profile(
     "test",

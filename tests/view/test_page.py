@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import signal
+import urllib.request
 from functools import cache
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -13,14 +16,17 @@ import torch
 from typer.testing import CliRunner
 
 import forcegp
+from forcegp import kinematics
 from forcegp.cli import app
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.report.animation import animation_source
 from forcegp.view.motion import Motion, at_rest, of_log, pictures, with_rollout
-from forcegp.view.page import Stage, force_text, write_view
+from forcegp.view.page import ARROW, content_of, force_text, serve, write_view
 from forcegp.view.shapes import shapes_of
 from forces.cases import logged, two_contacts
 
-viser = pytest.importorskip("viser")
+ROUNDED = 2e-5
+"""Coordinates in a page are rounded to 10 µm."""
 
 
 @cache
@@ -61,25 +67,31 @@ def test_forces_are_those_of_the_model_where_contacts_are_closed() -> None:
 
 def test_an_arrow_is_as_long_as_the_force_and_its_bar_is_two_deviations() -> None:
     motion = of_log(two_contacts(), log(), fitted())
-    server = viser.ViserServer(host="127.0.0.1", port=8190, verbose=False)
-    try:
-        stage = Stage(server, motion, shapes_of(two_contacts().robot))
-        force = motion.forces[0]
-        k = int(np.flatnonzero(np.isfinite(force.value))[0])
-        stage.show(k)
-        arrow, spread = stage._arrows[0]
-        ends = arrow.points[0].astype(float)
-        bar = spread.points[0].astype(float)
-        np.testing.assert_allclose(ends[0], force.point[k], atol=1e-6)
-        # The lengths of the arrow and of the bar are in the ratio of the force and of four deviations.
-        ratio = np.linalg.norm(bar[1] - bar[0]) / np.linalg.norm(ends[1] - ends[0])
-        np.testing.assert_allclose(ratio, 4.0 * force.std[k] / abs(force.value[k]), rtol=1e-4)
-        assert force_text(force, k) in stage._label.text
-        opened = int(np.flatnonzero(~np.isfinite(force.value))[0])
-        stage.show(opened)
-        assert not arrow.visible and "table: open" in stage._label.text
-    finally:
-        server.stop()
+    content = content_of(motion, shapes_of(two_contacts().robot))
+    force, arrow = motion.forces[0], content["forces"][0]
+    k = int(np.flatnonzero(np.isfinite(force.value))[0])
+    start, tip, bar = (np.array(arrow[name][k]) for name in ("start", "tip", "bar"))
+    np.testing.assert_allclose(start, force.point[k], atol=ROUNDED)
+    scale = ARROW / max(np.nanmax(abs(one.value), initial=0.0) for one in motion.forces)
+    np.testing.assert_allclose(np.linalg.norm(tip - start), scale * abs(force.value[k]), atol=ROUNDED)
+    np.testing.assert_allclose(np.linalg.norm(bar[1] - bar[0]), 4.0 * scale * force.std[k], atol=ROUNDED)
+    opened = int(np.flatnonzero(~np.isfinite(force.value))[0])
+    assert arrow["tip"][opened] is None and content["texts"][opened][0] == "table: open"
+    assert content["texts"][k][0] == force_text(force, k) != "table: open"
+
+
+def test_solids_move_with_their_links() -> None:
+    motion = of_log(two_contacts(), log())
+    robot, shapes = motion.system.robot, shapes_of(two_contacts().robot)
+    content = content_of(motion, shapes)
+    surfaces = [solid for solid in content["solids"] if solid["link"] is None]
+    assert len(surfaces) == 2 and len(content["solids"]) == len(shapes) + 2
+    poses, frame = kinematics.link_poses(robot, motion.q), content["poses"][3]
+    for link in range(robot.nq):
+        R, p = np.reshape(frame[link + 1][:9], (3, 3)), frame[link + 1][9:]
+        np.testing.assert_allclose(R, poses.rotation[3, link].numpy(), atol=ROUNDED)
+        expected = poses.position[3, link] + robot.base_position
+        np.testing.assert_allclose(p, expected.numpy(), atol=ROUNDED)
 
 
 def test_one_file_without_references(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -87,12 +99,25 @@ def test_one_file_without_references(tmp_path: Path, capfd: pytest.CaptureFixtur
         tmp_path / "view.html", at_rest(two_contacts()), shapes_of(two_contacts().robot), "a < b"
     )
     html = path.read_text(encoding="utf-8")
-    assert "<title>a &lt; b</title>" in html
-    assert not re.search(
-        r'<(script|link|img|iframe)[^>]+(src|href)="(?!data:)', html[: html.index("</head>")]
-    )
-    assert path.stat().st_size < 6_000_000
+    assert "<title>a &lt; b</title>" in html and f"script-src '{animation_source()}'" in html
+    assert not re.search(r'(src|href)="(?!data:)', html)
+    assert path.stat().st_size < 200_000
     assert capfd.readouterr().out == "", "a program may read the output"
+
+
+def test_the_page_is_served_until_interrupted() -> None:
+    pages = []
+
+    def ask(address: str) -> None:
+        def fetch() -> None:
+            with urllib.request.urlopen(address, timeout=10) as answer:
+                pages.append(answer.read().decode())
+            signal.raise_signal(signal.SIGINT)
+
+        Thread(target=fetch, daemon=True).start()
+
+    serve("<p>λ</p>", 0, ask)
+    assert pages == ["<p>λ</p>"]
 
 
 def test_paths_of_a_rollout_are_added() -> None:
@@ -114,7 +139,7 @@ def test_the_command_writes_a_page(tmp_path: Path) -> None:
     assert done.exit_code == 0, (done.output, done.exception)
     found = json.loads(done.stdout)
     assert found["page"] == str(out) and found["pictures"] == 10 and found["paths"] >= 1
-    assert "__VISER_EMBED_DATA__" in out.read_text(encoding="utf-8")
+    assert "<canvas" in out.read_text(encoding="utf-8")
 
 
 def test_one_motion_at_a_time(tmp_path: Path) -> None:

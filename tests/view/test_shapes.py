@@ -14,7 +14,7 @@ import forcegp
 from forcegp import kinematics
 from forcegp.errors import RobotFileError
 from forcegp.robot.load import BUNDLED
-from forcegp.view.shapes import Shape, rods, shapes_of, turn_z
+from forcegp.view.shapes import box, cylinder, rods, shapes_of, sphere, turn_z
 
 EXACT = 1e-12
 """Of products of a few rotations."""
@@ -57,17 +57,23 @@ def test_bundled_robots_have_shapes_of_their_file(name: str) -> None:
 
 def test_rods_end_at_the_joints() -> None:
     robot = forcegp.load_robot("double_pendulum")
-    found = [shape for shape in rods(robot) if shape.kind == "cylinder"]
+    found = rods(robot)
     assert {shape.link for shape in found} == {0, 1}
     q = torch.tensor([0.4, -0.9], dtype=torch.float64)
     poses = kinematics.link_poses(robot, q)
     ends = []
     for shape in found:
         R, p = poses.rotation[shape.link].numpy(), poses.position[shape.link].numpy()
-        along = R @ shape.rotation[:, 2] * shape.size[1] / 2
-        ends.append(p + R @ shape.position + along)
+        ends.append(p + R @ shape.points[len(shape.points) // 2 :].mean(axis=0))
     np.testing.assert_allclose(ends[0], poses.position[1].numpy(), atol=EXACT)
     np.testing.assert_allclose(ends[1], kinematics.point_position(robot, q, "tip").numpy(), atol=EXACT)
+
+
+def test_corners_lie_on_their_solids() -> None:
+    np.testing.assert_allclose(np.linalg.norm(sphere(0.3), axis=1), 0.3)
+    np.testing.assert_allclose(abs(box(0.2, 0.4, 0.6)), np.full((8, 3), [0.1, 0.2, 0.3]))
+    np.testing.assert_allclose(np.linalg.norm(cylinder(0.1, 0.4)[:, :2], axis=1), 0.1)
+    assert np.ptp(cylinder(0.1, 0.4)[:, 2]) == 0.4
 
 
 def write(folder: Path, geometry: str) -> tuple[forcegp.RobotModel, Path]:
@@ -79,9 +85,9 @@ def write(folder: Path, geometry: str) -> tuple[forcegp.RobotModel, Path]:
 
 def test_a_visual_of_a_fixed_frame_moves_with_its_joint(tmp_path: Path) -> None:
     (shape,) = shapes_of(*write(tmp_path, '<cylinder radius="0.1" length="0.4"/>'))
-    assert (shape.link, shape.kind, shape.size) == (0, "cylinder", (0.1, 0.4))
-    np.testing.assert_allclose(shape.position, [0.5, 0.0, 0.1], atol=EXACT)
-    np.testing.assert_allclose(shape.rotation[:, 2], [1.0, 0.0, 0.0], atol=EXACT)
+    assert shape.link == 0
+    np.testing.assert_allclose(shape.points.mean(axis=0), [0.5, 0.0, 0.1], atol=EXACT)
+    np.testing.assert_allclose(np.ptp(shape.points, axis=0), [0.4, 0.2, 0.2], atol=EXACT)
 
 
 STL = """solid s
@@ -101,8 +107,8 @@ def test_meshes_are_found_below_the_file_or_its_package(tmp_path: Path, name: st
     (tmp_path / "robot" / "m").mkdir(parents=True)
     (tmp_path / "robot" / "m" / "a.stl").write_text(STL)
     (shape,) = shapes_of(*write(tmp_path, f'<mesh filename="{name}" scale="2 2 2"/>'))
-    assert isinstance(shape, Shape) and shape.mesh == (tmp_path / "robot" / "m" / "a.stl").resolve()
-    assert shape.size == (2.0, 2.0, 2.0)
+    corners = {tuple(point) for point in shape.points.round(9)}
+    assert corners == {(0.5, 0.0, 0.1), (0.5, 0.0, -1.9), (0.5, 2.0, 0.1)}, "turned, scaled and moved"
 
 
 OUTSIDE = (
@@ -121,7 +127,7 @@ def test_a_mesh_outside_of_the_folder_is_not_read(tmp_path: Path, name: str) -> 
     (tmp_path / "secret.stl").write_text(STL)
     robot, path = write(tmp_path, '<mesh filename="x.stl"/>')
     path.write_text(ROBOT.format(f'<mesh filename="{name}"/>'))
-    assert all(shape.kind != "mesh" for shape in shapes_of(robot, path)), "rods instead"
+    assert all(len(shape.points) == 48 for shape in shapes_of(robot, path)), "rods instead"
 
 
 NOT_SIZES = ('<box size="1 2"/>', '<sphere radius="nan"/>', '<cylinder radius="1"/>')

@@ -1,63 +1,25 @@
-"""What several commands share: options, progress bars, results, and reading data for a robot."""
+"""What several commands share: progress bars, results, and reading data for a robot."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol
 
 import typer
 
 if TYPE_CHECKING:
     from forcegp.constraints import ConstrainedSystem
-    from forcegp.data import Dataset
-    from forcegp.models.base import Predictor
+    from forcegp.data import Dataset, SavitzkyGolay
+    from forcegp.models.base import FittedModel, Predictor
+    from forcegp.models.configured import Configured
     from forcegp.robot import RobotModel
     from forcegp.scene import ModelTable
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
-SCENES = sorted(
-    entry.name.removesuffix(".toml") for entry in (files("forcegp") / "scene" / "bundled").iterdir()
-)
-"""Names of the bundled scenes, read without loading the library."""
-SceneName = Annotated[
-    str,
-    typer.Option("--scene", "-s", help=f"Scene file, or the name of a bundled one: {', '.join(SCENES)}."),
-]
-SceneOrNone = Annotated[
-    str | None,
-    typer.Option("--scene", "-s", help=f"Scene file, or the name of a bundled one: {', '.join(SCENES)}."),
-]
-RobotName = Annotated[
-    str | None,
-    typer.Option(
-        "--robot", help="In place of a scene without contacts: URDF or MJCF file, or a bundled robot."
-    ),
-]
-ModelFile = Annotated[Path, typer.Option("--model", "-m", help="File of a fitted model.")]
-DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
-Config = Annotated[
-    Path | None,
-    typer.Option(help="TOML file with a table \\[model], in place of the scene's: priors, learning."),
-]
-DataFiles = Annotated[
-    list[Path],
-    typer.Option("--data", "-d", help="Data set, .parquet or .csv; may be given several times."),
-]
-Differentiate = Annotated[
-    int | None,
-    typer.Option(
-        metavar="WINDOW",
-        help="Compute velocities and accelerations that the log lacks by a Savitzky-Golay filter over an odd "
-        "number of samples.",
-    ),
-]
 
-
-@runtime_checkable
 class Advance(Protocol):
     """Moves a progress bar; `note` is a word on how it goes, such as the objective."""
 
@@ -66,11 +28,7 @@ class Advance(Protocol):
 
 @contextmanager
 def progress_bar(description: str, total: int) -> Iterator[Advance]:
-    """A progress bar on stderr.
-
-    Yields:
-        A function to call with the number of steps done so far, their total where it has changed, and a note.
-    """
+    """A progress bar on stderr; its function takes the steps done, their total if it changed, a note."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -91,78 +49,88 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
     fields = {name: value for name, value in result.items() if value is not None and value != ()}
     width = max(len(name) for name in fields)
     for name, value in fields.items():
-        text = f"{value:.6g}" if isinstance(value, float) else _listed(value)
+        text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+        text = f"{value:.6g}" if isinstance(value, float) else text
         typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
 
 
-def _listed(value: object) -> str:
-    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def check_apart(out: Path, *inputs: Path) -> None:
-    """Refuse to write a result over a file that it is made from, or over another result.
-
-    Raises:
-        DestinationError: they are one file.
-    """
+def check_output(out: Path, *inputs: Path) -> None:
+    """Check, before long work, that a file can be written and is none that the result is made from."""
+    from forcegp.destination import check_destination
     from forcegp.errors import DestinationError
 
+    check_destination(out)
     if out.resolve() in (path.resolve() for path in inputs):
         raise DestinationError(f"{out} would be overwritten", hint="name another file for the result")
 
 
 def check_data_destination(path: Path, *inputs: Path) -> None:
-    """Check, before long work, that a data set can be written without losing what it is made from.
-
-    Raises:
-        DataError: the name does not end in `.parquet`.
-        DestinationError: the place cannot be written, or is one of the inputs.
-    """
+    """Check, before long work, that a data set can be written without losing what it is made from."""
     from forcegp.data.table import check_ending
-    from forcegp.destination import check_destination
 
     check_ending(path)
-    check_destination(path)
-    check_apart(path, *inputs)
+    check_output(path, *inputs)
 
 
-def read_data(path: Path, differentiate: int | None = None) -> Dataset:
-    """Read a data set, computing derivatives that it lacks where a window is given."""
-    from forcegp.data import Dataset, SavitzkyGolay
+def derivatives(window: int | None) -> SavitzkyGolay | None:
+    """The filter of a window, if there is one."""
+    from forcegp.data import SavitzkyGolay
 
-    method = SavitzkyGolay(window=differentiate) if differentiate is not None else None
-    return Dataset.read(path, differentiate=method)
+    return None if window is None else SavitzkyGolay(window=window)
 
 
-def data_of_robot(data: Dataset, robot: RobotModel) -> Dataset:
-    """The data with the robot's joints in the robot's order; further logged joints are left out."""
-    if set(robot.joint_names) <= set(data.joint_names):
+def read_data(path: Path, robot: RobotModel | None = None, differentiate: int | None = None) -> Dataset:
+    """Read a data set with the joints of a robot in its order, computing derivatives if a window is given."""
+    from forcegp.data import Dataset
+
+    data = Dataset.read(path, differentiate=derivatives(differentiate))
+    if robot is not None and set(robot.joint_names) <= set(data.joint_names):
         data = data.select(robot.joint_names)
-    data.check_robot(robot)
+    if robot is not None:
+        data.check_robot(robot)
     return data
 
 
-def check_robot_named(scene: str | None, robot: str | None) -> None:
-    """Check that either a scene or a robot was given.
+def trajectory_from(data: Dataset, start: int, purpose: str) -> Dataset:
+    """The rows from `start` to the end of their trajectory."""
+    from forcegp.errors import DataError
 
-    Raises:
-        ForceGPError: neither was, or both.
-    """
+    if not data.header.ordered:
+        raise DataError(
+            f"a {purpose} needs a log in order of time",
+            got="points in order of selection",
+            hint="pass the log that they were selected from",
+        )
+    if start >= len(data):
+        raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 1}", got=start)
+    rest = data[start:]
+    return rest[rest.segment == rest.segment[0]]
+
+
+def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
+    """A model fitted under a progress bar that notes the objective."""
+
+    with progress_bar(f"fitting {model.name}", 1) as progress:
+        return model.fit(
+            data,
+            progress=lambda done, most, value: progress(
+                done, most, "" if math.isnan(value) else f"objective {value:.4g}"
+            ),
+            **options,
+        )
+
+
+def check_robot_named(scene: str | None, robot: str | None) -> None:
+    """Check that either a scene or a robot was given."""
     from forcegp.errors import ForceGPError
 
     if (scene is None) == (robot is None):
-        problem = (
-            "nothing says which robot moved" if scene is None else "both --scene and --robot name a robot"
-        )
-        raise ForceGPError(problem, hint="give either --scene or --robot")
+        problems = "nothing says which robot moved", "both --scene and --robot name a robot"
+        raise ForceGPError(problems[scene is not None], hint="give either --scene or --robot")
 
 
 def system_of(scene: str | None, robot: str | None) -> ConstrainedSystem:
-    """The robot of a scene with its contacts, or a robot without any.
-
-    Raises:
-        ForceGPError: neither is given, or both, or the file is not valid.
-    """
+    """The robot of a scene with its contacts, or a robot without any."""
     from forcegp.constraints import ConstrainedSystem
     from forcegp.robot import load_robot
     from forcegp.scene import load_scene
@@ -172,7 +140,7 @@ def system_of(scene: str | None, robot: str | None) -> ConstrainedSystem:
 
 
 def model_table(config: Path | None, scene: str | None) -> ModelTable:
-    """The table [model] of a file of its own where one is given, else that of the scene, if there is one."""
+    """The table [model] of a file of its own if one is given, else that of the scene, if there is one."""
     from forcegp.scene import default_model_table, load_model_table, load_scene
 
     if config is not None:

@@ -7,17 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import (
-    AsJson,
-    Config,
-    DataFile,
-    data_of_robot,
-    model_table,
-    progress_bar,
-    read_data,
-    show,
-    warn_beyond,
-)
+from forcegp.cli.common import fitted, model_table, progress_bar, read_data, show, warn_beyond
+from forcegp.cli.options import AsJson, Config, DataFile
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset
@@ -70,45 +61,41 @@ def evaluate(
         check_destination(out, folder=True, own_files=["*.json", "*.html", "*.svg", "*.png"])
     regression = _model(model, scene, config, train)
     robot = regression.system.robot
-    test = data_of_robot(read_data(data), robot)
-    training = None if train is None else data_of_robot(read_data(train), robot)
+    test = read_data(data, robot)
+    training = None if train is None else read_data(train, robot)
     with progress_bar("evaluating", len(test)) as progress:
         evaluation = run(regression, test, train=training, progress=progress)
     warn_beyond(regression, test)
     result: dict[str, object] = {"verdict": evaluation.verdict or "too few samples", **evaluation.summary()}
     if out is not None:
-        names = str(model or config or scene), str(data), None if train is None else str(train)
-        result |= _written(out, evaluation, regression, test, *names)
+        names = str(model or config or scene), str(data), str(train) if train else None
+        result |= _written(out, evaluation, regression, test, names)
     show(result, as_json)
 
 
 def _written(
-    out: Path, scores: Evaluation, fitted: Predictor, test: Dataset, model: str, data: str, train: str | None
+    out: Path, scores: Evaluation, model: Predictor, test: Dataset, names: tuple[str, str, str | None]
 ) -> dict[str, object]:
-    """Write the page and its data, and say where they are."""
+    """Write the page and its data, and say where they are; `names` are of the files in the title."""
     from forcegp.destination import write_or_keep
     from forcegp.files import write_json, written_folder
     from forcegp.report.evaluation import PAGE, write_evaluation
     from forcegp.report.window import opening, predicted_window
 
-    comparison = getattr(getattr(fitted, "result", None), "comparison", ())
-    window = predicted_window(fitted, opening(test, WINDOW_SECONDS), fitted.kind)
+    comparison = getattr(getattr(model, "result", None), "comparison", ())
+    window = predicted_window(model, opening(test, WINDOW_SECONDS), model.kind)
 
     def write(folder: Path) -> None:
         with written_folder(folder) as temporary:
             write_json(temporary / "evaluation.json", scores.to_dict())
-            write_evaluation(temporary, model, data, scores, window, train, comparison)
+            write_evaluation(temporary, *names, scores, window, comparison)
 
     write_or_keep(write, out)
     return {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}
 
 
 def _model(model: Path | None, scene: str | None, config: Path | None, train: Path | None) -> Predictor:
-    """The fitted model in a file, or one that is fitted to the training data now.
-
-    Raises:
-        ForceGPError: both are asked for, or neither.
-    """
+    """The fitted model in a file, or one that is fitted to the training data now."""
     from forcegp.errors import ForceGPError
     from forcegp.models.configured import configured
     from forcegp.models.load import load_model
@@ -125,8 +112,4 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
         )
     system = load_scene(scene).system()
     regression = configured(model_table(config, scene), system)
-    training = data_of_robot(read_data(train), system.robot)
-    with progress_bar(f"fitting {regression.name}", 1) as progress:
-        return regression.fit(
-            training, progress=lambda done, most, value: progress(done, most, f"objective {value:.4g}")
-        )
+    return fitted(regression, read_data(train, system.robot))

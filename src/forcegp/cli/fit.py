@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,20 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from forcegp.cli.common import (
-    AsJson,
-    Config,
-    DataFiles,
-    Differentiate,
-    RobotName,
-    SceneOrNone,
-    check_apart,
-    data_of_robot,
+    check_output,
+    derivatives,
+    fitted,
     model_table,
     progress_bar,
     read_data,
     show,
     system_of,
 )
+from forcegp.cli.options import AsJson, Config, DataFiles, Differentiate, RobotName, SceneOrNone
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset, StreamedDataset
@@ -74,41 +69,29 @@ def fit(
 
     forcegp fit --scene kuka_plane --data train.parquet --model sgp --out model
 
-    forcegp fit -s my_scene.toml -d train.parquet -m sgp-zero --noise-std 0.2 -o model --json
-
-    forcegp fit -s my_scene.toml -d train.parquet --config model.toml -o model
-
-    forcegp fit --robot ur3.urdf -d train.parquet -o model
+    forcegp fit --robot ur3.urdf -d train.parquet --config model.toml --noise-std 0.2 -o model --json
 
     forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model
     """
     from forcegp.destination import write_or_keep
     from forcegp.models.configured import configured
     from forcegp.storage.checkpoint import beside
-    from forcegp.storage.model_file import model_path
+    from forcegp.storage.model_file import check_model_destination, model_path
 
-    _check_places(out, checkpoint, data)
+    check_model_destination(out)
+    if checkpoint is not None:
+        check_output(checkpoint, model_path(out), *data)
     system = system_of(scene, robot)
     regression = configured(model_table(config, scene), system, name=model, noise_std=noise_std, seed=seed)
     training = _training(regression.model, data, differentiate, system.robot)
-    with progress_bar(f"fitting {regression.name}", 1) as progress:
-        fitted = regression.fit(
-            training,  # pyright: ignore[reportArgumentType]  # a stream for a structured GP only
-            progress=lambda done, most, value: progress(
-                done, most, "" if math.isnan(value) else f"objective {value:.4g}"
-            ),
-            checkpoint=checkpoint,
-        )
-    write_or_keep(fitted.save, out)
+    learned = fitted(regression, training, checkpoint=checkpoint)
+    write_or_keep(learned.save, out)
     if checkpoint is not None:
         for file in (checkpoint, beside(checkpoint)):
             file.unlink(missing_ok=True)
-    _warn(fitted.result)
-    figures = _figures(fitted.result, as_json)
-    show(
-        {"model": regression.name, "training_points": len(training), **figures, "file": str(model_path(out))},
-        as_json,
-    )
+    _warn(learned.result)
+    result: dict[str, object] = {"model": regression.name, "training_points": len(training)}
+    show({**result, **_figures(learned.result, as_json), "file": str(model_path(out))}, as_json)
 
 
 def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
@@ -120,39 +103,18 @@ def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
     return {name: value for name, value in figures.items() if name != "warnings" and value != ""}
 
 
-def _check_places(out: Path, checkpoint: Path | None, data: list[Path]) -> None:
-    """Check that the model and the checkpoint can be written, apart from the data and from each other.
-
-    Raises:
-        DestinationError: they cannot.
-    """
-    from forcegp.destination import check_destination
-    from forcegp.storage.model_file import check_model_destination, model_path
-
-    check_model_destination(out)
-    if checkpoint is None:
-        return
-    check_destination(checkpoint)
-    check_apart(checkpoint, model_path(out), *data)
-
-
 def _training(
     regression: Model, files: list[Path], differentiate: int | None, robot: RobotModel
 ) -> Dataset | StreamedDataset:
-    """The data that a model is fitted to: read piece by piece where they are long and the model can.
-
-    Raises:
-        DataError: a file cannot be read.
-    """
-    from forcegp.data import Dataset, SavitzkyGolay, StreamedDataset
+    """The data that a model is fitted to: read piece by piece where they are long and the model can."""
+    from forcegp.data import Dataset, StreamedDataset
     from forcegp.models.structured_gp import StructuredGP
 
     if isinstance(regression, StructuredGP) and all(file.suffix.lower() == ".parquet" for file in files):
-        method = SavitzkyGolay(window=differentiate) if differentiate is not None else None
-        log = StreamedDataset(tuple(files), method, robot.joint_names)
+        log = StreamedDataset(tuple(files), derivatives(differentiate), robot.joint_names)
         if len(files) > 1 or len(log) > STREAM_ROWS:
             return log
-    parts = [data_of_robot(read_data(file, differentiate), robot) for file in files]
+    parts = [read_data(file, robot, differentiate) for file in files]
     return parts[0] if len(parts) == 1 else Dataset.concatenate(parts)
 
 
@@ -197,7 +159,6 @@ def sweep(
         scores = run(
             fits, out, processes=processes, address=address, say=lambda done, _: progress(done, len(fits))
         )
-    errors = {
-        fit.name: score["clean_mae"] or score["noisy_mae"] for fit, score in zip(fits, scores, strict=True)
-    }
+    pairs = zip(fits, scores, strict=True)
+    errors = {fit.name: score["clean_mae"] or score["noisy_mae"] for fit, score in pairs}
     show({**errors, "folder": str(out)}, as_json)

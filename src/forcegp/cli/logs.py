@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from forcegp.cli.common import (
-    AsJson,
-    Differentiate,
-    RobotName,
-    SceneOrNone,
-    check_apart,
     check_data_destination,
+    check_output,
     check_robot_named,
     progress_bar,
     read_data,
     show,
     system_of,
 )
+from forcegp.cli.options import AsJson, Differentiate, RobotName, SceneOrNone
 
 if TYPE_CHECKING:
     from forcegp.checks import Report
@@ -67,28 +66,26 @@ def import_(
 
     forcegp import run.bag --robot ur3.urdf --mapping ur3_bag --out log.parquet
     """
-    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.destination import write_or_keep
     from forcegp.errors import ForceGPError
     from forcegp.logs import import_log
 
     check_robot_named(scene, robot)
-    if guess is not None:
-        check_destination(guess)
-        check_apart(guess, log)
-        show(_guess(log, system_of(scene, robot), guess), as_json)
-        return
-    if out is None or out.suffix.lower() != ".parquet":
+    place = guess or out
+    if place is None or (guess is None and place.suffix.lower() != ".parquet"):
         raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
-    check_destination(out)
-    check_apart(out, log)
+    check_output(place, log)
     system = system_of(scene, robot)
+    if guess is not None:
+        show(_guess(log, system, guess), as_json)
+        return
     with progress_bar(f"reading {log.name}", 1) as advance:
         imported = import_log(log, system, mapping, progress=advance)
-    write_or_keep(imported.data.write, out)
+    write_or_keep(imported.data.write, place)
     result = _json(imported) if as_json else _summary(imported)
     if fit_surface is not None:
         result |= _surfaces(imported, system, fit_surface, _tip_radius(tip_radius))
-    show(result | {"file": str(out)}, as_json)
+    show(result | {"file": str(place)}, as_json)
 
 
 def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]:
@@ -97,7 +94,7 @@ def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]
     from forcegp.logs.guess import guess_mapping
 
     with progress_bar(f"looking at {log.name}", 1) as advance:
-        guessed = guess_mapping(log, system, progress=lambda done, total: advance(done, total))
+        guessed = guess_mapping(log, system, progress=advance)
     write_or_keep(lambda path: write_text(path, guessed.toml), out)
     doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
     return {"mapping": str(out), **doubts, "next": f"check {out}, then import with --mapping {out}"}
@@ -106,32 +103,22 @@ def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]
 def _summary(imported: Imported) -> dict[str, object]:
     """Rows, trajectories and period, then what was found and done."""
     data, report = imported.data, imported.report
-    result: dict[str, object] = {
-        "rows": f"{len(data)} from {report.rows_read} logged",
-        "segments": int(data.segment[-1]) + 1,
-        "period_s": data.header.dt,
-    }
+    rows, segments = f"{len(data)} from {report.rows_read} logged", int(data.segment[-1]) + 1
+    result: dict[str, object] = {"rows": rows, "segments": segments, "period_s": data.header.dt}
     result |= {f"found_{i + 1}": finding.message for i, finding in enumerate(report.findings)}
     return result | {f"step_{i + 1}": step for i, step in enumerate(report.steps)}
 
 
 def _tip_radius(text: str | None) -> float | Literal["fit"] | None:
-    """The radius of the tip as it was given.
-
-    Raises:
-        ForceGPError: neither a length nor `fit`.
-    """
+    """The radius of the tip as it was given."""
     from forcegp.errors import ForceGPError
 
     if text is None or text == "fit":
         return text
-    try:
-        radius = float(text)
-    except ValueError:
-        radius = -1.0
-    if not 0.0 <= radius < float("inf"):
-        raise ForceGPError("no such radius of the tip", expected="a length in metres, or fit", got=text)
-    return radius
+    with suppress(ValueError):
+        if 0.0 <= float(text) < float("inf"):
+            return float(text)
+    raise ForceGPError("no such radius of the tip", expected="a length in metres, or fit", got=text)
 
 
 def _surfaces(
@@ -144,8 +131,8 @@ def _surfaces(
     from forcegp.logs.surface_fit import fit_surface
 
     touched = [name for name, closed in imported.data.contact.items() if bool(closed.any())]
-    fits = {name: fit_surface(imported.data, system, name, kind, tip_radius) for name in touched}
-    return {name: fit.toml().strip() for name, fit in fits.items()}
+    fits = ((name, fit_surface(imported.data, system, name, kind, tip_radius)) for name in touched)
+    return {name: fit.toml().strip() for name, fit in fits}
 
 
 def _json(imported: Imported) -> dict[str, object]:
@@ -190,19 +177,16 @@ def check(
 
     forcegp check --scene kuka_plane --data run.parquet
 
-    forcegp check -s my_scene.toml -d run.parquet --out check.html --json
-
-    forcegp check --robot ur3.urdf --data run.parquet
+    forcegp check --robot ur3.urdf -d run.parquet --out check.html --json
     """
     from threadpoolctl import threadpool_limits
 
     from forcegp.checks import check as run
     from forcegp.checks import read_log
-    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.destination import write_or_keep
 
     if out is not None:
-        check_destination(out)
-        check_apart(out, data)
+        check_output(out, data)
     system = system_of(scene, robot)
     log = read_log(data)
     # Matrices are small: threads of BLAS cost more than they save, and two checks at once would fight.
@@ -236,12 +220,8 @@ def _print(report: Report) -> None:
         for heading in ("severity", "kind", "rows", "finding and remedy"):
             table.add_column(heading, no_wrap=heading in ("severity", "kind"), overflow="fold")
         for finding in report.findings:
-            whole = finding.intervals == ((0, report.samples),)
-            rows = (
-                "all"
-                if whole
-                else describe(finding.intervals, most=2).removeprefix("rows ").removeprefix("row ")
-            )
+            rows = re.sub("^rows? ", "", describe(finding.intervals, most=2))
+            rows = "all" if finding.intervals == ((0, report.samples),) else rows
             # Joint and parameter names may hold brackets, which are no markup.
             body = Text(f"{finding.message}\n").append(f"→ {finding.remedy}", style="dim")
             kinds = "\nor ".join(finding.kinds)
@@ -289,7 +269,7 @@ def select(
     check_data_destination(out, log)
     if rest is not None:
         check_data_destination(rest, log, out)
-    whole = read_data(log, differentiate)
+    whole = read_data(log, differentiate=differentiate)
     data = whole if keep_impacts else without_marked_impacts(whole)
     held_out = {"stretch": stretch, "fraction": fraction, "margin": margin}
     with progress_bar("selecting points", count) as progress:
@@ -308,12 +288,13 @@ def _written(data: Dataset, parts: Split, how: str, out: Path, rest: Path | None
     """Write training and test points, and say what was written."""
     from forcegp.destination import write_or_keep
 
-    count = len(parts.train)
-    write_or_keep(data[parts.train].with_step(f"selected {count} training points {how}").write, out)
-    result: dict[str, object] = {"training_points": count, "training_file": str(out)}
-    if rest is not None:
-        write_or_keep(data[parts.test].with_step(f"kept {len(parts.test)} test points {how}").write, rest)
-        result |= {"test_points": len(parts.test), "test_file": str(rest)}
+    result: dict[str, object] = {}
+    files = ("selected", "training", parts.train, out), ("kept", "test", parts.test, rest)
+    for done, kind, rows, path in files:
+        if path is not None:
+            step = f"{done} {len(rows)} {kind} points {how}"
+            write_or_keep(data[rows].with_step(step).write, path)
+            result |= {f"{kind}_points": len(rows), f"{kind}_file": str(path)}
     if parts.stretches:
         result["held_out_rows"] = [list(rows) for rows in parts.stretches]
     return result

@@ -7,27 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import (
-    AsJson,
-    DataFile,
-    ModelFile,
-    check_data_destination,
-    data_of_robot,
-    progress_bar,
-    read_data,
-    show,
-    warn_beyond,
-)
+from forcegp.cli.common import check_data_destination, progress_bar, read_data, show, warn_beyond
+from forcegp.cli.options import AsJson, DataFile, ModelFile
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from forcegp.constraints import ConstrainedSystem
     from forcegp.data import Dataset
+    from forcegp.evaluation.predicted import Moments
     from forcegp.models.base import Predictor
 
-CHUNK = 2000
-"""States predicted at once: bounds the memory, and moves the progress bar."""
 PER_CONTACT = ("multiplier", "contact_force")
 """Quantities with one value or one vector per contact; the others have one component per joint."""
 
@@ -70,14 +60,18 @@ def predict(
     """
     from forcegp.destination import write_or_keep
     from forcegp.errors import ModelError
+    from forcegp.evaluation.predicted import in_chunks
     from forcegp.models.load import load_model
 
     check_data_destination(out, data)
     regression = load_model(model)
-    test = data_of_robot(read_data(data), regression.system.robot)
+    test = read_data(data, regression.system.robot)
     if sensor and quantity != "multiplier":
         raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
-    mean, std = _predict_all(regression, test, quantity, noise, sensor)
+    with progress_bar(f"predicting {quantity}", len(test)) as progress:
+        mean, std = in_chunks(
+            lambda part: _predicted(regression, part, quantity, noise, sensor), test, progress
+        )
     warn_beyond(regression, test)
     test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", mean)
     if std is not None:
@@ -89,46 +83,22 @@ def predict(
     )
 
 
-def _predict_all(
-    model: Predictor, test: Dataset, quantity: str, noise: bool, sensor: bool
-) -> tuple[Tensor, Tensor | None]:
-    """Mean and standard deviation of a quantity at all states, chunk by chunk."""
-    import torch
-
-    active = test.active(model.system.contact_names)
-    means, stds = [], []
-    with progress_bar(f"predicting {quantity}", len(test)) as progress:
-        for first in range(0, len(test), CHUNK):
-            rows = slice(first, first + CHUNK)
-            mean, std = _predicted(model, test[rows], quantity, active[rows], noise, sensor)
-            means.append(mean)
-            if std is not None:
-                stds.append(std)
-            progress(min(first + CHUNK, len(test)))
-    return torch.cat(means), torch.cat(stds) if stds else None
-
-
-def _predicted(
-    model: Predictor, part: Dataset, quantity: str, active: Tensor, noise: bool, sensor: bool
-) -> tuple[Tensor, Tensor | None]:
-    """Mean and standard deviation of a quantity at some states.
-
-    Raises:
-        ModelError: the model learned no noise, or was not fitted to a sensor.
-    """
+def _predicted(model: Predictor, part: Dataset, quantity: str, noise: bool, sensor: bool) -> Moments:
+    """Mean and standard deviation of a quantity at some states."""
     from forcegp.errors import ModelError
     from forcegp.models.sensed import force_from_sensor
     from forcegp.models.structured_fit import StructuredFit
 
-    if not (noise or sensor):
-        prediction = model.predict(part.q, part.qd, part.tau, quantity, active=active)
-        return prediction.mean, prediction.std
-    if not isinstance(model, StructuredFit):
+    if (noise or sensor) and not isinstance(model, StructuredFit):
         raise ModelError("--noise and --sensor need a structured Gaussian process", got=model.kind)
     if sensor:
-        mean, std = force_from_sensor(model, part)
+        mean, std = force_from_sensor(model, part)  # pyright: ignore[reportArgumentType]
         return mean[:, None], std[:, None]
-    prediction = model.predict(part.q, part.qd, part.tau, quantity, active=active, noise=True)
+    states, active = (part.q, part.qd, part.tau), part.active(model.system.contact_names)
+    if noise and isinstance(model, StructuredFit):
+        prediction = model.predict(*states, quantity, active=active, noise=True)
+    else:
+        prediction = model.predict(*states, quantity, active=active)
     return prediction.mean, prediction.std
 
 
@@ -136,21 +106,14 @@ def _with_columns(
     data: Dataset, system: ConstrainedSystem, quantity: str, name: str, values: Tensor
 ) -> Dataset:
     """The data set with a predicted quantity among its logged ones."""
-    if quantity not in PER_CONTACT:
-        return data.replace(extras={**data.extras, name: values})
-    sizes = _components(system, quantity)
-    named = {
-        contact: part[:, 0] if part.shape[-1] == 1 else part
-        for contact, part in zip(sizes, values.split(list(sizes.values()), dim=-1), strict=True)
-    }
-    return data.replace(contact_extras={**data.contact_extras, name: named})
-
-
-def _components(system: ConstrainedSystem, quantity: str) -> dict[str, int]:
-    """Number of components by contact: rows of a multiplier, or a Cartesian force where there is a
-    surface."""
     from forcegp.constraints import SurfaceContact
 
+    if quantity not in PER_CONTACT:
+        return data.replace(extras={**data.extras, name: values})
     if quantity == "multiplier":
-        return {contact.name: contact.rows for contact in system.contacts}
-    return {contact.name: 3 for contact in system.contacts if isinstance(contact, SurfaceContact)}
+        sizes = {contact.name: contact.rows for contact in system.contacts}
+    else:
+        sizes = {contact.name: 3 for contact in system.contacts if isinstance(contact, SurfaceContact)}
+    parts = zip(sizes, values.split(list(sizes.values()), dim=-1), strict=True)
+    named = {contact: part[:, 0] if part.shape[-1] == 1 else part for contact, part in parts}
+    return data.replace(contact_extras={**data.contact_extras, name: named})

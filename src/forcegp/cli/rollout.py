@@ -9,17 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import (
-    AsJson,
-    DataFile,
-    ModelFile,
-    SceneName,
-    check_data_destination,
-    data_of_robot,
-    progress_bar,
-    read_data,
-    show,
-)
+from forcegp.cli.common import check_data_destination, progress_bar, read_data, show, trajectory_from
+from forcegp.cli.options import AsJson, DataFile, ModelFile, SceneName
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,31 +20,23 @@ if TYPE_CHECKING:
     from forcegp.rollout import Rollout, RolloutOptions
 
 
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the page.")]
-Start = Annotated[int, typer.Option(min=0, help="Row of the data to start from.")]
-Duration = Annotated[
-    float | None, typer.Option(help="Time to roll out in seconds; default: to the end of the trajectory.")
-]
-Samples = Annotated[int, typer.Option(min=0, help="Functions to draw from the model's posterior.")]
-Stabilization = Annotated[str, typer.Option(help="none, baumgarte or projection.")]
-Method = Annotated[str, typer.Option(help="semi_implicit_euler, rk4, rk45 or dop853.")]
-Unilateral = Annotated[
-    bool, typer.Option("--unilateral", help="Let contacts open where they would pull, and close again.")
-]
-Seed = Annotated[int, typer.Option(help="Seed of the samples.")]
-
-
 def rollout(
     model: ModelFile,
     data: DataFile,
-    out: Out,
-    start: Start = 0,
-    duration: Duration = None,
-    samples: Samples = 0,
-    stabilization: Stabilization = "baumgarte",
-    method: Method = "semi_implicit_euler",
-    unilateral: Unilateral = False,
-    seed: Seed = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the page.")],
+    start: Annotated[int, typer.Option(min=0, help="Row of the data to start from.")] = 0,
+    duration: Annotated[
+        float | None, typer.Option(help="Time to roll out in seconds; default: to the end of the trajectory.")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=0, help="Functions to draw from the model's posterior.")] = 0,
+    stabilization: Annotated[str, typer.Option(help="none, baumgarte or projection.")] = "baumgarte",
+    method: Annotated[
+        str, typer.Option(help="semi_implicit_euler, rk4, rk45 or dop853.")
+    ] = "semi_implicit_euler",
+    unilateral: Annotated[
+        bool, typer.Option("--unilateral", help="Let contacts open where they would pull, and close again.")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Simulate forward with a model, from a logged state and under the logged torques.
@@ -71,26 +54,26 @@ def rollout(
     from forcegp.destination import check_destination, write_or_keep
     from forcegp.files import written_folder
     from forcegp.models.load import load_model
-    from forcegp.rollout import RolloutOptions
+    from forcegp.report.rollout_data import rollout_data
+    from forcegp.report.rollouts import write_rollouts
+    from forcegp.rollout import RolloutOptions, beside_log
     from forcegp.rollout.inputs import sampling_period
 
     check_destination(out, folder=True, own_files=["rollout*", "*.svg", "*.png"])
     regression = load_model(model)
-    log = _stretch(data_of_robot(read_data(data), regression.system.robot), start, duration)
+    log = _stretch(read_data(data, regression.system.robot), start, duration)
     _say_contact(log, unilateral)
     dt = sampling_period(log)
     options = RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
     path = _roll(regression, log, options, samples, seed)
     rolled = _as_data(path, log, dt)
-    title, step = (
-        f"{regression.kind} rolled out on {data}",
-        f"rolled out by the model in {model} from row {start}",
-    )
+    compared = rollout_data(beside_log(regression.kind, path, log, dt))
+    step = f"rolled out by the model in {model} from row {start}"
 
     def write(folder: Path) -> None:
         with written_folder(folder) as temporary:
             rolled.with_step(step).write(temporary / "rollout.parquet")
-            _write_page(temporary, title, regression.kind, path, log, dt)
+            write_rollouts(temporary, f"{regression.kind} rolled out on {data}", compared)
 
     write_or_keep(write, out)
     written = {"page": str(out / "rollout.html"), "file": str(out / "rollout.parquet")}
@@ -112,14 +95,6 @@ def _roll(regression: FittedModel, log: Dataset, options: RolloutOptions, sample
             options=options,
             progress=progress,
         )
-
-
-def _write_page(out: Path, title: str, name: str, path: Rollout, log: Dataset, dt: float) -> None:
-    from forcegp.report.rollout_data import rollout_data
-    from forcegp.report.rollouts import write_rollouts
-    from forcegp.rollout import beside_log
-
-    write_rollouts(out, title, rollout_data(beside_log(name, path, log, dt)))
 
 
 def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:
@@ -159,12 +134,7 @@ def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
     from forcegp.data.derivative import UNIFORM_TOLERANCE
     from forcegp.errors import DataError
 
-    if not data.header.ordered:
-        raise DataError("a rollout needs a log in order of time", got="points in order of selection")
-    if start >= len(data) - 1:
-        raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 2}", got=start)
-    rest = data[start:]
-    stretch = rest[rest.segment == rest.segment[0]]
+    stretch = trajectory_from(data, start, "rollout")
     if duration is not None:
         stretch = stretch[stretch.t <= stretch.t[0] + duration * (1.0 + 1e-9)]
     steps = stretch.t.diff()
@@ -178,35 +148,27 @@ def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
 
 def _spread(q: Tensor) -> Tensor:
     """Standard deviation `(T, nq)` over samples `(S, T, nq)` that have not diverged, while two are left."""
+    import numpy as np
     import torch
 
     finite = q.isfinite().all(-1)
     length = int((finite.sum(0) >= 2).to(torch.int64).cumprod(0).sum())
-    q, finite = q[:, :length], finite[:, :length, None]
-    count = finite.sum(0)
-    mean = torch.where(finite, q, 0.0).sum(0) / count
-    square = torch.where(finite, (q - mean).square(), 0.0).sum(0)
-    return (square / (count - 1)).sqrt()
+    sound = torch.where(finite[..., None], q, torch.nan)[:, :length]
+    return torch.from_numpy(np.nanstd(sound.numpy(), axis=0, ddof=1))
 
 
 def _as_data(path: Rollout, log: Dataset, dt: float) -> Dataset:
     """The rolled-out motion as a data set beside the log that it started from, up to where it diverged."""
     length = len(path.t) if not path.diverged else round(path.diverged[0].t / dt) + 1
-    spread = _spread(path.samples.q) if path.samples is not None and path.samples.rows > 1 else None
-    if spread is not None:
-        length = min(length, len(spread))
-    extras = {"q_logged": log.q[:length], "qd_logged": log.qd[:length]}
-    if spread is not None:
-        extras["q_std"] = spread[:length]
-    rows = slice(0, length)
-    names = path.system.contact_names
+    extras = {"q_logged": log.q, "qd_logged": log.qd}
+    if path.samples is not None and path.samples.rows > 1:
+        extras["q_std"] = _spread(path.samples.q)
+        length = min(length, len(extras["q_std"]))
+    closed = zip(path.system.contact_names, path.active[:length].unbind(-1), strict=True)
     return log[:length].replace(
-        q=path.q[rows],
-        qd=path.qd[rows],
-        qdd=path.qdd[rows],
-        tau=path.tau[rows],
-        contact={name: path.active[rows, i] for i, name in enumerate(names)},
-        extras=extras,
+        **{name: getattr(path, name)[:length] for name in ("q", "qd", "qdd", "tau")},
+        contact=dict(closed),
+        extras={name: values[:length] for name, values in extras.items()},
         contact_extras={},
     )
 

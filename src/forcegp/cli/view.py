@@ -7,45 +7,39 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import AsJson, data_of_robot, progress_bar, read_data, show
+from forcegp.cli.common import progress_bar, read_data, show, trajectory_from
+from forcegp.cli.options import AsJson
 
 if TYPE_CHECKING:
     from forcegp.constraints import ConstrainedSystem
     from forcegp.data import Dataset
     from forcegp.models.base import FittedModel
-    from forcegp.view.motion import Motion
     from forcegp.view.shapes import Shape
-
-Target = Annotated[
-    str, typer.Argument(help="Scene file, name of a bundled scene, or file of a fitted model.")
-]
-Data = Annotated[Path | None, typer.Option("--data", "-d", help="Log whose motion is shown.")]
-RolloutFile = Annotated[
-    Path | None,
-    typer.Option("--rollout", "-r", help="The rollout.parquet of `forcegp rollout`, shown as it predicts."),
-]
-Out = Annotated[
-    Path | None, typer.Option("--out", "-o", help="One HTML file that works offline; default: a live view.")
-]
-Seconds = Annotated[float, typer.Option(min=0.05, help="Length of the motion in seconds.")]
-Start = Annotated[int, typer.Option(min=0, help="Row of the log to start from.")]
-Samples = Annotated[
-    int, typer.Option(min=0, help="Function samples whose paths of the tip are drawn, of a structured model.")
-]
-Horizon = Annotated[float, typer.Option(min=0.01, help="How far ahead the paths reach in seconds.")]
-Port = Annotated[int, typer.Option(min=1024, max=65535, help="Port of the live view.")]
 
 
 def view(
-    target: Target,
-    data: Data = None,
-    rollout: RolloutFile = None,
-    out: Out = None,
-    start: Start = 0,
-    seconds: Seconds = 10.0,
-    samples: Samples = 8,
-    horizon: Horizon = 1.0,
-    port: Port = 8080,
+    target: Annotated[
+        str, typer.Argument(help="Scene file, name of a bundled scene, or file of a fitted model.")
+    ],
+    data: Annotated[Path | None, typer.Option("--data", "-d", help="Log whose motion is shown.")] = None,
+    rollout: Annotated[
+        Path | None,
+        typer.Option(
+            "--rollout", "-r", help="The rollout.parquet of `forcegp rollout`, shown as it predicts."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="HTML file that works offline; default: serve the page."),
+    ] = None,
+    start: Annotated[int, typer.Option(min=0, help="Row of the log to start from.")] = 0,
+    seconds: Annotated[float, typer.Option(min=0.05, help="Length of the motion in seconds.")] = 10.0,
+    samples: Annotated[
+        int,
+        typer.Option(min=0, help="Function samples whose paths of the tip are drawn, of a structured model."),
+    ] = 8,
+    horizon: Annotated[float, typer.Option(min=0.01, help="How far ahead the paths reach in seconds.")] = 1.0,
+    port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page.")] = 8080,
     as_json: AsJson = False,
 ) -> None:
     """Look at a robot, its surfaces, contact forces and predicted paths in three dimensions.
@@ -54,7 +48,7 @@ def view(
     deviations at its tip, and the paths of the tip that the model predicts from the first state. With a scene
     and a log, the force is the logged one. Without a log the robot stands still.
 
-    The live view is served to this computer only. With --out, one HTML file is written that needs no network.
+    The page is served to this computer only. With --out, one HTML file is written that needs no network.
 
     [bold]Examples[/bold]
 
@@ -65,32 +59,31 @@ def view(
     forcegp view my_scene.toml --rollout rollout/rollout.parquet
     """
     from forcegp.destination import check_destination
+    from forcegp.errors import ParameterError
+    from forcegp.view.motion import at_rest, of_log, sampled_rollout, with_rollout
+    from forcegp.view.page import serve, view_page, write_view
 
     if out is not None:
         check_destination(out)
     if data is not None and rollout is not None:
-        from forcegp.errors import ParameterError
-
         raise ParameterError("--data and --rollout exclude each other", hint="name one motion to look at")
     system, model, shapes = _target(target)
-    motion = _motion(system, model, data or rollout, start, seconds)
-    if model is not None and data is not None:
-        motion = _with_paths(motion, model, _stretch(data, system, start, seconds), samples, horizon)
-    title = f"{target}: {data or rollout or 'at rest'}"
+    log = data or rollout
+    motion = at_rest(system)
+    if log is not None:
+        stretch = _stretch(log, system, start, seconds)
+        motion = of_log(system, stretch, model)
+        if model is not None and data is not None:
+            with progress_bar("rolling out", 1) as advance:
+                motion = with_rollout(motion, sampled_rollout(model, stretch, samples, horizon))
+                advance(1)
+    title = f"{target}: {log or 'at rest'}"
     if out is None:
-        from forcegp.view.page import serve
-
-        serve(
-            motion, shapes, port, say=lambda address: typer.echo(f"{title}\nopen {address}, end with Ctrl-C")
-        )
+        page = view_page(motion, shapes, title)
+        serve(page, port, say=lambda address: typer.echo(f"{title}\nopen {address}, end with Ctrl-C"))
         return
-    from forcegp.view.page import write_view
-
-    with progress_bar("writing the view", 1) as advance:
-        write_view(out, motion, shapes, title)
-        advance(1)
-    figures = {"pictures": len(motion.t), "paths": len(motion.paths), "page": str(out)}
-    show(figures, as_json)
+    write_view(out, motion, shapes, title)
+    show({"pictures": len(motion.t), "paths": len(motion.paths), "page": str(out)}, as_json)
 
 
 def _target(target: str) -> tuple[ConstrainedSystem, FittedModel | None, list[Shape]]:
@@ -110,42 +103,10 @@ def _target(target: str) -> tuple[ConstrainedSystem, FittedModel | None, list[Sh
     return system, None, shapes_of(system.robot, named if named in BUNDLED else scene.folder / named)
 
 
-def _motion(
-    system: ConstrainedSystem, model: FittedModel | None, log: Path | None, start: int, seconds: float
-) -> Motion:
-    from forcegp.view.motion import at_rest, of_log
-
-    if log is None:
-        return at_rest(system)
-    return of_log(system, _stretch(log, system, start, seconds), model)
-
-
 def _stretch(log: Path, system: ConstrainedSystem, start: int, seconds: float) -> Dataset:
     """The rows of one trajectory from `start` on, up to its first gap, and as long as asked for."""
-    from forcegp.errors import DataError
-
-    data = data_of_robot(read_data(log), system.robot)
-    if not data.header.ordered:
-        raise DataError(
-            "a view needs a log in the order of time",
-            got="points in the order of their selection",
-            hint="pass the log that they were selected from",
-        )
-    if start >= len(data):
-        raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 1}", got=start)
-    rest = data[start:]
-    stretch = rest[rest.segment == rest.segment[0]]
+    stretch = trajectory_from(read_data(log, system.robot), start, "view")
     steps = stretch.t.diff()
     gaps = (steps > 1.5 * steps.median()).nonzero() if len(steps) > 0 else steps  # left by `forcegp select`
     stretch = stretch[: int(gaps[0]) + 1] if len(gaps) > 0 else stretch
     return stretch[stretch.t <= stretch.t[0] + seconds]
-
-
-def _with_paths(motion: Motion, model: FittedModel, data: Dataset, samples: int, horizon: float) -> Motion:
-    """The motion with the paths that the model predicts from its first state."""
-    from forcegp.view.motion import sampled_rollout, with_rollout
-
-    with progress_bar("rolling out", 1) as advance:
-        path = sampled_rollout(model, data, samples, horizon)
-        advance(1)
-    return with_rollout(motion, path)

@@ -9,31 +9,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields, component_names
+from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields, component_names, mapped, named_columns
 from forcegp.errors import DataError, near_names
 from forcegp.limits import LOGGED_VALUE
 from forcegp.robot.model import RobotModel
-
-
-def _named_columns(data: Fields) -> list[tuple[str, Tensor]]:
-    """Every floating-point column of the data set but time, by its name on disk, vectors whole."""
-    pairs = [(name, getattr(data, name)) for name in JOINT_VECTORS] + list(data.extras.items())
-    for name, group in data.contact_extras.items():
-        pairs += [(f"{name}.{contact}", value) for contact, value in group.items()]
-    return pairs
 
 
 def check_tensors(data: Fields) -> None:
     """Check that every column is a tensor, and every group of columns a mapping, before they are used."""
     for name in ("contact", "extras", "contact_extras"):
         _check_kind(name, getattr(data, name), Mapping, "a mapping of names to tensors")
-    named = {"t": data.t, **{name: getattr(data, name) for name in JOINT_VECTORS}, **data.extras}
-    named |= {f"contact.{name}": value for name, value in data.contact.items()}
-    if data.segment is not None:
-        named["segment"] = data.segment
     for name, group in data.contact_extras.items():
         _check_kind(name, group, Mapping, "a mapping of contacts to tensors")
-        named |= {f"{name}.{contact}": value for contact, value in group.items()}
+    named = {"t": data.t, **named_columns(data)}
+    named |= {f"contact.{name}": value for name, value in data.contact.items()}
+    named |= {} if data.segment is None else {"segment": data.segment}
     for name, value in named.items():
         _check_kind(name, value, Tensor, "a tensor", f"call torch.tensor({name}, dtype=torch.float64)")
 
@@ -61,7 +51,7 @@ def check_layout(data: Fields) -> None:
     if shared:
         raise DataError(f"{shared[0]!r} is the name of a joint and of a contact", hint="rename the contact")
     _check_names(data)
-    for name, value in (("t", data.t), *_named_columns(data)):
+    for name, value in (("t", data.t), *named_columns(data).items()):
         _check_type(name, value, data.t)
     for name in (*JOINT_VECTORS, *data.extras):
         _check_shape(name, getattr(data, name), (n, nq), f"{n} samples of {nq} joints")
@@ -98,11 +88,10 @@ def _check_names(data: Fields) -> None:
 
 def _check_type(name: str, value: Tensor, like: Tensor) -> None:
     if not value.is_floating_point() or value.dtype != like.dtype or value.device != like.device:
+        wanted = f"{like.dtype} on {like.device}" if like.is_floating_point() else "a floating-point type"
         raise DataError(
             f"column {name!r} is of another type or on another device than 't'",
-            expected=f"{like.dtype} on {like.device}"
-            if like.is_floating_point()
-            else "a floating-point type",
+            expected=wanted,
             got=f"{value.dtype} on {value.device}",
         )
 
@@ -116,23 +105,19 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 
 def check_values(data: Fields) -> None:
     """Check that every number is finite, and that time increases within each segment."""
-    for name, value in (("t", data.t), *_named_columns(data)):
-        if not bool((value.abs() <= LOGGED_VALUE).all()):
-            _report_not_finite(data, name, value)
+    for name, value in (("t", data.t), *named_columns(data).items()):
+        wrong = ~(value.abs() <= LOGGED_VALUE)
+        if bool(wrong.any()):
+            place = torch.nonzero(wrong)[0].tolist()
+            column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]
+            raise DataError(
+                f"column {column!r} holds {value[tuple(place)].item()} in row {place[0]}",
+                expected=f"a finite number in every row, up to ±{LOGGED_VALUE:g}",
+                got=f"{int(wrong.sum())} values in {name!r} that are not",
+                hint="drop or repair these rows before using the log",
+            )
     if data.header.ordered:
         check_time(data)
-
-
-def _report_not_finite(data: Fields, name: str, value: Tensor) -> None:
-    wrong = ~(value.abs() <= LOGGED_VALUE)
-    place, count = torch.nonzero(wrong)[0].tolist(), int(wrong.sum())
-    column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]
-    raise DataError(
-        f"column {column!r} holds {value[tuple(place)].item()} in row {place[0]}",
-        expected=f"a finite number in every row, up to ±{LOGGED_VALUE:g}",
-        got=f"{count} values in {name!r} that are not",
-        hint="drop or repair these rows before using the log",
-    )
 
 
 def check_time(data: Fields) -> None:
@@ -170,17 +155,13 @@ def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
     """
     if isinstance(rows, slice):
         return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
+    rule = "rows are selected by a slice, a mask or a list of row numbers"
     try:
         index = torch.as_tensor(rows, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise DataError(
-            "rows are selected by a slice, a mask or a list of row numbers", got=repr(rows)[:80]
-        ) from error
+        raise DataError(rule, got=repr(rows)[:80]) from error
     if index.ndim != 1 or (index.is_floating_point() and len(index)):
-        raise DataError(
-            "rows are selected by a slice, a mask or a list of row numbers",
-            got=f"a tensor of shape {tuple(index.shape)} and type {index.dtype}",
-        )
+        raise DataError(rule, got=f"a tensor of shape {tuple(index.shape)} and type {index.dtype}")
     if index.dtype == torch.bool:
         if len(index) != n:
             raise DataError("the mask has another length than the data set", expected=n, got=len(index))
@@ -200,20 +181,15 @@ def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
     if tuple(have) == tuple(want):
         return
     missing = [joint for joint in want if joint not in have]
-    if not missing:
-        raise DataError(
-            f"the joints of the data are not those of robot {robot!r} in its order",
-            expected=", ".join(want),
-            got=", ".join(have),
-            hint="call data.select(robot.joint_names)",
-        )
-    near = near_names(missing[0], (joint for joint in have if joint not in want))
-    raise DataError(
-        f"joint {missing[0]!r} of robot {robot!r} is not in the data",
-        expected=", ".join(want),
-        got=", ".join(have),
-        hint=f"is {near[0]!r} in the data the same joint? Rename its columns" if near else lock_hint(missing),
-    )
+    if missing:
+        near = near_names(missing[0], (joint for joint in have if joint not in want))
+        problem = f"joint {missing[0]!r} of robot {robot!r} is not in the data"
+        same = f"is {near[0]!r} in the data the same joint? Rename its columns" if near else None
+        hint = same or lock_hint(missing)
+    else:
+        problem = f"the joints of the data are not those of robot {robot!r} in its order"
+        hint = "call data.select(robot.joint_names)"
+    raise DataError(problem, expected=", ".join(want), got=", ".join(have), hint=hint)
 
 
 def lock_hint(joints: Sequence[str]) -> str:
@@ -244,8 +220,8 @@ def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
                 expected=f"contact.{name}, 1 where the contact is closed and 0 elsewhere",
                 got=", ".join(f"contact.{c}" for c in data.contact) or "no contact column",
             )
-    columns_ = [data.contact[name] for name in contacts]
-    return torch.stack(columns_, dim=-1) if columns_ else data.segment.new_zeros(len(data), 0).bool()
+    closed = [data.contact[name] for name in contacts]
+    return torch.stack(closed, dim=-1) if closed else data.segment.new_zeros(len(data), 0).bool()
 
 
 def check_alike(parts: Sequence[Fields]) -> None:
@@ -288,21 +264,11 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
 def concatenated(parts: Sequence[Fields]) -> dict[str, Any]:
     """Fields of data sets one after another, each with segments of its own; errors as of `check_alike`."""
     check_alike(parts)
-    first = parts[0]
     segments, start = [], 0
     for part in parts:
         _, numbers = torch.unique_consecutive(part.segment, return_inverse=True)
         segments.append(numbers + start)
         start += int(numbers.max()) + 1 if len(part) else 0
-    return {
-        **{name: torch.cat([getattr(p, name) for p in parts]) for name in ("t", *JOINT_VECTORS)},
-        "joint_names": first.joint_names,
-        "contact": {name: torch.cat([p.contact[name] for p in parts]) for name in first.contact},
-        "extras": {name: torch.cat([p.extras[name] for p in parts]) for name in first.extras},
-        "contact_extras": {
-            name: {c: torch.cat([p.contact_extras[name][c] for p in parts]) for c in group}
-            for name, group in first.contact_extras.items()
-        },
-        "segment": torch.cat(segments),
-        "header": common_header([part.header for part in parts]),
-    }
+    header = common_header([part.header for part in parts])
+    own = {"joint_names": parts[0].joint_names, "segment": torch.cat(segments), "header": header}
+    return mapped(parts, torch.cat) | own

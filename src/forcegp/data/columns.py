@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forcegp.data.derivative import SavitzkyGolay, differentiate
-from forcegp.data.fields import AXES, JOINT_VECTORS, DataHeader, Fields, component_names
+from forcegp.data.fields import AXES, JOINT_VECTORS, DataHeader, Fields, component_names, named_columns
 from forcegp.data.table import Columns, IgnoredColumnsWarning
 from forcegp.errors import DataError, near_names
 from forcegp.limits import JOINTS, SEGMENT_NUMBER
@@ -22,12 +22,9 @@ Arrays = dict[str, Any]
 
 def unparse(data: Fields) -> tuple[Columns, DataHeader]:
     """Columns and header of a data set, as they are written."""
-    named: dict[str, Tensor] = {name: getattr(data, name) for name in JOINT_VECTORS} | dict(data.extras)
-    for name, group in data.contact_extras.items():
-        named |= {f"{name}.{contact}": value for contact, value in group.items()}
     columns: dict[str, Tensor] = {"t": data.t, "segment": data.segment}
     columns |= {f"contact.{name}": value for name, value in data.contact.items()}
-    for name, value in named.items():
+    for name, value in named_columns(data).items():
         parts = component_names(name, value, data.joint_names)
         columns |= dict(zip(parts, value.reshape(len(data), len(parts)).unbind(-1), strict=True))
     header = data.header.model_copy(

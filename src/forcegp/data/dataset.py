@@ -22,7 +22,7 @@ from forcegp.data.checks import (
 )
 from forcegp.data.columns import as_tensors, parse, unparse
 from forcegp.data.derivative import SavitzkyGolay
-from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields
+from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields, mapped
 from forcegp.data.table import check_ending, read_table, write_parquet
 from forcegp.errors import DataError, UnknownNameError
 from forcegp.notebook import html_table
@@ -39,7 +39,8 @@ def summary(data: Fields) -> str:
     robot = f" of {data.header.robot!r}" if data.header.robot else ""
     parts = [f"{len(data)} samples of {len(data.joint_names)} joints"]
     if len(data):
-        parts += [_time(data), *_contacts(data)]
+        closed = [f"{name} ({float(x.double().mean()):.0%} closed)" for name, x in data.contact.items()]
+        parts += [_time(data)] + ([f"contact {', '.join(closed)}"] if closed else [])
     also = [*data.extras, *data.contact_extras]
     parts += [f"also logged: {', '.join(also)}"] if also else []
     kind = str(data.q.dtype).removeprefix("torch.")
@@ -54,11 +55,6 @@ def _time(data: Fields) -> str:
     _, rows = torch.unique_consecutive(data.segment, return_counts=True)
     last = rows.cumsum(0) - 1
     return f"{float((data.t[last] - data.t[last - rows + 1]).sum()):.4g} s in {segments}"
-
-
-def _contacts(data: Fields) -> list[str]:
-    closed = [f"{name} ({float(value.double().mean()):.0%} closed)" for name, value in data.contact.items()]
-    return [f"contact {', '.join(closed)}"] if closed else []
 
 
 def summary_table(data: Fields) -> tuple[str, tuple[str, ...], list[tuple[object, ...]], list[str]]:
@@ -100,8 +96,8 @@ class Dataset:
         >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
         >>> t = torch.arange(20, dtype=torch.float64)
         >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> data.nq, len(data[::2])
-        (2, 10)
+        >>> data.nq, len(data[::2]), len(Dataset.concatenate([data, data]))
+        (2, 10, 40)
 
     Raises:
         DataError: a shape, type, value or time does not fit; the message names column and row.
@@ -152,8 +148,7 @@ class Dataset:
     def __getitem__(self, rows: object) -> Dataset:
         """The data set of some rows, given as a slice, a mask `(n,)` or indices in any order.
 
-        Rows that no longer follow time make a data set of points: its `header.ordered` is false, so that
-        models can be fitted to it, but it cannot be split into stretches or differentiated.
+        Rows that no longer follow time have `header.ordered` false: they cannot be split into stretches.
 
         Raises:
             DataError: a mask of another length, or an index that does not exist.
@@ -206,10 +201,7 @@ class Dataset:
         )
 
     def select(self, joints: Sequence[str]) -> Dataset:
-        """The data set with its joints reordered, or only some of them.
-
-        Args:
-            joints: the joints wanted, such as `robot.joint_names`.
+        """The data set with its joints reordered, or only some of them, such as `robot.joint_names`.
 
         Raises:
             UnknownNameError: a joint is not in the data set; the message has the nearest name.
@@ -237,7 +229,7 @@ class Dataset:
     def plot(
         self, quantity: str | None = None, *, joints: Sequence[str] | None = None, ax: Target = None
     ) -> list[Axes]:
-        """Draw the log over time; the time in contact is shaded.
+        """Draw the log over time, with the time in contact shaded, and return the axes.
 
         Args:
             quantity: a logged quantity, such as `"tau"` or `"multiplier"`, with one panel per joint or
@@ -245,12 +237,8 @@ class Dataset:
             joints: which joints; default all.
             ax: matplotlib axes to draw on, one per panel; default a new figure.
 
-        Returns:
-            The axes, one per panel.
-
         Raises:
-            UnknownNameError: no such quantity or joint.
-            ParameterError: the number of axes is not that of the panels.
+            ForceGPError: no such quantity or joint, or the number of axes is not that of the panels.
         """
         from forcegp.data.plot import plot
 
@@ -262,31 +250,11 @@ class Dataset:
 
     def _map(self, change: Callable[[Tensor], Tensor], **fields: object) -> Dataset:
         """The data set with every column changed alike."""
-        vectors = {name: change(getattr(self, name)) for name in ("t", "segment", *JOINT_VECTORS)}
-        return self.replace(
-            **vectors,
-            contact={name: change(value) for name, value in self.contact.items()},
-            extras={name: change(value) for name, value in self.extras.items()},
-            contact_extras={
-                name: {contact: change(value) for contact, value in group.items()}
-                for name, group in self.contact_extras.items()
-            },
-            **fields,
-        )
+        return self.replace(**mapped([self], lambda values: change(values[0])), **fields)
 
     @staticmethod
     def concatenate(parts: Sequence[Dataset]) -> Dataset:
         """Data sets one after another, each with segments of its own.
-
-        Example:
-            >>> import forcegp, torch
-            >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-            >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-            >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-            >>> t = torch.arange(20, dtype=torch.float64)
-            >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-            >>> len(Dataset.concatenate([data, data]))
-            40
 
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
@@ -321,19 +289,6 @@ class Dataset:
 
     def write(self, path: str | Path) -> None:
         """Write to a Parquet file, whole or not at all.
-
-        Example:
-            >>> import forcegp, torch
-            >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-            >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-            >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-            >>> t = torch.arange(20, dtype=torch.float64)
-            >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-            >>> import tempfile
-            >>> with tempfile.TemporaryDirectory() as folder:
-            ...     data.write(f"{folder}/log.parquet")
-            ...     len(Dataset.read(f"{folder}/log.parquet"))
-            20
 
         Raises:
             DataError: the name does not end in `.parquet`.

@@ -26,10 +26,6 @@ class SavitzkyGolay:
         window: number of samples, odd.
         order: degree of the polynomial, at least 2 and less than `window`.
 
-    Example:
-        >>> SavitzkyGolay(window=11, order=3).window
-        11
-
     Raises:
         DataError: a parameter is out of range.
     """
@@ -55,10 +51,9 @@ def differentiate(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The `degree`-th time derivative of x, and the standard deviation of its noise.
 
-    The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x becomes σ |w|. σ is
-    estimated, one per column, from the residuals of the fit, whose deviation is σ √(1 − h) with h the
-    weight of a sample in its own fit; the median absolute deviation keeps corners of the motion out of it.
-    The first and last half window of each segment are read off the outermost fits, with their larger noise.
+    The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x becomes σ |w|. The median
+    absolute residual of the fit gives σ of each column: residuals scatter by σ √(1 − h), with h the weight of
+    a sample in its own fit. The outermost fits give the ends of each segment, with larger noise.
 
     Args:
         t: `(n,)` time [s], evenly spaced within each segment.
@@ -80,7 +75,9 @@ def differentiate(
     half, residuals = window // 2, []
     # Norm of the weights at each position of the window, per unit time step.
     norms = [np.linalg.norm(savgol_coeffs(window, order, deriv=degree, pos=place)) for place in range(window)]
-    for rows in _runs(segment):
+    edges = [0, *(np.flatnonzero(np.diff(segment)) + 1).tolist(), len(segment)]
+    for first, last in pairwise(edges):
+        rows = slice(first, last)
         dt = _time_step(t, rows, window)
         samples = x[rows]
         result[rows] = savgol_filter(samples, window, order, deriv=degree, delta=dt, axis=0, mode="interp")
@@ -92,13 +89,6 @@ def differentiate(
     centre_weight = savgol_coeffs(window, order)[half]
     spread = MAD_TO_STD * np.median(np.abs(np.concatenate(residuals)), axis=0)
     return result, gain * (spread / np.sqrt(1.0 - centre_weight))
-
-
-def _runs(segment: NDArray[np.int64]) -> list[slice]:
-    """Stretches of rows with the same segment number."""
-    cuts = np.flatnonzero(np.diff(segment)) + 1
-    edges = [0, *cuts.tolist(), len(segment)]
-    return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def _time_step(t: NDArray[np.float64], rows: slice, window: int) -> float:

@@ -1,9 +1,9 @@
-"""What a data set holds and what it says about itself, as its checks and its files see it."""
+"""Header and columns of a data set, as its checks and its files see them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
@@ -82,3 +82,25 @@ def component_names(name: str, value: Tensor, joint_names: Sequence[str]) -> lis
     if value.ndim == 1:
         return [name]
     return [f"{name}.{part}" for part in (AXES if "." in name else joint_names)]
+
+
+def named_columns(data: Fields) -> dict[str, Tensor]:
+    """Every floating-point column but time by its name on disk, vectors whole."""
+    named = {name: getattr(data, name) for name in JOINT_VECTORS} | dict(data.extras)
+    for name, group in data.contact_extras.items():
+        named |= {f"{name}.{contact}": value for contact, value in group.items()}
+    return named
+
+
+def mapped(parts: Sequence[Fields], change: Callable[[list[Tensor]], Tensor]) -> dict[str, Any]:
+    """Columns of data sets of one layout; `change` gets the tensors of each column in all parts."""
+    first = parts[0]
+    return {
+        **{name: change([getattr(p, name) for p in parts]) for name in ("t", "segment", *JOINT_VECTORS)},
+        "contact": {name: change([p.contact[name] for p in parts]) for name in first.contact},
+        "extras": {name: change([p.extras[name] for p in parts]) for name in first.extras},
+        "contact_extras": {
+            name: {c: change([p.contact_extras[name][c] for p in parts]) for c in group}
+            for name, group in first.contact_extras.items()
+        },
+    }

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
-from torch import Tensor
 
 from forcegp.data.fields import AXES, JOINT_VECTORS, Fields
 from forcegp.errors import UnknownNameError
@@ -26,12 +25,13 @@ def plot(
     data: Fields, quantity: str | None = None, joints: Sequence[str] | None = None, ax: Target = None
 ) -> list[Axes]:
     """Draw a data set; `Dataset.plot` documents the arguments."""
+    wanted = chosen(joints, data.joint_names, "joint of the data set")
     if quantity is None:
-        panels = _overview(data, chosen(joints, data.joint_names, "joint of the data set"))
+        panels = _overview(data, wanted)
     elif quantity in data.contact_extras:
         panels = _by_contact(data, quantity)
     elif quantity in (*JOINT_VECTORS, *data.extras):
-        panels = _by_joint(data, quantity, chosen(joints, data.joint_names, "joint of the data set"))
+        panels = _by_joint(data, quantity, wanted)
     else:
         names = (*JOINT_VECTORS, *data.extras, *data.contact_extras)
         raise UnknownNameError("quantity of the data set", quantity, names)
@@ -39,15 +39,10 @@ def plot(
     return draw_panels(panels, time, tuple(data.contact.values()), ax)
 
 
-def values_of(data: Fields, quantity: str) -> Tensor:
-    """A joint vector `(n, nq)`."""
-    return getattr(data, quantity)
-
-
 def _overview(data: Fields, joints: list[int]) -> list[Panel]:
     panels = []
     for name in JOINT_VECTORS:
-        values = values_of(data, name)
+        values = getattr(data, name)
         curves = [Curve(values[:, j], data.joint_names[j], CYCLE[j % len(CYCLE)], width=0.8) for j in joints]
         panels.append(Panel("", _named(name), curves))
     multipliers = data.contact_extras.get("multiplier", {})
@@ -58,7 +53,7 @@ def _overview(data: Fields, joints: list[int]) -> list[Panel]:
 
 
 def _by_joint(data: Fields, quantity: str, joints: list[int]) -> list[Panel]:
-    values, label = values_of(data, quantity), _named(quantity)
+    values, label = getattr(data, quantity), _named(quantity)
     return [
         Panel(data.joint_names[j], label, [Curve(values[:, j], "logged", MEASURED, width=0.8)])
         for j in joints

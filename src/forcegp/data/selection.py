@@ -1,9 +1,8 @@
 """How a log is prepared for learning: points selected, stretches held out, impacts left out, noise added.
 
-Farthest point sampling selects few points that cover the inputs of a log (section 5.3 of the paper).
-Neighbouring samples of a trajectory are almost the same point. Where training points are drawn from the
-same stretch as the test rows, as in the paper, the test error says how well a model interpolates; held-out
-stretches say how well it predicts motion that it has not seen.
+Farthest point sampling selects few points that cover the inputs of a log (section 5.3 of the paper). If
+training points come from the same stretch as the test rows, as in the paper, the test error measures
+interpolation; held-out stretches measure prediction of unseen motion.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ def farthest_points(
     """Indices of points each of which is farthest from those before it, by exact Euclidean distance.
 
     i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}|; of equal distances the lowest index wins, so the result
-    is deterministic, and the first k of it are the result for k points. O(n d) a point, O(n) memory.
+    is deterministic, and the first k of it are the result for k points. O(n d) per point, O(n) memory.
 
     Args:
         x: `(n, d)` points.
@@ -55,15 +54,11 @@ def farthest_points(
         start: the first point; default the one closest to the mean.
         progress: called after each point with the number chosen so far.
 
-    Returns:
-        `(count,)` indices in the order of selection.
-
     Raises:
         DataError: there are fewer than `count` distinct points, or no point `start`.
     """
     n = x.shape[0]
-    if not 0 < count <= n:
-        raise DataError(f"cannot select {count} of {n} points", expected=f"1 to {n}", got=count)
+    _check_count(count, n)
     if start is not None and not 0 <= start < n:
         raise DataError("there is no such starting point", expected=f"0 to {n - 1}", got=start)
     x = x.contiguous()
@@ -78,6 +73,11 @@ def farthest_points(
         if progress is not None:
             progress(number + 1)
     return torch.stack(chosen)
+
+
+def _check_count(count: int, n: int) -> None:
+    if not 0 < count <= n:
+        raise DataError(f"cannot select {count} of {n} points", expected=f"1 to {n}", got=count)
 
 
 def _distance(x: Tensor, point: Tensor) -> Tensor:
@@ -101,13 +101,12 @@ def select_points(
         count: how many points.
         method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in their order), or
             `"random"` for comparison. Farthest points favour outliers, which a measured log has.
-        seed: of the random choice; farthest points need none.
+        seed: of the random choice.
         candidates: row numbers to choose from; default all.
         progress: called with the number of points chosen so far.
 
     Raises:
-        UnknownNameError: no such method.
-        DataError: there are fewer distinct points.
+        ForceGPError: no such method, or fewer distinct points.
     """
     rows = torch.arange(len(data), device=data.device) if candidates is None else candidates
     if method == "farthest":
@@ -115,10 +114,7 @@ def select_points(
         return rows[farthest_points(standardized_inputs(data)[rows], count, progress=progress)]
     if method not in ("even", "random"):
         raise UnknownNameError("method of selection", method, ["farthest", "even", "random"])
-    if not 0 < count <= len(rows):
-        raise DataError(
-            f"cannot select {count} of {len(rows)} points", expected=f"1 to {len(rows)}", got=count
-        )
+    _check_count(count, len(rows))
     if method == "even":
         return rows[torch.linspace(0, len(rows) - 1, count, dtype=torch.float64).round().long()]
     order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
@@ -127,12 +123,8 @@ def select_points(
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Rows to train on and rows to test on.
-
-    Attributes:
-        train: `(count,)` row numbers in the order of selection.
-        test: row numbers, increasing.
-        stretches: the held-out stretches as (first row, one past the last).
+    """Rows to train on, in the order of selection, rows to test on, increasing, and the held-out stretches as
+    (first row, one past the last).
     """
 
     train: Int[Tensor, " count"]
@@ -155,11 +147,7 @@ def split_by_selection(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Split:
-    """The paper's split: training points selected from the whole log, the rest for testing.
-
-    Raises:
-        DataError: there are fewer distinct points.
-    """
+    """The paper's split: training points selected from the whole log, the rest for testing."""
     train = select_points(data, count, method=method, seed=seed, progress=progress)
     return Split(train, complement(train, len(data)))
 
@@ -175,15 +163,12 @@ def split_by_stretches(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Split:
-    """Hold out whole stretches of motion, and select training points from the rest only.
-
-    Each trajectory is cut into stretches of equal duration, as close to `stretch` as fits; of all of
-    them, a fraction is drawn at random.
+    """Hold out stretches of motion drawn at random, and select training points from the rest only.
 
     Args:
         data: a log in order of time.
         count: how many training points.
-        stretch: duration of a held-out stretch [s].
+        stretch: approximate duration of the equal stretches that each trajectory is cut into [s].
         fraction: part of the stretches that is held out.
         margin: time beside each held-out stretch from which no training point is taken either [s].
         method: see `select_points`.
@@ -247,14 +232,7 @@ IMPACT = "impact"
 
 
 def without_marked_impacts(data: Dataset) -> Dataset:
-    """The rows that no mask `impact.<contact>` marks; all rows of a log without masks.
-
-    Args:
-        data: a log in order of time, or a part of one.
-
-    Returns:
-        The log without the marked rows, with a step in its provenance if there are any.
-    """
+    """The rows that no mask `impact.<contact>` marks; all rows of a log without masks."""
     marked = torch.zeros(len(data), dtype=torch.bool, device=data.t.device)
     for mask in data.contact_extras.get(IMPACT, {}).values():
         marked |= mask > 0.0
@@ -267,7 +245,7 @@ def without_marked_impacts(data: Dataset) -> Dataset:
 def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset:
     """Gaussian noise on q̈, beside the noise-free value: q̈ = q̈_clean + std ε, ε ~ N(0, I).
 
-    Where the data hold `qdd_clean`, the noise is added to that, so that it never adds up.
+    If the data hold `qdd_clean`, the noise is added to that, so that it never adds up.
 
     Args:
         data: the log.

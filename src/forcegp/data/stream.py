@@ -1,8 +1,4 @@
-"""A long log in Parquet files, read a piece at a time in memory that does not grow with its rows.
-
-Trajectories are numbered throughout. A window that reaches beyond a piece sees its neighbours, within the
-same trajectory only.
-"""
+"""A long log in Parquet files, read a piece at a time; a window sees the pieces beside its own."""
 
 from __future__ import annotations
 
@@ -34,16 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Piece:
-    """Neighbouring rows of a file.
-
-    Attributes:
-        columns: values by name, with rows before and after the piece that a window needs.
-        header: of the file.
-        first: row of the file that the piece begins with.
-        before: rows in `columns` before it.
-        rows: length of the piece.
-        last_segment: number of the trajectory at its end.
-    """
+    """Neighbouring rows of a file from row `first`; `columns` has `before` more rows in front of them."""
 
     columns: Columns
     header: DataHeader
@@ -54,19 +41,11 @@ class Piece:
 
 
 def shape_of(path: Path) -> tuple[int, DataHeader]:
-    """Number of rows and header of a Parquet file.
-
-    Raises:
-        DataError: no such file, or not a Parquet log.
-    """
+    """Number of rows and header of a Parquet file."""
     file = existing(path)
     if file.suffix.lower() != ".parquet":
-        raise DataError(
-            f"{file}: only Parquet files are read piece by piece",
-            expected="a name that ends in .parquet",
-            got=file.suffix,
-            hint="write the log as Parquet: Dataset.read(path).write('run.parquet')",
-        )
+        hint = "write the log as Parquet: Dataset.read(path).write('run.parquet')"
+        raise DataError(f"{file}: only Parquet files are read piece by piece", got=file.suffix, hint=hint)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Columns that are left out are reported when they are read.
         with opened_parquet(file) as (parquet, _, header):
@@ -74,13 +53,9 @@ def shape_of(path: Path) -> tuple[int, DataHeader]:
 
 
 def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece]:
-    """The pieces of a file, all but the last of the same size.
+    """The pieces of a file, of `size` rows each but for the last; `number` is that of its first trajectory.
 
-    Args:
-        path: the file.
-        size: rows of a piece.
-        window: rows before and after a piece that are read with it, within its trajectories.
-        number: of the first trajectory.
+    A piece is read with `window` rows before and after it, within its trajectories.
 
     Raises:
         DataError: the file is damaged, a value is missing, or rows of a trajectory are not together.
@@ -118,49 +93,44 @@ def _tables(parquet: pq.ParquetFile, usable: list[str], size: int) -> Iterator[p
 
 
 def _columns(file: Path, table: pa.Table) -> Columns:
-    pairs = zip(table.column_names, table.columns, strict=True)
-    columns = {name: numeric(file, name, column, "refuse") for name, column in pairs}
+    columns = {name: numeric(file, name, table[name], "refuse") for name in table.column_names}
     return columns | {"segment": columns.get("segment", np.zeros(table.num_rows, np.int64))}
 
 
 def _with_context(before: Columns, columns: Columns, after: Columns) -> tuple[Columns, int]:
-    """A piece with the rows around it that belong to its first and last trajectory."""
+    """A piece with the rows around it of its first and last trajectory, and the number of those before it."""
+    parts = [columns]
     if before:
         same = before["segment"] == columns["segment"][0]
-        before = {name: values[same] for name, values in before.items()}
+        parts.insert(0, {name: values[same] for name, values in before.items()})
     if after:
         same = after["segment"] == columns["segment"][-1]
-        after = {name: values[same] for name, values in after.items()}
-    parts = [part for part in (before, columns, after) if part]
-    return {name: np.concatenate([part[name] for part in parts]) for name in columns}, (
-        len(before["segment"]) if before else 0
-    )
+        parts.append({name: values[same] for name, values in after.items()})
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in columns}
+    return whole, len(parts[0]["segment"]) if before else 0
 
 
 class _Trajectories:
     """Numbers trajectories throughout, and checks that each is in one run and in order of time."""
 
     def __init__(self, source: str, number: int) -> None:
-        self.source, self.last_number = source, number
-        self.raw: float | None = None
-        self.time = -np.inf
-        self.segments: set[float] = set()
+        self.source, self.last_number = source, number - 1
+        self.raw, self.time, self.segments = np.nan, -np.inf, set[float]()
 
     def number(self, columns: Columns, ordered: bool) -> None:
         """Replace the segments of the next rows by numbers that go on from those before."""
         raw, t = columns["segment"], columns.get("t")
-        if ordered and self.raw is not None and t is not None and raw[0] == self.raw and t[0] <= self.time:
+        if ordered and t is not None and raw[0] == self.raw and t[0] <= self.time:
             raise DataError(
                 f"{self.source}: column 't' does not increase",
                 expected=f"more than {self.time:.9g} s",
                 got=f"{t[0]:.9g} s",
                 hint="sort the log by time, or number its trajectories in a column 'segment'",
             )
-        starts = np.append(self.raw is not None and raw[0] != self.raw, raw[1:] != raw[:-1])
-        fresh = {float(raw[0])} if self.raw is None else set()
-        fresh |= set(raw[starts].astype(float).tolist())
+        starts = self._starts(raw)
+        fresh = set(raw[starts].astype(float).tolist())
         repeated = fresh & self.segments
-        if ordered and (repeated or len(fresh) < int(starts.sum()) + (self.raw is None)):
+        if ordered and (repeated or len(fresh) < int(starts.sum())):
             which = next(iter(repeated), None)
             raise DataError(
                 f"{self.source}: the rows of a segment are not together",
@@ -168,17 +138,16 @@ class _Trajectories:
                 hint="sort the log by 'segment' and 't'",
             )
         self.segments |= fresh
-        columns["segment"] = self._counted(starts)
+        columns["segment"] = self.last_number + np.cumsum(starts)
         self.raw, self.last_number = float(raw[-1]), int(columns["segment"][-1])
         self.time = -np.inf if t is None else float(t[-1])
 
     def peek(self, columns: Columns) -> None:
         """Number rows that come next, without passing on to them."""
-        raw = columns["segment"]
-        columns["segment"] = self._counted(np.append(raw[0] != self.raw, raw[1:] != raw[:-1]))
+        columns["segment"] = self.last_number + np.cumsum(self._starts(columns["segment"]))
 
-    def _counted(self, starts: NDArray[np.bool_]) -> NDArray[np.int64]:
-        return (self.last_number + np.cumsum(starts)).astype(np.int64)
+    def _starts(self, raw: NDArray[np.generic]) -> NDArray[np.bool_]:
+        return np.append(raw[0] != self.raw, raw[1:] != raw[:-1])
 
 
 PIECE_ROWS = 8192
@@ -189,10 +158,9 @@ Keep = Callable[[Dataset], Tensor]
 
 @dataclass(frozen=True)
 class StreamedDataset:
-    """A log of any length in one or several Parquet files, one after another.
+    """A log of any length in one or several Parquet files, one after another, with trajectories of their own.
 
-    Each file has trajectories of its own. Velocities and accelerations that the files lack are computed as by
-    `Dataset.read`, never across two trajectories; the noise of what is computed is estimated piece by piece.
+    What the files lack is computed as by `Dataset.read`; its noise is estimated piece by piece.
 
     Args:
         paths: the files; their joints, contacts and further columns must agree.
@@ -201,9 +169,6 @@ class StreamedDataset:
         dtype, device: of the tensors.
         distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each of them
             makes the same call and gets the same fit.
-
-    Raises:
-        DataError: there is not a file, one does not exist, or one is not Parquet.
 
     Example:
         >>> import tempfile, torch
@@ -232,8 +197,7 @@ class StreamedDataset:
     @cached_property
     def files(self) -> tuple[Path, ...]:
         """The files as paths."""
-        paths = (self.paths,) if isinstance(self.paths, str | Path) else self.paths
-        return tuple(map(Path, paths))
+        return tuple(map(Path, (self.paths,) if isinstance(self.paths, str | Path) else self.paths))
 
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:
@@ -274,19 +238,16 @@ class StreamedDataset:
         for path in self.files:
             for piece in pieces_of(path, PIECE_ROWS, window, number):
                 number = piece.last_segment
+                in_share = count >= start and count % share[1] == share[0]
+                data = self._dataset(path, piece, first) if in_share or first is None else first
+                first = data[:1] if first is None else first
+                if count >= start:
+                    yield data if in_share else first[:0]
                 count += 1
-                in_share = count > start and (count - 1) % share[1] == share[0]
-                if in_share or first is None:
-                    data = self._dataset(path, piece)
-                    first = data[:1] if first is None else first
-                    _check_alike(path, first, data)
-                    if in_share:
-                        yield data
-                if count > start and not in_share:
-                    yield first[:0]
             number += 1
 
-    def _dataset(self, path: Path, piece: Piece) -> Dataset:
+    def _dataset(self, path: Path, piece: Piece, first: Dataset | None) -> Dataset:
+        """A piece as a data set of the same columns as the first one."""
         source = str(path) if piece.first == 0 else f"{path} (rows counted from {piece.first - piece.before})"
         with warnings.catch_warnings():
             if piece.first:  # One warning per file is enough.
@@ -299,28 +260,22 @@ class StreamedDataset:
         except DataError as error:
             raise DataError.at(source, error) from None
         data = data[piece.before : piece.before + piece.rows]
-        if self.joints is None or set(self.joints) - set(data.joint_names):
-            return data
-        return data.select(self.joints)
-
-
-def _check_alike(path: Path, first: Dataset, data: Dataset) -> None:
-    try:
-        check_alike([first, data[:1]])
-    except DataError as error:
-        raise DataError.at(str(path), error) from None
+        if self.joints is not None and not set(self.joints) - set(data.joint_names):
+            data = data.select(self.joints)
+        try:
+            check_alike([data[:1] if first is None else first, data[:1]])
+        except DataError as error:
+            raise DataError.at(str(path), error) from None
+        return data
 
 
 def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = None) -> tuple[Dataset, int]:
-    """Evenly spaced rows of a log of unknown length, in one pass.
+    """Evenly spaced rows of a log of unknown length, in one pass, and the number of all rows that count.
 
     Args:
         pieces: the log.
-        count: how many rows to keep at least, where there are so many; fewer than twice as many are kept.
+        count: how many rows to keep at least, if there are so many; fewer than twice as many are kept.
         keep: which rows of a piece count; all by default.
-
-    Returns:
-        The rows as one data set, and the number of all rows that count.
 
     Raises:
         DataError: there are no pieces.
@@ -337,12 +292,8 @@ def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = Non
             step *= 2
             kept = [(place[place % step == 0], data[place % step == 0]) for place, data in kept]
         kept = [part for i, part in enumerate(kept) if len(part[0]) or i == 0]
-    return _joined([data for _, data in kept]), total
-
-
-def _joined(parts: list[Dataset]) -> Dataset:
-    """Data sets one after another; a segment may go on from one to the next."""
-    if not parts:
+    if not kept:
         raise DataError("there are no samples to read", expected="at least one", got="none")
-    segment = torch.cat([part.segment for part in parts])
-    return Dataset.concatenate(parts).replace(segment=segment, header=parts[0].header)
+    parts = [data for _, data in kept]
+    segment = torch.cat([part.segment for part in parts])  # one may go on from a piece to the next
+    return Dataset.concatenate(parts).replace(segment=segment, header=parts[0].header), total

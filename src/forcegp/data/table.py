@@ -1,7 +1,4 @@
-"""Named numeric columns on disk: Parquet with a JSON header, and CSV.
-
-This file knows files and columns; what the columns mean is in `columns.py`.
-"""
+"""Named numeric columns on disk: Parquet with a JSON header, and CSV."""
 
 from __future__ import annotations
 
@@ -68,9 +65,7 @@ def read_table(
 ) -> tuple[Columns, DataHeader]:
     """Read the numeric columns of a Parquet or CSV file, and its header (defaults where it has none).
 
-    Args:
-        path: the file.
-        missing: whether an empty value is an error or becomes a NaN.
+    An empty value is an error, or a NaN where `missing` is `"nan"`.
 
     Raises:
         DataError: no such file, a kind of file that is not read, or one that is damaged or too large.
@@ -82,27 +77,20 @@ def read_table(
             f"{file}: not a kind of data file that is read", expected=" or ".join(readers), got=file.suffix
         )
     table, header = readers[file.suffix.lower()](file)
-    pairs = zip(table.column_names, table.columns, strict=True)
-    return {name: numeric(file, name, column, missing) for name, column in pairs}, header
+    return {name: numeric(file, name, table[name], missing) for name in table.column_names}, header
 
 
 def existing(path: str | Path) -> Path:
-    """The path of a file that exists.
-
-    Raises:
-        DataError: no such file; the hint names the nearest one.
-    """
+    """The path of a file that exists, else a `DataError` whose hint names the nearest one."""
     file = Path(path)
-    if not file.is_file():
-        raise DataError(f"{file}: no such file", hint=_files_beside(file))
-    return file
-
-
-def _files_beside(file: Path) -> str | None:
+    if file.is_file():
+        return file
     if not file.parent.is_dir():
-        return f"the folder {file.parent} does not exist"
-    near = near_names(file.name, (other.name for other in file.parent.iterdir()))
-    return f"did you mean {file.with_name(near[0])}?" if near else None
+        hint = f"the folder {file.parent} does not exist"
+    else:
+        near = near_names(file.name, (other.name for other in file.parent.iterdir()))
+        hint = f"did you mean {file.with_name(near[0])}?" if near else None
+    raise DataError(f"{file}: no such file", hint=hint)
 
 
 def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
@@ -139,13 +127,10 @@ def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], Data
 
 
 def _check_count(file: Path, columns: int) -> None:
+    most = f"at most {limits.COLUMNS}"
     if columns > limits.COLUMNS:
-        raise DataError(
-            f"{file}: too many columns",
-            expected=f"at most {limits.COLUMNS}",
-            got=columns,
-            hint="write only the columns of the robot",
-        )
+        hint = "write only the columns of the robot"
+        raise DataError(f"{file}: too many columns", expected=most, got=columns, hint=hint)
 
 
 def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
@@ -153,10 +138,11 @@ def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
     names = set(usable)
     for path in paths:
         parts = path.split(".") if path not in names else []
-        for n in range(1, len(parts)):
-            if ".".join(parts[:n]) in names:
-                outer = ".".join(parts[:n])
-                raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
+        outer = next(
+            (".".join(parts[:n]) for n in range(1, len(parts)) if ".".join(parts[:n]) in names), None
+        )
+        if outer is not None:
+            raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
 
 
 def _check_size(file: Path, rows: int, columns: int) -> None:
@@ -174,14 +160,8 @@ def _check_size(file: Path, rows: int, columns: int) -> None:
 
 
 def _header(file: Path, metadata: dict[bytes, bytes]) -> DataHeader:
-    if HEADER_KEY not in metadata:
-        return DataHeader()
-    text = metadata[HEADER_KEY]
-    if len(text) > limits.HEADER_BYTES:
-        raise DataError(
-            f"{file}: the header is too large", expected=f"at most {limits.HEADER_BYTES} bytes", got=len(text)
-        )
-    return DataHeader.from_json(text, str(file), DataError)
+    text = metadata.get(HEADER_KEY)
+    return DataHeader() if text is None else DataHeader.from_json(text, str(file), DataError)
 
 
 def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:
@@ -191,10 +171,8 @@ def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:
     with file.open("rb") as opened:
         first, second = (opened.readline(limits.HEADER_BYTES + 1) for _ in range(2))
     if len(first) > limits.HEADER_BYTES:
-        raise DataError(
-            f"{file}: the first line is too long",
-            expected=f"at most {limits.HEADER_BYTES} bytes of column names",
-        )
+        most = f"at most {limits.HEADER_BYTES} bytes of column names"
+        raise DataError(f"{file}: the first line is too long", expected=most)
     columns = first.count(b",") + 1
     _check_count(file, columns)
     rows = file.stat().st_size // max(len(second), 2 * columns)
@@ -220,13 +198,9 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
         raise DataError(f"{file}: column {twice[0]!r} occurs more than once")
     if any(len(name) > limits.COLUMN_NAME for name in names):
         raise DataError(f"{file}: a column's name is longer than {limits.COLUMN_NAME} characters")
-    numeric = [
-        field.name
-        for field in schema
-        if kinds.is_floating(field.type) or kinds.is_integer(field.type) or kinds.is_boolean(field.type)
-    ]
-    numeric_names = set(numeric)
-    ignored = [name for name in names if name not in numeric_names]
+    kept = (kinds.is_floating, kinds.is_integer, kinds.is_boolean)
+    numeric = [field.name for field in schema if any(kind(field.type) for kind in kept)]
+    ignored = sorted(set(names) - set(numeric), key=names.index)
     # A text column that should be numbers is reported by name once it is missed; the rest is harmless.
     if ignored:
         warnings.warn(
@@ -238,11 +212,7 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
 
 
 def numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
-    """The values of a column.
-
-    Raises:
-        DataError: a value is missing, and that is refused.
-    """
+    """The values of a column; a missing one is a `DataError`, or a NaN."""
     if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(

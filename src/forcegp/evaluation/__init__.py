@@ -13,7 +13,6 @@ from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines
 from forcegp.evaluation.predicted import (
-    CHUNK_STATES,
     MultiplierScore,
     Predicted,
     Progress,
@@ -55,8 +54,7 @@ class Evaluation:
         predictors: errors by joint of the model and of the trivial predictors.
         verdicts: the model against each trivial predictor; empty if there are too few samples.
         multipliers: λ against the logged one, for models of forces and logs that contain it.
-        sensed: the same with the log's force sensor as a measurement at each state, for models that were
-            fitted to that sensor.
+        sensed: the same with the log's force sensor as a measurement at each state, for models fitted to it.
     """
 
     kind: str
@@ -75,39 +73,9 @@ class Evaluation:
     sensed: tuple[MultiplierScore, ...] = ()
 
     @property
-    def noisy_mae(self) -> float:
-        """Mean absolute error against measured accelerations, the paper's measure."""
-        return self.noisy.mae
-
-    @property
-    def clean_mae(self) -> float | None:
-        """Mean absolute error against noise-free accelerations."""
-        return None if self.clean is None else self.clean.mae
-
-    @property
     def verdict(self) -> str:
         """Whether the model is better than the trivial predictors, in one sentence."""
         return sentence(self.verdicts)
-
-    @property
-    def coverage_noisy(self) -> float | None:
-        """±2σ coverage of measured accelerations."""
-        return None if self.uncertainty is None else self.uncertainty.coverage_noisy
-
-    @property
-    def coverage_clean(self) -> float | None:
-        """±2σ coverage of noise-free accelerations."""
-        return None if self.uncertainty is None else self.uncertainty.coverage_clean
-
-    @property
-    def calibration(self) -> dict[str, float] | None:
-        """Coverage of the central interval of each level."""
-        return None if self.uncertainty is None else self.uncertainty.calibration
-
-    @property
-    def nlpd(self) -> float | None:
-        """Mean negative log predictive density [nats]."""
-        return None if self.uncertainty is None else self.uncertainty.nlpd
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in JSON types."""
@@ -116,16 +84,17 @@ class Evaluation:
 
     def summary(self) -> dict[str, float | int | str | None]:
         """The scores over all joints, by name."""
+        clean, spread = self.clean, self.uncertainty
         return {
             "kind": self.kind,
             "samples": self.samples,
             "noisy_mae": self.noisy.mae,
             "noisy_rmse": self.noisy.rmse,
-            "clean_mae": self.clean_mae,
-            "clean_rmse": None if self.clean is None else self.clean.rmse,
-            "coverage_noisy": self.coverage_noisy,
-            "coverage_clean": self.coverage_clean,
-            "nlpd": self.nlpd,
+            "clean_mae": None if clean is None else clean.mae,
+            "clean_rmse": None if clean is None else clean.rmse,
+            "coverage_noisy": None if spread is None else spread.coverage_noisy,
+            "coverage_clean": None if spread is None else spread.coverage_clean,
+            "nlpd": None if spread is None else spread.nlpd,
             "residual": self.residual,
             "residual_max": self.residual_max,
             "seconds_per_state": self.seconds_per_state,
@@ -153,24 +122,8 @@ def evaluate(
             predictors; by default those of the model, before it learned any parameters of theirs.
         progress: called with the number of states predicted and their total number.
 
-    Returns:
-        Scores over all joints and by joint, and the verdict.
-
-    Example:
-        >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-        >>> t = torch.arange(20, dtype=torch.float64)
-        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = forcegp.StructuredGP(system, mean="analytical", noise=0.1).fit(data[:10])
-        >>> evaluation = evaluate(fit, data[10:])
-        >>> evaluation.samples
-        10
-
     Raises:
-        DataError: the data are empty, or their joints are not the robot's.
-        UnknownNameError: a contact is not in the data.
+        ForceGPError: the data are empty, their joints are not the robot's, or they lack a contact.
     """
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
@@ -197,8 +150,8 @@ def evaluate(
         seconds_per_state=predicted.seconds / len(data),
         predictors=scores,
         verdicts=verdicts(scores, data.joint_names) if scores else (),
-        multipliers=multiplier_scores(model, data, CHUNK_STATES) if model.force_field() else (),
-        sensed=sensed_scores(model, data, CHUNK_STATES),
+        multipliers=multiplier_scores(model, data) if model.force_field() else (),
+        sensed=sensed_scores(model, data),
     )
 
 

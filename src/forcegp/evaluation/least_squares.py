@@ -10,7 +10,7 @@ projected onto the directions in which the constraint force does not act.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -40,11 +40,9 @@ POINT = 1e-4
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """An identified rigid robot.
+    """An identified rigid robot, and its friction beyond the robot file's.
 
-    Attributes:
-        system: robot with the identified inertial parameters, and the contacts.
-        friction: `(3 nq,)` viscous friction, Coulomb friction and offset of every joint, beyond the file's.
+    `friction` `(3 nq,)` holds viscous friction, Coulomb friction and offset of every joint.
     """
 
     system: ConstrainedSystem
@@ -53,10 +51,8 @@ class LeastSquares:
     @torch.no_grad()
     def predict(self, data: Dataset) -> Tensor:
         """Accelerations `(n, nq)` under the logged torques, on the constraint."""
-        parts = (data[i : i + CHUNK_STATES] for i in range(0, len(data), CHUNK_STATES))
-        return torch.cat([self._predict(part) for part in parts])
-
-    def _predict(self, data: Dataset) -> Tensor:
+        if len(data) > CHUNK_STATES:
+            return torch.cat([self.predict(part) for part in _chunks(data)])
         eom = self.system.equations(data.q, data.qd, data.active(self.system.contact_names))
         return eom.acceleration(eom.Q_K + data.tau - self.losses(data.qd))
 
@@ -65,15 +61,14 @@ class LeastSquares:
         return (_friction_columns(self.system.robot, qd) @ self.friction[:, None])[..., 0]
 
 
+def _chunks(data: Dataset) -> Iterator[Dataset]:
+    return (data[i : i + CHUNK_STATES] for i in range(0, len(data), CHUNK_STATES))
+
+
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
     """Identify inertial parameters, friction and offsets from measured torques and accelerations.
 
-    Args:
-        system: robot and contacts of the robot file.
-        train: the log.
-
-    Returns:
-        The identified robot; what the motion does not excite stays as in the robot file.
+    What the motion does not excite stays as in the robot file.
     """
     rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
     train, robot = train[rows.unique()], system.robot
@@ -115,8 +110,8 @@ def _normal_equations(
     """WᵀW `(nq, p, p)`, Wᵀy `(nq, p)` and yᵀy `(nq,)` by joint, with unknowns scaled by the prior."""
     p, nq = len(prior), train.nq
     G, g, y2 = prior.new_zeros(nq, p, p), prior.new_zeros(nq, p), prior.new_zeros(nq)
-    for i in range(0, len(train), CHUNK_STATES):
-        W, y = _rows(system, train[i : i + CHUNK_STATES])
+    for part in _chunks(train):
+        W, y = _rows(system, part)
         W = (W * prior).transpose(0, 1)
         G += W.mT @ W
         g += (W.mT @ y.mT[..., None])[..., 0]
@@ -187,9 +182,8 @@ def _slopes(theta: Tensor) -> Tensor:
     """∂π/∂θ `(nq, 10, 10)` in closed form: J = U Uᵀ, and every entry of U depends on α and one more."""
     scale = theta[:, 0].exp()
     dU = theta.new_zeros(len(theta), 10, 4, 4)
-    for k, (i, j) in enumerate(
-        ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)), start=1
-    ):
+    places = (0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)
+    for k, (i, j) in enumerate(places, start=1):
         dU[:, k, i, j] = scale * (theta[:, k].exp() if i == j else 1.0)
     s12, s23, s13, *t = (scale * theta[:, k] for k in range(4, 10))
     for k, value in (((0, 1), s12), ((1, 2), s23), ((0, 2), s13), *(((i, 3), t[i]) for i in range(3))):
@@ -211,8 +205,7 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name: what it is called.
-        system: robot and contacts by whose mass matrix its errors become torques.
+        name, system: what it is called, and the robot by whose mass matrix its errors become torques.
         predict: accelerations `(n, nq)` of a data set.
         std: `(nq,)` root-mean-square error on its training data, its constant uncertainty.
     """
@@ -224,25 +217,17 @@ class Baseline:
 
 
 def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
-    """The trivial predictors, fitted to training data.
-
-    Args:
-        system: robot and contacts as known before any learning.
-        train: at least `FEWEST_TRAINING` samples.
-
-    Returns:
-        The mean, the robot file alone, and least squares.
-    """
+    """Mean, robot file and least squares, fitted to at least `FEWEST_TRAINING` samples."""
     mean, nothing = train.qdd.mean(0), train.qdd.new_zeros(3 * train.nq)
-    file, identified = LeastSquares(system, nothing), identify_rigid(system, train)
-    predictors: dict[str, tuple[ConstrainedSystem, Callable[[Dataset], Tensor]]] = {
-        "mean": (system, lambda data: mean.expand_as(data.qdd)),
-        "robot file": (system, file.predict),
-        "least squares": (identified.system, identified.predict),
-    }
+    identified = identify_rigid(system, train)
+
+    def baseline(name: str, mechanics: ConstrainedSystem, predict: Callable[[Dataset], Tensor]) -> Baseline:
+        return Baseline(name, mechanics, predict, ((predict(train) - train.qdd) ** 2).mean(0).sqrt())
+
     return [
-        Baseline(name, mechanics, predict, ((predict(train) - train.qdd) ** 2).mean(0).sqrt())
-        for name, (mechanics, predict) in predictors.items()
+        baseline("mean", system, lambda data: mean.expand_as(data.qdd)),
+        baseline("robot file", system, LeastSquares(system, nothing).predict),
+        baseline("least squares", identified.system, identified.predict),
     ]
 
 

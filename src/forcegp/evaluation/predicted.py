@@ -1,8 +1,4 @@
-"""Predictions at all samples of a data set, in chunks that bound the memory.
-
-The predicted multiplier is compared with a logged one, without and with the log's force sensor as a
-measurement.
-"""
+"""Predictions at all samples of a data set, in chunks that bound the memory; scores of the multiplier."""
 
 from __future__ import annotations
 
@@ -43,38 +39,45 @@ class Predicted:
     seconds: float
 
 
+Moments = tuple[Tensor, Tensor | None]
+"""Mean, and variance or standard deviation if the model gives one."""
+
+
+def in_chunks(
+    predict: Callable[[Dataset], Moments], data: Dataset, progress: Progress | None = None
+) -> Moments:
+    """What `predict` returns for all samples, asked for `CHUNK_STATES` at a time."""
+    parts = []
+    for first in range(0, len(data), CHUNK_STATES):
+        parts.append(predict(data[first : first + CHUNK_STATES]))
+        if progress is not None:
+            progress(min(first + CHUNK_STATES, len(data)), len(data))
+    means, spreads = zip(*parts, strict=True)
+    return torch.cat(means), None if spreads[0] is None else torch.cat(spreads)
+
+
 def predict_all(
     model: Predictor, data: Dataset, system: ConstrainedSystem, progress: Progress | None
 ) -> Predicted:
-    """Predict a data set chunk by chunk.
+    """Predict the accelerations of a data set, and their residual on the constraint of a system."""
+    residuals, seconds = [], []
 
-    Args:
-        model: a fitted model.
-        data: the states.
-        system: the constraint that predictions are held against.
-        progress: called with the number of states predicted and their total number.
-    """
-    active = data.active(model.system.contact_names)
-    means, variances, residuals, seconds = [], [], [], 0.0
-    for first in range(0, len(data), CHUNK_STATES):
-        rows = slice(first, first + CHUNK_STATES)
-        began = time.perf_counter()
-        part = model.predict(data.q[rows], data.qd[rows], data.tau[rows], active=active[rows])
-        seconds += time.perf_counter() - began
-        means.append(part.mean)
-        variances += [] if part.variance is None else [part.variance]
-        residuals.append(_residual(system, data, rows, part.mean))
-        if progress is not None:
-            progress(min(first + CHUNK_STATES, len(data)), len(data))
-    variance = torch.cat(variances) if variances else None
-    return Predicted(torch.cat(means), variance, _noise_std(model, data), torch.cat(residuals), seconds)
+    def predict(part: Dataset) -> Moments:
+        active, began = part.active(model.system.contact_names), time.perf_counter()
+        predicted = model.predict(part.q, part.qd, part.tau, active=active)
+        seconds.append(time.perf_counter() - began)
+        residuals.append(_residual(system, part, predicted.mean))
+        return predicted.mean, predicted.variance
+
+    mean, variance = in_chunks(predict, data, progress)
+    return Predicted(mean, variance, _noise_std(model, data), torch.cat(residuals), sum(seconds))
 
 
 @torch.no_grad()
-def _residual(system: ConstrainedSystem, data: Dataset, rows: slice, qdd: Tensor) -> Tensor:
+def _residual(system: ConstrainedSystem, data: Dataset, qdd: Tensor) -> Tensor:
     """|A q̈ − b| of the rows of closed contacts, `(k,)`."""
-    active = data.active(system.contact_names)[rows]
-    eom = system.equations(data.q[rows], data.qd[rows], active)
+    active = data.active(system.contact_names)
+    eom = system.equations(data.q, data.qd, active)
     residual = ((eom.A @ qdd[..., None])[..., 0] - eom.b).abs()
     return residual[system.active_rows(active, qdd.shape[:-1])]
 
@@ -113,50 +116,36 @@ class MultiplierScore:
 
 
 @torch.no_grad()
-def multiplier_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[MultiplierScore, ...]:
-    """Compare λ with what a simulator or another sensor logged as `multiplier`, contact by contact.
+def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
+    """Compare λ with what a simulator or another sensor logged as `multiplier`, for contacts of one row each.
 
-    Args:
-        model: a fitted model that predicts forces.
-        data: with `multiplier` of some contacts of the model that have one row each.
-        chunk: states predicted at a time.
-
-    Returns:
-        One score per contact with a logged multiplier and at least two samples in contact.
+    There is one score per contact with a logged multiplier and at least two samples in contact.
     """
-    names = model.system.contact_names
-    if not _comparable(model, data):
-        return ()
-    active, means, stds = data.active(names), [], []
-    for i in range(0, len(data), chunk):
-        part, closed = data[i : i + chunk], active[i : i + chunk]
-        states = part.q, part.qd, part.tau
-        predicted = model.predict(*states, "multiplier", active=closed)
-        means.append(predicted.mean)
+
+    def predict(part: Dataset) -> Moments:
+        states, active = (part.q, part.qd, part.tau), part.active(model.system.contact_names)
+        predicted = model.predict(*states, "multiplier", active=active)
         variance = predicted.variance
         if variance is not None and isinstance(model, StructuredFit):
-            variance = variance + model.noise_variance(*states, "multiplier", closed, sensor=False)
-        stds += [] if variance is None else [variance.clamp(min=0.0).sqrt()]
-    return _scores(data, names, torch.cat(means), torch.cat(stds) if stds else None)
+            variance = variance + model.noise_variance(*states, "multiplier", active, sensor=False)
+        return predicted.mean, None if variance is None else variance.clamp(min=0.0).sqrt()
+
+    return _scores(model, data, *in_chunks(predict, data)) if _comparable(model, data) else ()
 
 
 @torch.no_grad()
-def sensed_scores(model: Predictor, data: Dataset, chunk: int) -> tuple[MultiplierScore, ...]:
-    """The same where the log's force sensor is a measurement at the predicted states too.
-
-    Args:
-        model, data, chunk: see `multiplier_scores`.
-
-    Returns:
-        Nothing for a model that was not fitted to a sensor, or a log without one.
-    """
+def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
+    """The same with the log's force sensor as a measurement at each state; empty without a sensor."""
     if not isinstance(model, StructuredFit) or "multiplier" not in model.noise:
         return ()
     if not _comparable(model, data) or not has_sensor(data, model.system):
         return ()
-    parts = [force_from_sensor(model, data[i : i + chunk]) for i in range(0, len(data), chunk)]
-    mean, std = (torch.cat(part) for part in zip(*parts, strict=True))
-    return _scores(data, model.system.contact_names, mean[:, None], std[:, None])
+
+    def predict(part: Dataset) -> Moments:
+        mean, std = force_from_sensor(model, part)
+        return mean[:, None], std[:, None]
+
+    return _scores(model, data, *in_chunks(predict, data))
 
 
 def _comparable(model: Predictor, data: Dataset) -> bool:
@@ -165,26 +154,22 @@ def _comparable(model: Predictor, data: Dataset) -> bool:
     return model.system.m == len(names) and any(name in logged for name in names)
 
 
-def _scores(
-    data: Dataset, names: tuple[str, ...], mean: Tensor, std: Tensor | None
-) -> tuple[MultiplierScore, ...]:
+def _scores(model: Predictor, data: Dataset, mean: Tensor, std: Tensor | None) -> tuple[MultiplierScore, ...]:
     """Scores of λ `(n, contacts)` over the samples in which each contact is closed."""
-    logged, active = data.contact_extras["multiplier"], data.active(names)
-    return tuple(
-        _score(name, mean[rows, i], None if std is None else std[rows, i], logged[name][rows])
-        for i, (name, rows) in enumerate(zip(names, active.T, strict=True))
-        if name in logged and int(rows.sum()) >= 2
-    )
-
-
-def _score(contact: str, mean: Tensor, std: Tensor | None, logged: Tensor) -> MultiplierScore:
-    error = mean - logged
-    varies = float(mean.std()) > 0.0 and float(logged.std()) > 0.0
-    return MultiplierScore(
-        contact=contact,
-        samples=len(error),
-        bias=float(error.mean()),
-        spread=float(error.std()),
-        correlation=float(torch.corrcoef(torch.stack([mean, logged]))[0, 1]) if varies else None,
-        coverage=None if std is None else share(error.abs() <= 2.0 * std),
-    )
+    names = model.system.contact_names
+    scores, logged, active = [], data.contact_extras["multiplier"], data.active(names)
+    for i, (name, rows) in enumerate(zip(names, active.T, strict=True)):
+        if name not in logged or int(rows.sum()) < 2:
+            continue
+        both = torch.stack([mean[rows, i], logged[name][rows]])
+        error = both[0] - both[1]
+        score = MultiplierScore(
+            contact=name,
+            samples=len(error),
+            bias=float(error.mean()),
+            spread=float(error.std()),
+            correlation=float(torch.corrcoef(both)[0, 1]) if bool((both.std(1) > 0.0).all()) else None,
+            coverage=None if std is None else share(error.abs() <= 2.0 * std[rows, i]),
+        )
+        scores.append(score)
+    return tuple(scores)

@@ -1,14 +1,11 @@
-"""Errors of predicted accelerations, whether the predicted uncertainty is right, and the verdict.
-
-Errors are by joint, in acceleration and in torque, moving and at rest. Uncertainty is judged by coverage and
-density. The verdict says in one sentence whether a model is better than the trivial predictors.
-"""
+"""Errors of predicted accelerations by joint, coverage and density of their uncertainty, and the verdict."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import torch
 from torch import Tensor
@@ -77,14 +74,9 @@ class JointErrors:
         """From differences, the measured quantity and whether the joint moves, each `(n, nq)`."""
         spread = measured.std(0, correction=0)
         total = _rmse(error, torch.ones_like(moving), fewest=1)
-        return cls(
-            all=total,
-            moving=_rmse(error, moving, FEWEST),
-            rest=_rmse(error, ~moving, FEWEST),
-            normalised=tuple(
-                None if e is None or s == 0.0 else e / s for e, s in zip(total, spread.tolist(), strict=True)
-            ),
-        )
+        pairs = zip(total, spread.tolist(), strict=True)
+        normalised = tuple(None if e is None or s == 0.0 else e / s for e, s in pairs)
+        return cls(total, _rmse(error, moving, FEWEST), _rmse(error, ~moving, FEWEST), normalised)
 
 
 def _rmse(error: Tensor, rows: Tensor, fewest: int) -> ByJoint:
@@ -93,11 +85,7 @@ def _rmse(error: Tensor, rows: Tensor, fewest: int) -> ByJoint:
 
 
 def moving_joints(qd: Tensor) -> Tensor:
-    """Whether each joint moves, `(n, nq)` bool: |q̇| > max(`REST` · its 95 % quantile, `SLOWEST`).
-
-    Args:
-        qd: `(n, nq)` joint velocities [rad/s, m/s].
-    """
+    """Whether each joint moves, `(n, nq)` bool: |q̇| > max(`REST` · its 95 % quantile, `SLOWEST`)."""
     fast = qd.abs().quantile(0.95, dim=0) if len(qd) < 1_000_000 else qd.abs().amax(0)
     return qd.abs() > (REST * fast).clamp(min=SLOWEST)
 
@@ -129,25 +117,22 @@ class Uncertainty:
         cls, mean: Tensor, variance: Tensor, noise_std: Tensor, measured: Tensor, clean: Tensor | None
     ) -> Uncertainty:
         """From predictions and accelerations `(n, nq)` and the noise `(nq,)`."""
-        deviation = (measured - mean).abs() / (variance + noise_std**2).sqrt()
+        std = (variance + noise_std**2).sqrt()
+        deviation = (measured - mean).abs() / std
+        half_widths = {f"{level:g}": NormalDist().inv_cdf(0.5 + 0.5 * level) for level in LEVELS}
         within = None if clean is None else share((clean - mean).abs() <= 2.0 * variance.sqrt())
         return cls(
             coverage_noisy=share(deviation <= 2.0),
             coverage_clean=within,
             coverage_by_joint=tuple((deviation <= 2.0).to(mean.dtype).mean(0).tolist()),
-            calibration={f"{level:g}": share(deviation <= half_width(level)) for level in LEVELS},
-            nlpd=nlpd(measured - mean, (variance + noise_std**2).sqrt()),
+            calibration={level: share(deviation <= width) for level, width in half_widths.items()},
+            nlpd=nlpd(measured - mean, std),
         )
 
 
 def nlpd(error: Tensor, std: Tensor) -> float:
     """Mean negative log density of errors under a centred normal distribution [nats]."""
     return float((0.5 * (error / std) ** 2 + std.log() + 0.5 * math.log(2.0 * math.pi)).mean())
-
-
-def half_width(level: float) -> float:
-    """Half width of the central interval of a standard normal variable with a given probability."""
-    return math.sqrt(2.0) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
 
 
 def share(inside: Tensor) -> float:
@@ -208,22 +193,14 @@ class Verdict:
 
 
 def verdicts(scores: Sequence[PredictorScores], joint_names: Sequence[str]) -> tuple[Verdict, ...]:
-    """The first predictor, the model, against each of the others.
-
-    Args:
-        scores: the model's, then those of the trivial predictors.
-        joint_names: one per error.
-    """
+    """The first predictor, the model, against each of the others."""
     model, *others = scores
     result = []
     for other in others:
-        ratios = {
-            unit: _ratios(getattr(model, unit), getattr(other, unit)) for unit in ("torque", "acceleration")
-        }
-        worse = [
-            name for name, pair in zip(joint_names, zip(*ratios.values(), strict=True), strict=True)
-            if max(pair) > 1.0 + EQUAL
-        ]  # fmt: skip
+        units = "torque", "acceleration"
+        ratios = {unit: _ratios(getattr(model, unit), getattr(other, unit)) for unit in units}
+        pairs = zip(joint_names, zip(*ratios.values(), strict=True), strict=True)
+        worse = [name for name, pair in pairs if max(pair) > 1.0 + EQUAL]
         worse = ["every joint"] if len(worse) == len(joint_names) else worse
         means = {unit: math.exp(sum(map(math.log, r)) / len(r)) for unit, r in ratios.items()}
         result.append(Verdict(other.name, **means, worse=tuple(worse)))

@@ -1,12 +1,8 @@
-"""The page of a checked log: the verdict, where findings lie, and each finding with a picture.
-
-Pictures of findings: the columns concerned, around the rows concerned.
-"""
+"""The page of a checked log: the verdict, and each finding with a picture of its columns and rows."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -64,21 +60,16 @@ def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture
         return _contact(finding, system, log, rows)
     if family in ("torque", "mechanics"):
         return _panels(finding, log, rows, index, _torque(system, log, rows), "torque [N m]")
-    painters: dict[str, tuple[Paint, str]] = {
-        "clock": (_steps, "time step [s]"),
-        "values": (_position, "q"),
-        "kinematics": (_rates, "qd"),
-        "noise": (_acceleration, "qdd"),
-        "excitation": (_position, "q"),
-    }
-    paint, label = painters.get(family, (_position, "q"))
-    if finding.message.startswith("qd "):
-        paint, label = painters["kinematics"]
     column = next((name for name in ("tau", "qdd", "qd", "q") if f"{name}." in finding.message), None)
     if family == "values" and (column or finding.kind in ("torque-saturated", "torque-limit")):
-        name = column or "tau"
-        paint, label = (lambda axes, log, rows, j: _line(axes, rows, getattr(log, name)[rows, j])), name
-    return _panels(finding, log, rows, index if family != "clock" else [0], paint, label)
+        return _panels(finding, log, rows, index, _column(column or "tau"), column or "tau")
+    if family == "kinematics" or finding.message.startswith("qd "):
+        return _panels(finding, log, rows, index, _rates, "qd")
+    if family == "clock":
+        return _panels(finding, log, rows, [0], _steps, "time step [s]")
+    if family == "noise":
+        return _panels(finding, log, rows, index, _acceleration, "qdd")
+    return _panels(finding, log, rows, index, _column("q"), "q")
 
 
 def _window(finding: Finding, log: Log) -> slice:
@@ -132,12 +123,12 @@ def _line(axes: Axes, rows: slice, y: Array, colour: str = INK, name: str | None
     axes.plot(x, y, color=colour, label=name, linewidth=0.9)
 
 
+def _column(name: str) -> Paint:
+    return lambda axes, log, rows, j: _line(axes, rows, getattr(log, name)[rows, j])
+
+
 def _steps(axes: Axes, log: Log, rows: slice, j: int) -> None:
     _line(axes, rows, np.diff(log.t[rows], prepend=np.nan))
-
-
-def _position(axes: Axes, log: Log, rows: slice, j: int) -> None:
-    _line(axes, rows, log.q[rows, j])
 
 
 def _acceleration(axes: Axes, log: Log, rows: slice, j: int) -> None:
@@ -148,9 +139,8 @@ def _acceleration(axes: Axes, log: Log, rows: slice, j: int) -> None:
 
 def _rates(axes: Axes, log: Log, rows: slice, j: int) -> None:
     with np.errstate(all="ignore"):
-        _line(
-            axes, rows, np.gradient(log.q[rows, j]) / np.gradient(log.t[rows]), OTHER, "rate of change of q"
-        )
+        rate = np.gradient(log.q[rows, j]) / np.gradient(log.t[rows])
+    _line(axes, rows, rate, OTHER, "rate of change of q")
     _line(axes, rows, log.qd[rows, j], COLOURS["error"], "qd")
     axes.legend(loc="upper right", ncols=2)
 
@@ -190,50 +180,19 @@ def _contact(finding: Finding, system: ConstrainedSystem, log: Log, rows: slice)
     return draw(fill, (SIZE[0], 2.4), f"Distance of the tip from {contact.name}: {finding.message}")
 
 
-@dataclass(frozen=True)
-class FindingSection:
-    """One finding on the page.
-
-    Attributes:
-        finding: the finding.
-        title: its kind in words, and those of its alternatives.
-        rows: the rows in words.
-        picture: what it looks like.
-    """
-
-    finding: Finding
-    title: str
-    rows: str
-    picture: Picture
-
-
 def write_check(path: Path, title: str, report: Report, system: ConstrainedSystem, log: Log) -> Path:
-    """Write the page of a checked log: one HTML file that needs no other.
-
-    Args:
-        path: where it goes.
-        title: log and scene.
-        report: what was found.
-        system, log: what was checked.
-
-    Returns:
-        The path.
-    """
-    log = of_robot(log, system.robot)
+    """Write the page of a checked log, whose title is `title`: one HTML file that needs no other."""
+    log, everything = of_robot(log, system.robot), ((0, report.samples),)
     sections = [
-        FindingSection(finding, _title(finding), _rows(finding, report), picture_of(finding, system, log))
+        {
+            "finding": finding,
+            "title": ", or ".join(KINDS[kind].title for kind in finding.kinds),
+            "rows": "all rows" if finding.intervals == everything else describe(finding.intervals, most=6),
+            "picture": picture_of(finding, system, log),
+        }
         for finding in report.findings
     ]
     overview = draw_overview(report) if report.findings else None
-    write_text(
-        path, render("check.html.j2", title=title, report=report, sections=sections, overview=overview)
-    )
+    page = render("check.html.j2", title=title, report=report, sections=sections, overview=overview)
+    write_text(path, page)
     return path
-
-
-def _title(finding: Finding) -> str:
-    return ", or ".join(KINDS[kind].title for kind in finding.kinds)
-
-
-def _rows(finding: Finding, report: Report) -> str:
-    return "all rows" if finding.intervals == ((0, report.samples),) else describe(finding.intervals, most=6)

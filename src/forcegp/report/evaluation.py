@@ -38,33 +38,32 @@ def write_evaluation(
     folder: Path,
     model: str,
     data: str,
+    fitted_to: str | None,
     scores: Evaluation,
     window: WindowData,
-    fitted_to: str | None = None,
     comparison: Sequence[Compared] = (),
 ) -> Path:
-    """Write the page on one model, with its plots and their data.
+    """Write the page on one model, with its plots and their data, and return its path.
 
     Args:
         folder: where the files go.
         model, data: the model file and the data file, as the page names them.
+        fitted_to: the file that the trivial predictors were fitted to, if not halves of the data.
         scores: of the model.
         window: predictions over a few seconds of the data.
-        fitted_to: the file that the trivial predictors were fitted to, if not halves of the data.
         comparison: sets of force priors that the training log chose between.
-
-    Returns:
-        The path of the page.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
-    pictures += [draw_calibration(scores)] if scores.calibration else []
+    pictures += [draw_calibration(scores)] if scores.uncertainty else []
     for name, picture in zip(PLOTS, pictures, strict=False):
         write_text(folder / name, picture.svg)
     write_text(folder / WINDOW, window.to_json())
+    # A folder that is called `model` adds nothing.
+    name = "" if Path(model).name.lower() in ("", "model") else f" “{Path(model).name}”"
     page = render(
         "evaluation.html.j2",
-        title=_title(scores.kind, Path(model).name, Path(data).name),
+        title=f"{label(scores.kind)}{name} on {Path(data).name}",
         model=model,
         data=data,
         scores=scores,
@@ -81,20 +80,13 @@ def write_evaluation(
     return folder / PAGE
 
 
-def _title(kind: str, model: str, data: str) -> str:
-    """Kind and name of the model, and the log; a folder that is called `model` adds nothing."""
-    name = "" if model.lower() in ("", "model") else f" “{model}”"
-    return f"{label(kind)}{name} on {data}"
-
-
 def _blocks(window: WindowData, pictures: list[Picture]) -> list[PictureBlock]:
     blocks = [
         PictureBlock(
             "Predictions and errors",
             f"The first {window.seconds:.2g} s. Predictions: accelerations by joint, measured in black, "
-            f"predicted "
-            "in colour, with the ±2σ band if the model gives one. Errors: measured (grey) and, if logged, "
-            "noise-free (black) acceleration less the prediction.",
+            "predicted in colour, with the ±2σ band if the model gives one. Errors: measured (grey) and, if "
+            "logged, noise-free (black) acceleration less the prediction.",
             tuple(pictures[:2]),
             WINDOW,
         )
@@ -102,8 +94,7 @@ def _blocks(window: WindowData, pictures: list[Picture]) -> list[PictureBlock]:
     if len(pictures) > 2:
         caption = (
             "Share of measured accelerations inside the central interval of each probability. On the "
-            "diagonal "
-            "the uncertainty is right; below it the model is overconfident, above it underconfident."
+            "diagonal the uncertainty is right; below it the model is overconfident, above it underconfident."
         )
         blocks.append(PictureBlock("Calibration", caption, tuple(pictures[2:]), "evaluation.json"))
     return blocks
@@ -111,7 +102,8 @@ def _blocks(window: WindowData, pictures: list[Picture]) -> list[PictureBlock]:
 
 def draw_calibration(evaluation: Evaluation) -> Picture:
     """Coverage over nominal probability."""
-    levels = {float(level): share for level, share in (evaluation.calibration or {}).items()}
+    shares = evaluation.uncertainty.calibration if evaluation.uncertainty else {}
+    levels = {float(level): share for level, share in shares.items()}
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
@@ -142,7 +134,9 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
         rows, bad = [], set()
         for i, joint in enumerate(evaluation.joint_names):
             shown = [e.in_motion[i] for e in errors.values()]
-            rows.append((joint, *map(_short, (*shown, model_errors.rest[i], model_errors.normalised[i]))))
+            rows.append(
+                (joint, *(cell(x, 3) for x in (*shown, model_errors.rest[i], model_errors.normalised[i])))
+            )
             if any((shown[0] or 0.0) > (e.in_motion[i] or 0.0) for e in others):
                 bad.add((i, 1))
         caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: worse than another"
@@ -164,17 +158,14 @@ def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
         caption = "Mean log density of a measured joint acceleration [nats], higher is better"
         tables.append(Table(caption, ("predictor", "log density"), rows))
     head = ("contact", "samples", "bias [N]", "standard deviation [N]", "correlation", "±2σ coverage")
-    caption = "Multiplier λ: predicted less logged"
-    for scores, title in (
-        (evaluation.multipliers, caption),
-        (evaluation.sensed, f"{caption}, with the force sensor"),
-    ):
-        rows = tuple(
-            (m.contact, str(m.samples), *map(_short, (m.bias, m.spread, m.correlation, m.coverage)))
-            for m in scores
-        )
-        if rows:
-            tables.append(Table(title, head, rows))
+    titles = (
+        "Multiplier λ: predicted less logged",
+        "Multiplier λ: predicted less logged, with the force sensor",
+    )
+    for title, scores in zip(titles, (evaluation.multipliers, evaluation.sensed), strict=True):
+        values = [(m.contact, m.samples, m.bias, m.spread, m.correlation, m.coverage) for m in scores]
+        if values:
+            tables.append(Table(title, head, tuple(tuple(cell(x, 3) for x in row) for row in values)))
     return tuple(tables)
 
 
@@ -188,16 +179,9 @@ def score_table(evaluation: Evaluation) -> Table:
 def comparison_tables(comparison: Sequence[Compared]) -> tuple[Table, ...]:
     """The sets of force priors that the training log chose between; none if they were named."""
     rows = tuple(
-        (
-            each.name,
-            *(_short(x) for x in (each.log_density, each.behind, each.standard_error)),
-            ", ".join(part for part in ("chosen" if each.chosen else "", each.note) if part),
-        )
+        tuple(cell(x, 3) for x in (each.name, each.log_density, each.behind, each.standard_error, note))
         for each in comparison
+        for note in [", ".join(part for part in ("chosen" if each.chosen else "", each.note) if part)]
     )
     caption = "Force priors, compared on held-out stretches of the training log [nats per sample]"
     return (Table(caption, ("set", "log density", "behind", "standard error", ""), rows),) if rows else ()
-
-
-def _short(value: float | None) -> str:
-    return cell(None if value is None else float(f"{value:.3g}"))

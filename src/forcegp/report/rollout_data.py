@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from forcegp import kinematics
-from forcegp.files import Header
-from forcegp.report.html import Part, Series, series
-from forcegp.robot.model import BASE, RobotModel
+from forcegp.files import Header, Record
+from forcegp.report.animation import FRAMES_PER_SECOND, arm_points, rounded
+from forcegp.report.html import Series, series
 from forcegp.rollout.comparison import HORIZONS, LEVEL, Comparison
 
-FRAMES_PER_SECOND = 20
-"""Frame rate of the animation."""
 
-
-class Band(Part):
-    """A central band over function samples.
-
-    Attributes:
-        lower, upper: bounds.
-    """
+class Band(Record):
+    """Bounds of a central band over function samples."""
 
     lower: Series
     upper: Series
 
 
-class ModelPath(Part):
+class ModelPath(Record):
     """The first predicted trajectory of one model, up to where it diverged.
 
     Attributes:
@@ -66,13 +57,8 @@ class ModelPath(Part):
     diverged_at: float | None
 
 
-class Film(Part):
-    """Joint positions in space for an animation.
-
-    Attributes:
-        label: whose motion.
-        points: frames × points × 3, flat [m].
-    """
+class Film(Record):
+    """Points of an arm for an animation: frames × points × 3, flat [m]; `label` names the model."""
 
     label: str
     points: Series
@@ -83,16 +69,12 @@ class RolloutData(Header):
 
     Attributes:
         t: time since the start [s].
-        tip: logged x, y and z of the tip [m].
-        multiplier: logged λ of the first contact [N]; empty if it is not logged.
+        tip, multiplier: logged x, y, z of the tip [m]; λ of the first contact [N], empty if not logged.
         starts: number of starts of the medians.
-        band_starts, band_seconds: number of starts and duration of the bands and their coverage.
-        level: nominal coverage of the bands.
+        band_starts, band_seconds, level: starts, duration and nominal coverage of the bands.
         horizons: times of `ModelPath.errors` [s].
         models: one per model.
-        frame_times: of the animation [s].
-        bodies: number of points of the arm in each frame.
-        films: the logged motion and one per model.
+        frame_times, bodies, films: animation times [s], points of the arm, and arms, the logged one first.
     """
 
     FORMAT: ClassVar[str] = "forcegp-rollout"
@@ -116,18 +98,17 @@ class RolloutData(Header):
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
     """The data of the section from a comparison; curves are those of its first start.
 
-    Args:
-        comparison: the comparison.
-        calibration: the same models on another motion, on which the bands are calibrated.
+    Bands are calibrated on `calibration`, the same models on another motion.
     """
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
-    joints = [arm_points(comparison.system.robot, comparison.q[0, ::stride], comparison)]
-    films = [Film(label="logged", points=_rounded(joints[0]))]
+    tip = comparison.frame, comparison.point
+    joints = arm_points(comparison.system.robot, comparison.q[0, ::stride], *tip)
+    films = [Film(label="logged", points=rounded(joints))]
     for name, rolled in comparison.predicted.items():
         sound = _sound(rolled.q[0])
-        points = arm_points(rolled.system.robot, rolled.q[0, :sound:stride], comparison)
-        films.append(Film(label=name, points=_rounded(points)))
+        points = arm_points(rolled.system.robot, rolled.q[0, :sound:stride], *tip)
+        films.append(Film(label=name, points=rounded(points)))
     logged = comparison.multiplier
     return RolloutData(
         t=series(comparison.t),
@@ -140,45 +121,9 @@ def rollout_data(comparison: Comparison, calibration: Comparison | None = None) 
         horizons=horizons,
         models=[_model_path(comparison, name, horizons, calibration) for name in comparison.predicted],
         frame_times=series(comparison.t[::stride]),
-        bodies=joints[0].shape[1],
+        bodies=joints.shape[1],
         films=films,
     )
-
-
-def with_bands(paths: RolloutData, bands: RolloutData) -> RolloutData:
-    """Trajectories of mean functions with the bands of another, cheaper comparison of the same models.
-
-    Bands cost one trajectory per sample, so they may cover fewer starts and a shorter time.
-
-    Args:
-        paths: tip errors, drift and multiplier over the whole time.
-        bands: of the models that have function samples, from the same first start.
-    """
-    sampled = {band.model: band for band in bands.models}
-    models = [_with_bands(p, sampled[p.model]) if p.model in sampled else p for p in paths.models]
-    seconds = {"band_starts": bands.starts, "band_seconds": bands.band_seconds}
-    return paths.model_copy(update={"models": models, **seconds})
-
-
-def together(parts: Sequence[RolloutData]) -> RolloutData:
-    """Trajectories of several models, from one comparison each with the same log.
-
-    Args:
-        parts: at least one; each from the same starts.
-    """
-    # Models without function samples have no bands, whose duration is then that of the trajectories.
-    whole = min(parts, key=lambda part: part.band_seconds)
-    models = [model for part in parts for model in part.models]
-    films = [parts[0].films[0], *(film for part in parts for film in part.films[1:])]
-    return whole.model_copy(update={"models": models, "films": films})
-
-
-def _with_bands(path: ModelPath, band: ModelPath) -> ModelPath:
-    drifts = [x.worst_drift for x in (path, band) if x.worst_drift is not None]
-    times = [x.diverged_at for x in (path, band) if x.diverged_at is not None]
-    names = ("tip_bands", "multiplier_band", "lost", "coverage", "inflation", "calibrated_coverage")
-    worst = {"worst_drift": max(drifts, default=None), "diverged_at": min(times, default=None)}
-    return path.model_copy(update={name: getattr(band, name) for name in names} | worst)
 
 
 def _model_path(
@@ -189,6 +134,7 @@ def _model_path(
     samples, contacts = rolled.samples, rolled.system.m > 0
     multiplier = rolled.multiplier[0, :n, 0] if contacts else rolled.multiplier.new_zeros(0)
     has_multiplier = bool(torch.isfinite(multiplier).all()) and len(multiplier) > 0
+    tip_error = comparison.tip_error(name).median(0).values
     errors = [comparison.error_at(name, horizon) for horizon in horizons]
     times = [d.t for d in (*rolled.diverged, *(samples.diverged if samples else ()))]
     factor = calibration.inflation(name) if samples and calibration else math.inf
@@ -198,7 +144,7 @@ def _model_path(
         model=name,
         tip=[series(x) for x in comparison.predicted_tip(name)[0, :n].T],
         tip_bands=[] if samples is None else _bands(rolled, comparison.sampled_tip(name)[:, 0], n),
-        tip_error=series(_finite(comparison.tip_error(name).median(0).values)),
+        tip_error=series(tip_error[torch.isfinite(tip_error)]),
         drift=series(rolled.drift[0, :n, 0]) if contacts else [],
         multiplier=series(multiplier) if has_multiplier else [],
         multiplier_band=_bands(rolled, samples.multiplier[:, 0], n)[0] if samples and contacts else None,
@@ -215,35 +161,11 @@ def _model_path(
 def _bands(rolled, values: Tensor, n: int) -> list[Band]:
     """Bands `(S, T, d)` of each component over the first n times, as far as any sample goes."""
     band = rolled.bands(values[:, :n], LEVEL)
-    last = int(torch.isfinite(band.lower).all(-1).sum())
-    return [
-        Band(lower=series(low), upper=series(high))
-        for low, high in zip(band.lower[:last].T, band.upper[:last].T, strict=True)
-    ]
+    last = _sound(band.lower)
+    pairs = zip(band.lower[:last].T, band.upper[:last].T, strict=True)
+    return [Band(lower=series(low), upper=series(high)) for low, high in pairs]
 
 
 def _sound(q: Tensor) -> int:
     """How many leading times `(T, nq)` hold a finite state."""
     return int(torch.isfinite(q).all(-1).sum())
-
-
-def _finite(values: Tensor) -> Tensor:
-    return values[torch.isfinite(values)]
-
-
-def arm_points(robot: RobotModel, q: Tensor, comparison: Comparison) -> Tensor:
-    """Base, link origins on the way to the tip, and the tip: `(frames, points, 3)` in the world [m]."""
-    poses = kinematics.link_poses(robot, q)
-    joint = robot.frame_parents[robot.frame_index(comparison.frame)]
-    chain: list[int] = []
-    while joint != BASE:
-        chain.insert(0, joint)
-        joint = robot.parents[joint]
-    origins = poses.position[:, chain] + robot.base_position
-    base = robot.base_position.expand(len(q), 1, 3)
-    tip = kinematics.point_position(robot, q, comparison.frame, tuple(comparison.point))[:, None]
-    return torch.cat([base, origins, tip], dim=1)
-
-
-def _rounded(points: Tensor) -> Series:
-    return [round(x, 5) for x in points.flatten().tolist()]

@@ -1,16 +1,9 @@
-"""Predicted trajectories beside the logged one: plots, table and animation.
-
-The arm in motion: an animation in the page, drawn by its own script.
-"""
+"""Predicted trajectories beside the logged one: plots, table and animation."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
 import math
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
 from markupsafe import Markup
@@ -18,13 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.files import write_text
+from forcegp.report.animation import animation, animation_source
 from forcegp.report.html import NONE, PictureBlock, Series, Table, render
 from forcegp.report.rollout_data import Band, ModelPath, RolloutData
 from forcegp.report.style import DASHES, INK, Picture, colour, draw, label, line
 
 
-def animation(data: RolloutData) -> Markup:
-    """The arm in motion: a canvas with a slider, a play button and a checkbox for each model."""
+def _animation(data: RolloutData) -> Markup:
+    """The logged arm and the predicted ones in motion."""
     films = [
         {
             "label": "simulated" if film.label == "logged" else label(film.label),
@@ -35,25 +29,7 @@ def animation(data: RolloutData) -> Markup:
         for film in data.films
     ]
     content = {"times": data.frame_times, "bodies": data.bodies, "films": films}
-    # "</" would end the script element, even inside a string.
-    text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
-    return Markup(
-        '<figure class="animation"><canvas width="920" height="560" role="img" '
-        'aria-label="The arm moving: simulated in black, predicted in colour"></canvas>'
-        '<p><button type="button">Play</button> <input type="range" min="0" value="0" step="1" '
-        'aria-label="time"> <output></output></p><p class="films"></p>'
-        f'<script type="application/json">{text}</script><script>{_script()}</script></figure>'
-    )
-
-
-def animation_source() -> str:
-    """Hash of the animation's script for a content security policy."""
-    digest = hashlib.sha256(_script().encode()).digest()
-    return "sha256-" + base64.b64encode(digest).decode()
-
-
-def _script() -> str:
-    return (files("forcegp.report") / "templates" / "animation.js").read_text(encoding="utf-8")
+    return animation(content, "The arm moving: simulated in black, predicted in colour")
 
 
 WIDTH = 4.6
@@ -82,25 +58,27 @@ def draw_tip(data: RolloutData) -> Picture:
 
 def draw_tip_error(data: RolloutData) -> Picture:
     """Distance between predicted and logged tip over time, on a logarithmic scale."""
-    curves = [(path, _logarithmic(path.tip_error, 1e-9)) for path in data.models]
+    curves = [(path, path.tip_error) for path in data.models]
     alt = f"Tip error over time, median over {data.starts} starts, logarithmic scale, one curve per model."
-    return _draw_logarithmic(data, curves, "tip error [m]", alt, "Tip error over time")
+    return _draw_logarithmic(data, curves, 1e-9, "tip error [m]", alt, "Tip error over time")
 
 
 def draw_drift(data: RolloutData) -> Picture:
     """Constraint error of the predicted trajectories."""
-    curves = [(path, _logarithmic(path.drift, 1e-16)) for path in data.models if path.drift]
+    curves = [(path, path.drift) for path in data.models if path.drift]
     alt = "Distance of the predicted tip from the surface over time, logarithmic scale, one curve per model."
-    return _draw_logarithmic(data, curves, "|c(q)| [m]", alt, "Drift off the surface")
+    return _draw_logarithmic(data, curves, 1e-16, "|c(q)| [m]", alt, "Drift off the surface")
 
 
 def _draw_logarithmic(
-    data: RolloutData, curves: list[tuple[ModelPath, Series]], name: str, alt: str, title: str
+    data: RolloutData, curves: list[tuple[ModelPath, Series]], least: float, name: str, alt: str, title: str
 ) -> Picture:
+    """Magnitudes on a logarithmic scale; the first, at the logged start, is zero and left out."""
+
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         for path, values in curves:
-            _curve(axes, data, path, values)
+            _curve(axes, data, path, [math.nan, *(max(abs(value), least) for value in values[1:])])
         axes.set_yscale("log")
         axes.set_xlabel("time [s]")
         axes.set_ylabel(name)
@@ -145,18 +123,11 @@ def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band:
     axes.plot(data.t[: len(values)], values, label=label(path.model), **style)
 
 
-def _logarithmic(values: Series, least: float) -> Series:
-    """Magnitudes for a logarithmic scale; the first, at the logged start, is zero and left out."""
-    return [math.nan, *(max(abs(value), least) for value in values[1:])]
-
-
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
     """The plots of the section for which there are data."""
     pictures = [draw_tip(data), draw_tip_error(data)]
-    if any(path.drift for path in data.models):
-        pictures.append(draw_drift(data))
-    if any(path.multiplier for path in data.models):
-        pictures.append(draw_contact_force(data))
+    pictures += [draw_drift(data)] if any(path.drift for path in data.models) else []
+    pictures += [draw_contact_force(data)] if any(path.multiplier for path in data.models) else []
     return tuple(pictures)
 
 
@@ -184,14 +155,7 @@ def rollout_table(data: RolloutData) -> Table:
 
 @dataclass(frozen=True)
 class RolloutSection:
-    """The section on trajectories, of any page.
-
-    Attributes:
-        block: the plots under their caption.
-        table: tip errors, coverage and drift.
-        animation: the arm in motion.
-        script: hash of the animation's script for the page's content security policy.
-    """
+    """Plots, table and animation of trajectories; `script` is the hash for the page's security policy."""
 
     block: PictureBlock
     table: Table
@@ -210,20 +174,11 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
         "its prediction diverged."
     )
     block = PictureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
-    return RolloutSection(block, rollout_table(data), animation(data), animation_source())
+    return RolloutSection(block, rollout_table(data), _animation(data), animation_source())
 
 
 def write_rollouts(folder: Path, title: str, data: RolloutData) -> Path:
-    """Write the page on trajectories, its plots and their data.
-
-    Args:
-        folder: where the files go.
-        title: models and data.
-        data: what was predicted.
-
-    Returns:
-        The path of the page.
-    """
+    """Write the page on trajectories, its plots and their data to a folder; returns the path of the page."""
     section = rollout_section(data)
     for i, picture in enumerate(section.block.pictures):
         write_text(folder / f"rollout-{i + 1}.svg", picture.svg)

@@ -6,10 +6,9 @@ import base64
 import io
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import matplotlib
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 COLOURS = {
@@ -21,7 +20,6 @@ COLOURS = {
     "sgp-contact": "#007a5e",
 }
 """One colour per model, distinguishable by colour-blind readers and in print."""
-MARKERS = {"analytical": "x", "nn": "v", "gp": "s", "sgp-zero": "o", "sgp-mean": "D", "sgp-contact": "^"}
 DASHES = {"nn-30-20": (1.0, 1.2), "nn-200x4": (5.0, 1.5, 1.0, 1.5)}
 """Dashes and gaps, in line widths, of the networks that share the first one's colour."""
 KINDS = {
@@ -52,44 +50,13 @@ LABELS = {
 }
 """What a model is called in plots and tables."""
 
-SETTINGS: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.labelsize": 9.0,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#666666",
-    "axes.linewidth": 0.7,
-    "axes.grid": True,
-    "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "axes.unicode_minus": True,
-    "lines.linewidth": 1.1,
-    "figure.facecolor": "white",
-    "figure.constrained_layout.use": True,
-    "figure.constrained_layout.h_pad": 0.02,
-    "figure.constrained_layout.w_pad": 0.03,
-    "path.simplify_threshold": 0.5,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "forcegp",
-}
+STYLE = Path(__file__).parent / "templates" / "forcegp.mplstyle"
+"""Fonts, sizes and lines of plots."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn plot.
-
-    Attributes:
-        svg: the file's text.
-        alt: what it shows, for readers who cannot see it.
-        title: short heading, such as the model's name.
-    """
+    """A drawn plot as the text of an SVG file; `alt` describes it for readers who cannot see it."""
 
     svg: str
     alt: str
@@ -117,23 +84,10 @@ def line(model: str) -> str | tuple[float, tuple[float, ...]]:
 
 
 def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, title: str = "") -> Picture:
-    """Draw a plot as SVG in the style of this project, without changing global settings.
-
-    Args:
-        paint: fills the empty canvas.
-        size: width and height [inch]; a page column is 4.6 wide.
-        alt: what the plot shows.
-        title: short heading.
-    """
+    """Draw a plot of a size [inch] as SVG in the style of this project, without changing global settings."""
     buffer = io.StringIO()
-    with matplotlib.rc_context(SETTINGS):
+    with matplotlib.rc_context({"svg.hashsalt": "forcegp"}, fname=STYLE):
         figure = Figure(figsize=size)
         paint(figure)
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return Picture(buffer.getvalue(), alt, title)
-
-
-def shade(axes: Axes, spans: list[tuple[float, float]]) -> None:
-    """Shade spans of time behind the curves."""
-    for first, last in spans:
-        axes.axvspan(first, last, color="#f1ead2", zorder=0, linewidth=0)

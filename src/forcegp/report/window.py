@@ -1,9 +1,8 @@
-"""Predicted accelerations of all joints over a few seconds, and their errors: data, computation, plots."""
+"""Predicted accelerations of all joints over a few seconds, and their errors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from matplotlib.figure import Figure
@@ -16,20 +15,15 @@ from forcegp.models.structured_fit import StructuredFit
 from forcegp.report.html import Series, as_tensor, columns, series
 from forcegp.report.style import INK, Picture, colour, draw, label
 
-WIDTH, ROW, MARGIN = 4.1, 0.92, 0.55
+WIDTH, ROW, MARGIN = 4.1, 0.92, 0.75
 """Size of a plot with one row per joint [inch]."""
 GREY = "#9a9a9a"
 
 
 class WindowData(Header):
-    """Predictions of one model over a window of time.
+    """Predictions of one model over a window of time, by joint [rad/s²]; `clean` and `std` may be unknown.
 
-    Attributes:
-        model: registry name or kind.
-        noise_std: of the measured accelerations [rad/s²], if known.
-        t: time from the first sample [s].
-        joint_names: one per series.
-        measured, clean, mean, std: accelerations by joint [rad/s²]; `clean` and `std` may be unknown.
+    `noise_std` is that of the measured accelerations [rad/s²]; `t` is the time from the first sample [s].
     """
 
     FORMAT: ClassVar[str] = "forcegp-window"
@@ -64,16 +58,7 @@ def opening(data: Dataset, seconds: float) -> Dataset:
 
 @torch.no_grad()
 def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
-    """Mean and standard deviation of the accelerations at the samples of a window.
-
-    Args:
-        model: a fitted model.
-        data: the window, sorted by time.
-        name: what the plots call the model.
-
-    Returns:
-        The data of both plots.
-    """
+    """Predictions at the samples of a window, sorted by time; the plots call the model `name`."""
     predicted = model.predict(data.q, data.qd, data.tau, active=data.active(model.system.contact_names))
     clean, variance = data.extras.get("qdd_clean"), predicted.variance
     if variance is not None and isinstance(model, StructuredFit) and model.torque_std is not None:
@@ -95,17 +80,9 @@ def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
 
 def draw_predictions(window: WindowData) -> Picture:
     """Measured and predicted accelerations, one row per joint, with a band of ±2 standard deviations."""
-    name, joints = label(window.model), len(window.joint_names)
     band = ", with the ±2σ band," if window.std else ""
-    alt = (
-        f"{name}: accelerations of {joints} joints over {window.seconds:.3g} s; measured in black, "
-        f"predicted{band} in colour."
-    )
-
-    def paint(figure: Figure) -> None:
-        _rows(figure, window, torch.zeros(len(window.t), dtype=torch.float64))
-
-    return draw(paint, (WIDTH, MARGIN + ROW * joints), alt, name)
+    alt = f"accelerations of {{}}; measured in black, predicted{band} in colour."
+    return _draw(window, torch.zeros(len(window.t), dtype=torch.float64), alt)
 
 
 def draw_errors(window: WindowData, limit: float | None = None) -> Picture:
@@ -116,24 +93,20 @@ def draw_errors(window: WindowData, limit: float | None = None) -> Picture:
         limit: half height of every row [rad/s²], to compare models at one scale; each row has its own
             scale by default.
     """
-    name, joints, error = label(window.model), len(window.joint_names), window.error.abs()
+    error = window.error.abs()
     alt = (
-        f"{name}: error of the predicted accelerations of {joints} joints over {window.seconds:.3g} s, "
-        f"mean magnitude {error.mean():.2g}, largest {error.max():.2g} rad/s²."
+        f"error of the predicted accelerations of {{}}, mean magnitude {error.mean():.2g}, "
+        f"largest {error.max():.2g} rad/s²."
     )
-
-    def paint(figure: Figure) -> None:
-        _rows(figure, window, as_tensor(window.mean), limit)
-
-    return draw(paint, (WIDTH, MARGIN + ROW * joints), alt, name)
+    return _draw(window, as_tensor(window.mean), alt, limit)
 
 
-def common_limit(windows: Sequence[WindowData]) -> float:
-    """A half height [rad/s²] that fits the noise and the errors of the better half of the models."""
-    if not windows:
-        return 0.5
-    largest = sorted(float(window.error.abs().quantile(0.995)) for window in windows)
-    return max(4.0 * (windows[0].noise_std or 0.0), 1.3 * largest[(len(largest) - 1) // 2])
+def _draw(window: WindowData, centre: Tensor, alt: str, limit: float | None = None) -> Picture:
+    name, joints = label(window.model), len(window.joint_names)
+    alt = f"{name}: " + alt.format(f"{joints} joints over {window.seconds:.3g} s")
+    return draw(
+        lambda figure: _rows(figure, window, centre, limit), (WIDTH, MARGIN + ROW * joints), alt, name
+    )
 
 
 def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | None = None) -> None:
@@ -146,14 +119,10 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
         axes.plot(window.t, measured[i], color=ink, linewidth=0.7, label="measured")
         if window.std is not None:
             spread = 2.0 * as_tensor(window.std[i])
-            band: dict[str, Any] = {
-                "color": model_colour,
-                "alpha": 0.3,
-                "linewidth": 0,
-                "label": "±2σ",
-                "zorder": 3,
-            }
-            axes.fill_between(window.t, mean[i] - spread, mean[i] + spread, **band)
+            low, high = mean[i] - spread, mean[i] + spread
+            axes.fill_between(
+                window.t, low, high, color=model_colour, alpha=0.3, linewidth=0, label="±2σ", zorder=3
+            )
         axes.plot(window.t, mean[i], color=model_colour, linewidth=1.1, label="predicted", zorder=4)
         if relative and window.clean is not None:
             clean = as_tensor(window.clean[i]) - centre[i]
@@ -163,10 +132,10 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
         axes.locator_params(axis="y", nbins=4)
         if limit is not None:
             axes.set_ylim(-limit, limit)
+    rows[0].set_title(f"acceleration{' less prediction' if relative else ''} [rad/s²]", loc="left")
     rows[-1].set_xlabel("time from the first sample [s]")
     figure.align_ylabels()
     handles, names = rows[0].get_legend_handles_labels()
     legend = figure.legend(handles, names, loc="outside upper center", ncols=len(names))
     for shown_line in legend.get_lines():
         shown_line.set_linewidth(1.6)  # a hairline of the plot would look grey
-    figure.supylabel(f"acceleration{' less prediction' if relative else ''} [rad/s²]", fontsize=9)

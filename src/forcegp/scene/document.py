@@ -41,9 +41,6 @@ class Document:
         content: the bytes of the file.
         source: its name, for messages.
         error: the class of error to raise, also by the methods.
-
-    Raises:
-        ForceGPError: of class `error`, if the file is not TOML; the message names file and line.
     """
 
     def __init__(self, content: bytes, source: str, error: type[ForceGPError] = SceneError) -> None:
@@ -67,10 +64,7 @@ class Document:
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
-        """The content as an instance of a schema.
-
-        Args:
-            schema: a pydantic model, whose fields may be models, data classes or unions with a `type`.
+        """The content as an instance of a pydantic model.
 
         Raises:
             ForceGPError: the first error in the content, with its line and key.
@@ -86,11 +80,7 @@ class Document:
             raise self._error(schema, errors[0]) from error
 
     def at(self, key: Key, make: Callable[..., T], *args: object, **options: object) -> T:
-        """The result of `make(*args, **options)`, whose errors are reported at a key of this file.
-
-        Raises:
-            ForceGPError: `make` raised an error of this library.
-        """
+        """The result of `make(*args, **options)`, whose errors are reported at a key of this file."""
         try:
             return make(*args, **options)
         except ForceGPError as error:
@@ -104,9 +94,8 @@ class Document:
             members: Any = dict(enumerate(value)) if isinstance(value, list) else value
             if isinstance(members, dict) and part in members:
                 prefix, value = (*prefix, part), members[part]
-        line = next(
-            (self._lines[prefix[:n]] for n in range(len(prefix), 0, -1) if prefix[:n] in self._lines), None
-        )
+        known = (prefix[:n] for n in range(len(prefix), 0, -1) if prefix[:n] in self._lines)
+        line = self._lines.get(next(known, ()))
         where = self.source if line is None else f"{self.source}:{line}"
         return f"{where}: {dotted(prefix)}" if prefix else where
 
@@ -119,10 +108,9 @@ class Document:
         if kind == "json_invalid":  # well-formed, as it was just written, but too deep for the validator
             return self.error(f"{self.source}: nested too deeply", got=context.get("error"))
         if kind in _UNKNOWN_KEY:
-            allowed = _allowed_keys(schema, key)
-            return self.error(
-                f"{place}: unknown key", expected=_one_of(allowed), hint=did_you_mean(last, allowed)
-            )
+            allowed = list(dict.fromkeys(name for t in _tables_at(schema, key[:-1]) for name in _hints(t)))
+            hint = did_you_mean(last, allowed)
+            return self.error(f"{place}: unknown key", expected=_one_of(allowed), hint=hint)
         if kind == "missing" and isinstance(key[-1], int):
             return self.error(f"{place}: too few numbers", expected=f"more than {last}")
         if kind == "missing":
@@ -168,11 +156,6 @@ def _check_keys(text: str, source: str, error: type[ForceGPError]) -> None:
 
 def _one_of(names: list[str]) -> str:
     return f"one of {', '.join(names)}"
-
-
-def _allowed_keys(schema: type, key: Key) -> list[str]:
-    """The keys of the table that contains a key."""
-    return list(dict.fromkeys(name for table in _tables_at(schema, key[:-1]) for name in _hints(table)))
 
 
 def _tags(schema: type, key: Key) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from forcegp.constraints import ConstrainedSystem, Constraint, PointConnection, SurfaceContact
+from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import SceneError, did_you_mean
 from forcegp.robot import RobotModel, load_robot
 from forcegp.robot.load import BUNDLED as BUNDLED_ROBOTS
@@ -31,12 +31,7 @@ BUNDLED = (
 
 @dataclass(frozen=True)
 class ModelTable:
-    """The table `[model]` of a file; `forcegp.models.configured` makes what it describes.
-
-    Attributes:
-        section: its keys.
-        document: the file, for messages.
-    """
+    """The table `[model]` of a file, for `forcegp.models.configured`, and the file, for messages."""
 
     section: ModelSection
     document: Document
@@ -44,13 +39,7 @@ class ModelTable:
 
 @dataclass(frozen=True)
 class Scene:
-    """A validated scene file; `system` makes what it describes.
-
-    Attributes:
-        sections: the tables.
-        document: the file, for messages.
-        folder: where relative paths start.
-    """
+    """A validated scene file; relative paths start at `folder`."""
 
     sections: SceneSections
     document: Document
@@ -67,11 +56,7 @@ class Scene:
         return ModelTable(self.sections.model, self.document)
 
     def robot(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> RobotModel:
-        """The robot.
-
-        Raises:
-            SceneError: the robot cannot be loaded; the message names the key and line.
-        """
+        """The robot; a `SceneError` names the key and line."""
         section = self.sections.robot
         bundled = section.model in BUNDLED_ROBOTS
         source = section.model if bundled else self.folder / section.model
@@ -88,19 +73,13 @@ class Scene:
     def system(
         self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
     ) -> ConstrainedSystem:
-        """The robot with its contacts.
-
-        Raises:
-            SceneError: a part is not valid; the message names the key and line.
-        """
+        """The robot with its contacts; a `SceneError` names the key and line."""
         robot, sections, at = self.robot(dtype, device), self.sections, self.document.at
-        constraints: list[Constraint] = []
-        for i, c in enumerate(sections.contact):
-            constraints.append(SurfaceContact(c.name, c.frame, c.point, c.surface, radius=c.radius))
-            at(("contact", i, "frame"), constraints[-1].check, robot)
-        for i, c in enumerate(sections.connection):
-            constraints.append(PointConnection(c.name, c.frame, c.point, c.other_frame, c.other_point))
-            at(("connection", i, "frame"), constraints[-1].check, robot)
+        tables = [(("contact", i), table) for i, table in enumerate(sections.contact)]
+        tables += [(("connection", i), table) for i, table in enumerate(sections.connection)]
+        constraints = [table.build() for _, table in tables]
+        for (key, _), constraint in zip(tables, constraints, strict=True):
+            at((*key, "frame"), constraint.check, robot)
         return at(("contact",), ConstrainedSystem, robot, constraints, baumgarte=sections.baumgarte)
 
 
@@ -113,13 +92,9 @@ def _is_file(path: Path) -> bool:
 
 
 def load_scene(source: str | Path) -> Scene:
-    """Read a scene file.
+    """Read a scene file: a path, or the name of a bundled scene, one of `BUNDLED`.
 
-    Args:
-        source: a path, or the name of a bundled scene, one of `BUNDLED`.
-
-    Returns:
-        The scene; nothing but its file has been read yet.
+    Nothing but the file is read yet.
 
     Example:
         >>> load_scene("kuka_plane").system().contact_names
@@ -147,10 +122,7 @@ def default_model_table() -> ModelTable:
 
 
 def load_model_table(path: str | Path) -> ModelTable:
-    """Read a file with the table `[model]` alone.
-
-    Args:
-        path: a TOML file.
+    """Read a TOML file with the table `[model]` alone.
 
     Raises:
         SceneError: the file does not exist or is not valid; the message names file, line and key.

@@ -1,37 +1,23 @@
 """The tables of a scene file.
 
-Surfaces, the stabilization and the simulation are described by the classes that they make, so a key of a
-scene file is a parameter of that class; the other tables are described here.
-
-The table `[model]` of a scene file or of a file of its own: which model, and how it learns.
-
-Names and values are those of the arguments in Python and of the fields in saved models; a key that is left
-out has the default of the model. Priors and kernels are described as in saved models (`settings.priors`).
+A key is a parameter of the class that the table makes, or a field of saved models. A key that is left out of
+`[model]` has the default of the model.
 """
 
 from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    field_validator,
-)
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, field_validator
 
-from forcegp.constraints import Baumgarte, SurfaceSchema
+from forcegp.constraints import Baumgarte
+from forcegp.files import Record
 from forcegp.simulate.config import SimulationConfig
+from forcegp.storage.system import ConnectionFields, ContactFields, Point
 
 
-class Section(BaseModel):
-    """A table of a TOML file: unknown keys and numbers that are not finite are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+class Section(Record, strict=True):
+    """A table of a TOML file."""
 
     def given(self) -> dict[str, Any]:
         """The keys that are in the file, with their values."""
@@ -93,7 +79,7 @@ class ModelSection(Section):
     standardize: bool = True
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: str | tuple[dict[str, Any], ...] = ()
-    analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = {}
+    analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = Field(default_factory=dict)
     hidden: tuple[PositiveInt, ...] = ()
     window: WindowSection = WindowSection()
     seed: NonNegativeInt | None = None
@@ -119,37 +105,22 @@ class ModelFile(Section):
     model: ModelSection
 
 
-Vector = tuple[float, float, float]
-
-
 class RobotSection(Section):
     """`[robot]`: see `forcegp.load_robot`; a path is relative to the scene file."""
 
     model: str
-    base_position: Vector = (0.0, 0.0, 0.0)
-    base_rpy: Vector = (0.0, 0.0, 0.0)
-    gravity: Vector = (0.0, 0.0, -9.81)
+    base_position: Point = (0.0, 0.0, 0.0)
+    base_rpy: Point = (0.0, 0.0, 0.0)
+    gravity: Point = (0.0, 0.0, -9.81)
     locked_joints: dict[str, float] = Field(default_factory=dict)
 
 
-class ContactSection(Section):
+class ContactSection(ContactFields, strict=True):
     """`[[contact]]`: a point of the robot that may touch a surface, or a ball of some `radius` around it."""
 
-    name: str
-    frame: str
-    point: Vector = (0.0, 0.0, 0.0)
-    surface: SurfaceSchema
-    radius: float = 0.0
 
-
-class ConnectionSection(Section):
+class ConnectionSection(ConnectionFields, strict=True):
     """`[[connection]]`: two points that coincide; without `other_frame`, the second is fixed in the world."""
-
-    name: str
-    frame: str
-    point: Vector = (0.0, 0.0, 0.0)
-    other_frame: str | None = None
-    other_point: Vector = (0.0, 0.0, 0.0)
 
 
 class SceneSections(Section):

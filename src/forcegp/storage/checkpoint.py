@@ -36,12 +36,7 @@ def beside(checkpoint: str | Path) -> Path:
 
 @dataclass
 class Checkpoint:
-    """A safetensors file with the tensors from which a long fit goes on.
-
-    Args:
-        path: the file.
-        key: what is being learned (`key_of`); a file that was written for something else is refused.
-    """
+    """A safetensors file from which a long fit goes on; `key` (`key_of`) says what is learned."""
 
     path: Path
     key: str
@@ -56,15 +51,14 @@ class Checkpoint:
         return digest.hexdigest()[:16]
 
     def read(self, like: Mapping[str, Tensor], growing: Container[str] = ()) -> dict[str, Tensor]:
-        """The tensors in the file, none where there is not a file.
+        """The tensors in the file; none if there is no file.
 
         Args:
             like: tensors of the names, types and shapes that the file holds.
             growing: names of those whose length may differ.
 
         Raises:
-            ModelError: the file is damaged, is a folder, holds values that are not finite, or belongs to
-                another fit.
+            ModelError: the file is damaged, not finite, or belongs to another fit.
         """
         if not self.path.exists():
             return {}
@@ -104,15 +98,11 @@ class Checkpoint:
 
 @dataclass
 class Evaluations:
-    """Every evaluation of an objective: where, its value and its gradient, kept in a checkpoint.
+    """Every evaluation of an objective: position, value and gradient, kept in a checkpoint.
 
-    A resumed fit runs the optimiser again from the start and gives it the recorded values, which takes no
-    time, until they end. So it ends with the same bits as a fit that was not interrupted, after warm starts
-    and restarts too. Where the optimiser asks for another point than the recorded one (another machine or
-    release of a library), the rest of the record is dropped and evaluated anew.
-
-    Args:
-        checkpoint: where they are kept.
+    A resumed fit runs the optimiser again from the start on the recorded values, which takes no time, and so
+    ends with the same bits as a fit that was not interrupted. If the optimiser asks for another point (on
+    another machine or release of a library), the rest of the record is dropped and evaluated anew.
     """
 
     checkpoint: Checkpoint
@@ -120,17 +110,7 @@ class Evaluations:
     _next: int = field(default=0, init=False)
 
     def read(self, start: Mapping[str, Tensor]) -> int:
-        """Take up the evaluations in the file, if there is one.
-
-        Args:
-            start: initial tensors of what is learned.
-
-        Returns:
-            How many evaluations will not be repeated.
-
-        Raises:
-            ModelError: see `Checkpoint.read`; or a position is one that no fit reaches.
-        """
+        """Take up the evaluations in the file, if there is one; returns how many will not be repeated."""
         size = sum(value.numel() for value in start.values())
         rows = torch.zeros(0, size, dtype=torch.float64)
         record = self.checkpoint.read(dict(zip(NAMES, (rows, rows[:, 0], rows), strict=True)), NAMES)
@@ -232,11 +212,7 @@ def _bytes_of(value: object) -> bytes:
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], str | None]:
-    """The tensors of a checkpoint, and the key of what it was written for.
-
-    Raises:
-        ModelError: the file is damaged, too large, or is a folder.
-    """
+    """The tensors of a checkpoint, and the key of what it was written for."""
     if not path.is_file():
         raise ModelError(f"{path} is not a file", expected="the file of a checkpoint")
     try:

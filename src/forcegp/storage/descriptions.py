@@ -52,8 +52,7 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bo
         whole: whether every field must be there; otherwise fields that are left out have their defaults.
 
     Raises:
-        ModelError: a field is missing, unknown or has another type; names the place.
-        UnknownNameError: a class is not in the table.
+        ForceGPError: a field is missing, unknown or of another type, or a class is unknown; names the place.
     """
     if depth > MAX_DEPTH:
         raise ModelError(f"{place}: nested too deeply", expected=f"at most {MAX_DEPTH} levels")

@@ -19,13 +19,12 @@ from typing import Any, ClassVar, TypeVar
 import safetensors
 import safetensors.torch
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.destination import check_destination
 from forcegp.errors import ModelError
-from forcegp.files import Header, atomic_file
+from forcegp.files import Header, Record, atomic_file, validated
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
 from forcegp.resources import announce_memory
 from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
@@ -39,17 +38,11 @@ _POSITIVE = re.compile(r"(data\.\d+|training)\.noise_std|std\.[^.]+|scale\..+\.s
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
-    """Check the number, types and values of tensors that were read.
-
-    Only joint limits may be infinite, nothing may be NaN, and standard deviations are positive. Which
-    tensors a model has, and their shapes, its loader checks.
-
-    Args:
-        tensors: by name.
-        source: name of the file, for messages.
+    """Check the number, types and values of tensors that were read; their shapes the loader checks.
 
     Raises:
-        ModelError: a tensor is of another type, not finite, or not positive where it must be.
+        ModelError: a tensor is of another type, NaN, infinite but no joint limit, or a standard deviation
+            that is not positive.
     """
     if len(tensors) > TENSORS:
         raise ModelError(f"{source}: too many tensors", expected=f"at most {TENSORS}", got=len(tensors))
@@ -79,13 +72,7 @@ COPIES = 3
 
 
 class ModelHeader(Header):
-    """What a saved model says of itself.
-
-    Attributes:
-        kind: class of models, `Model.kind`.
-        settings: what the kind needs beside its tensors.
-        system: the system, as written by `pack_system`.
-    """
+    """Header of a saved model: `Model.kind`, its settings, and its system as `pack_system` wrote it."""
 
     FORMAT: ClassVar[str] = "forcegp-model"
     VERSION: ClassVar[int] = 3
@@ -95,10 +82,8 @@ class ModelHeader(Header):
     system: dict[str, Any]
 
 
-class Settings(BaseModel):
-    """Base of what a kind of models keeps in `ModelHeader.settings`: frozen, no unknown field."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+class Settings(Record):
+    """Base of what a kind of models keeps in `ModelHeader.settings`."""
 
 
 SettingsT = TypeVar("SettingsT", bound=Settings)
@@ -113,14 +98,7 @@ def model_path(path: str | Path) -> Path:
 def model_bytes(
     kind: str, system: ConstrainedSystem, settings: Settings, tensors: Mapping[str, Tensor]
 ) -> bytes:
-    """The content of the file of a model.
-
-    Args:
-        kind: `Model.kind`.
-        system: written beside the model.
-        settings: of the kind.
-        tensors: of the model, by names that do not begin with `system.`.
-    """
+    """The content of the file of a model; no tensor has a name that begins with `system.`."""
     record, robot = pack_system(system)
     copies = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
     header = ModelHeader(kind=kind, settings=settings.model_dump(mode="json"), system=record)
@@ -157,7 +135,15 @@ def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
         if Path(path).is_dir():
             hint = "models were folders before version 3: fit the model again with this release"
         raise ModelError(f"{file} is not a saved model", expected="a file that Fit.save wrote", hint=hint)
-    return parse_model(_content(file, MODEL_BYTES), str(file))
+    try:
+        size = file.stat().st_size
+        if size > MODEL_BYTES:
+            raise ModelError(f"{file}: too large", expected=f"at most {MODEL_BYTES:,} bytes", got=f"{size:,}")
+        announce_memory(COPIES * size, f"reading {file}")
+        data = file.read_bytes()
+    except OSError as cause:
+        raise ModelError(f"{file}: cannot be read", got=cause.strerror or str(cause)) from cause
+    return parse_model(data, str(file))
 
 
 def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor]]:
@@ -218,28 +204,8 @@ def _entry(digest: str) -> bytes:
     return f'"{HEADER}":"{digest}'.encode()
 
 
-def _content(file: Path, most: int) -> bytes:
-    """The bytes of a file of bounded size."""
-    try:
-        size = file.stat().st_size
-        if size > most:
-            raise ModelError(f"{file}: too large", expected=f"at most {most:,} bytes", got=f"{size:,}")
-        announce_memory(COPIES * size, f"reading {file}")
-        return file.read_bytes()
-    except OSError as cause:
-        raise ModelError(f"{file}: cannot be read", got=cause.strerror or str(cause)) from cause
-
-
 def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:
-    """Check, before a long fit, that `write_model` will be able to write a model.
-
-    Args:
-        path: the file.
-        needed_bytes: room that the model takes, where it is known [bytes].
-
-    Raises:
-        DestinationError: the place cannot be written.
-    """
+    """Check, before a long fit, that `write_model` will be able to write a model."""
     check_destination(model_path(path), needed_bytes=needed_bytes)
 
 
@@ -254,11 +220,4 @@ def settings_of(header: ModelHeader, kind: type[SettingsT], source: str) -> Sett
     Raises:
         ModelError: a field is missing, unknown or not valid; names file and field.
     """
-    try:
-        return kind.model_validate(header.settings)
-    except ValidationError as cause:
-        first = cause.errors()[0]
-        place = ".".join(str(part) for part in ("settings", *first["loc"]))
-        raise ModelError(
-            f"{source}: field {place!r} is not valid", expected=first["msg"], got=first["input"]
-        ) from cause
+    return validated(kind, header.settings, source, ModelError, ("settings",))

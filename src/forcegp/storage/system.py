@@ -3,18 +3,16 @@
 The robot is saved as the tensors of `RobotModel`, bit for bit. Constraints that the user defines in Python
 (an `ImplicitSurface`, a subclass of `Constraint`) cannot be saved: the file has a placeholder, and reading
 takes them from a system that the caller passes.
-
-Robot, constraints and stabilization as records of a JSON file; surfaces are described as in scenes.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, get_args
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, Field
 from torch import Tensor
 
 from forcegp.constraints import (
@@ -26,18 +24,21 @@ from forcegp.constraints import (
     SurfaceSchema,
 )
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.files import Record, validated
 from forcegp.robot.model import RobotModel
 
-Point = tuple[float, float, float]
-POINTS = ("point", "other_point")
 SURFACES = get_args(get_args(SurfaceSchema)[0])
 """The surfaces that can be saved."""
 
 
-class Record(BaseModel):
-    """Base of all records: frozen; unknown fields and numbers that are not finite are errors."""
+def _floats(value: object) -> object:
+    """Elements of arrays and tensors as numbers."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        return value
+    return tuple(x.item() if hasattr(x, "item") else x for x in value)
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+Point = Annotated[tuple[float, float, float], BeforeValidator(_floats)]
 
 
 class RobotRecord(Record):
@@ -52,13 +53,12 @@ class RobotRecord(Record):
     remarks: tuple[str, ...]
 
 
-class SurfaceContactRecord(Record):
-    """A point of the robot on a surface."""
+class ContactFields(Record):
+    """A point of the robot that may touch a surface, or a ball of some `radius` around it."""
 
-    type: Literal["surface_contact"] = "surface_contact"
     name: str
     frame: str
-    point: Point
+    point: Point = (0.0, 0.0, 0.0)
     surface: SurfaceSchema
     radius: float = 0.0
 
@@ -67,19 +67,30 @@ class SurfaceContactRecord(Record):
         return SurfaceContact(self.name, self.frame, self.point, self.surface, radius=self.radius)
 
 
-class PointConnectionRecord(Record):
-    """A point of the robot tied to another point."""
+class ConnectionFields(Record):
+    """Two points that coincide; without `other_frame`, the second is fixed in the world."""
 
-    type: Literal["point_connection"] = "point_connection"
     name: str
     frame: str
-    point: Point
-    other_frame: str | None
-    other_point: Point
+    point: Point = (0.0, 0.0, 0.0)
+    other_frame: str | None = None
+    other_point: Point = (0.0, 0.0, 0.0)
 
     def build(self) -> Constraint:
         """The constraint."""
         return PointConnection(self.name, self.frame, self.point, self.other_frame, self.other_point)
+
+
+class SurfaceContactRecord(ContactFields):
+    """A `SurfaceContact`."""
+
+    type: Literal["surface_contact"] = "surface_contact"
+
+
+class PointConnectionRecord(ConnectionFields):
+    """A `PointConnection`."""
+
+    type: Literal["point_connection"] = "point_connection"
 
 
 class UnsavedRecord(Record):
@@ -90,40 +101,25 @@ class UnsavedRecord(Record):
     described_by: str
 
 
-class BaumgarteRecord(Record):
-    """Constraint stabilization."""
-
-    natural_frequency: float
-    damping_ratio: float
+ConstraintRecord = SurfaceContactRecord | PointConnectionRecord | UnsavedRecord
 
 
 class SystemRecord(Record):
     """A `ConstrainedSystem` without the tensors of its robot."""
 
     robot: RobotRecord
-    contacts: tuple[
-        Annotated[SurfaceContactRecord | PointConnectionRecord | UnsavedRecord, Field(discriminator="type")],
-        ...,
-    ]
-    baumgarte: BaumgarteRecord | None
+    contacts: tuple[Annotated[ConstraintRecord, Field(discriminator="type")], ...]
+    baumgarte: Baumgarte | None
 
 
-def fields_of(value: Any, record: type[Record]) -> dict[str, Any]:
-    """The attributes of a value that a record keeps."""
-    names = [name for name in record.model_fields if name not in ("type", "surface")]
-    kept = {name: getattr(value, name) for name in names}
-    return kept | {name: tuple(map(float, kept[name])) for name in POINTS if name in kept}
-
-
-def contact_record(contact: Constraint) -> SurfaceContactRecord | PointConnectionRecord | UnsavedRecord:
-    """The record of a contact, or a placeholder if it is defined in Python code."""
+def _record(contact: Constraint) -> ConstraintRecord:
+    """The record of a constraint, or a placeholder if it is defined in Python code."""
     if type(contact) is PointConnection:
-        return PointConnectionRecord(**fields_of(contact, PointConnectionRecord))
-    if type(contact) is not SurfaceContact:
-        return UnsavedRecord(name=contact.name, described_by=type(contact).__name__)
-    if type(contact.surface) not in SURFACES:
-        return UnsavedRecord(name=contact.name, described_by=type(contact.surface).__name__)
-    return SurfaceContactRecord(**fields_of(contact, SurfaceContactRecord), surface=contact.surface)  # pyright: ignore[reportArgumentType]
+        return PointConnectionRecord.model_validate(contact)
+    described = contact.surface if type(contact) is SurfaceContact else contact
+    if type(described) not in SURFACES:
+        return UnsavedRecord(name=contact.name, described_by=type(described).__name__)
+    return SurfaceContactRecord.model_validate(contact)
 
 
 PREFIX = "system."
@@ -145,24 +141,15 @@ MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
 def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """A system as a JSON object and named tensors (`system.<field>` of the robot).
-
-    Args:
-        system: robot and constraints.
-
-    Returns:
-        The JSON object, and detached copies of the tensors on the CPU.
-    """
-    robot, rule = system.robot, system.baumgarte
+    """A system as a JSON object, and copies of the tensors of its robot on the CPU (`system.<field>`)."""
     record = SystemRecord(
-        robot=RobotRecord(**fields_of(robot, RobotRecord)),
-        contacts=tuple(contact_record(contact) for contact in system.contacts),
-        baumgarte=None if rule is None else BaumgarteRecord(**fields_of(rule, BaumgarteRecord)),
+        robot=RobotRecord.model_validate(system.robot),
+        contacts=tuple(map(_record, system.contacts)),
+        baumgarte=system.baumgarte,
     )
     tensors = {
-        PREFIX + field.name: value.detach().to("cpu", copy=True).contiguous()
-        for field in dataclasses.fields(robot)
-        if isinstance(value := getattr(robot, field.name), Tensor)
+        PREFIX + name: getattr(system.robot, name).detach().to("cpu", copy=True).contiguous()
+        for name in robot_tensors(system.robot)
     }
     return record.model_dump(mode="json"), tensors
 
@@ -173,44 +160,26 @@ def unpack_system(
     source: str,
     fallback: ConstrainedSystem | None = None,
 ) -> ConstrainedSystem:
-    """The system that `pack_system` wrote.
+    """The system that `pack_system` wrote, from its JSON object and the tensors named `system.<field>`.
 
     Args:
-        json: the JSON object.
-        tensors: at least the tensors named `system.<field>`.
+        json, tensors: what was read.
         source: name of the file, for messages.
         fallback: system that provides the constraints that cannot be saved.
 
     Raises:
         ModelError: a field or tensor is missing or not valid, or a constraint that was not saved is needed.
     """
-    try:
-        record = SystemRecord.model_validate(dict(json))
-    except ValidationError as cause:
-        first = cause.errors()[0]
-        place = ".".join(str(part) for part in ("system", *first["loc"]))
-        if isinstance(reason := first.get("ctx", {}).get("error"), ForceGPError):
-            raise ModelError.at(f"{source}: field {place!r}", reason) from cause
-        raise ModelError(
-            f"{source}: field {place!r} is not valid", expected=first["msg"], got=first["input"]
-        ) from cause
+    record = validated(SystemRecord, dict(json), source, ModelError, ("system",))
     robot = _robot(record.robot, tensors, source)
-    rule = record.baumgarte
     try:
-        return ConstrainedSystem(
-            robot,
-            tuple(_contact(contact, source, fallback) for contact in record.contacts),
-            None if rule is None else Baumgarte(rule.natural_frequency, rule.damping_ratio),
-        )
+        contacts = tuple(_constraint(contact, fallback) for contact in record.contacts)
+        return ConstrainedSystem(robot, contacts, record.baumgarte)
     except ForceGPError as cause:
         raise ModelError.at(f"{source}: field 'system'", cause) from cause
 
 
-def _contact(
-    record: SurfaceContactRecord | PointConnectionRecord | UnsavedRecord,
-    source: str,
-    fallback: ConstrainedSystem | None,
-) -> Constraint:
+def _constraint(record: ConstraintRecord, fallback: ConstrainedSystem | None) -> Constraint:
     if not isinstance(record, UnsavedRecord):
         return record.build()
     if fallback is None:
@@ -231,7 +200,12 @@ def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> R
                 expected=length,
                 got=len(getattr(record, name)),
             )
-    _check_parents(record, source)
+    # Parents come before their children, and frames belong to joints that exist.
+    limits = {"parents": range(sizes["nq"]), "frame_parents": [sizes["nq"]] * sizes["nf"]}
+    for name, limit in limits.items():
+        for i, (parent, below) in enumerate(zip(getattr(record, name), limit, strict=True)):
+            if not -1 <= parent < below:
+                raise ModelError(f"{source}: field 'system.robot.{name}.{i}' names no joint", got=parent)
     axis = tensors.get(PREFIX + "axis")
     dtype = axis.dtype if axis is not None and axis.is_floating_point() else torch.float64
     arrays = {}
@@ -243,17 +217,6 @@ def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> R
     return RobotModel(**{name: getattr(record, name) for name in type(record).model_fields}, **arrays)
 
 
-def _check_parents(record: RobotRecord, source: str) -> None:
-    """Parents come before their children, and frames belong to joints that exist."""
-    for name, parents, limit in (
-        ("parents", record.parents, None),
-        ("frame_parents", record.frame_parents, len(record.parents)),
-    ):
-        for i, parent in enumerate(parents):
-            if not -1 <= parent < (i if limit is None else limit):
-                raise ModelError(f"{source}: field 'system.robot.{name}.{i}' names no joint", got=parent)
-
-
 def take(
     tensors: Mapping[str, Tensor],
     name: str,
@@ -263,18 +226,10 @@ def take(
     *,
     finite: bool = True,
 ) -> Tensor:
-    """A named tensor of a saved model, checked.
-
-    Args:
-        tensors: what the file holds.
-        name: the tensor's name.
-        shape: what its shape must be, or `None` for any.
-        dtype: what its type must be.
-        source: name of the file, for messages.
-        finite: whether its values must be finite.
+    """A named tensor of a saved model, checked; a shape of `None` is any.
 
     Raises:
-        ModelError: it is missing, of another shape or type, or not finite.
+        ModelError: it is missing, of another shape or type, or not finite where it must be.
     """
     if name not in tensors:
         raise ModelError(f"{source}: tensor {name!r} is missing")
@@ -297,20 +252,10 @@ def robot_tensors(robot: RobotModel) -> list[str]:
 
 
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
-    """A robot with tensors named `<prefix><field>`, and everything else as in another one.
-
-    Raises:
-        ModelError: a tensor is missing, of another shape or type, or not finite.
-    """
-    fields = {
-        name: take(
-            tensors,
-            prefix + name,
-            tuple(getattr(like, name).shape),
-            getattr(like, name).dtype,
-            source,
-            finite=name not in MAY_BE_INFINITE,
-        )
-        for name in robot_tensors(like)
-    }
+    """A robot with tensors named `<prefix><field>`, checked by `take`, and all else as in another one."""
+    fields = {}
+    for name in robot_tensors(like):
+        value, finite = getattr(like, name), name not in MAY_BE_INFINITE
+        shape = tuple(value.shape)
+        fields[name] = take(tensors, prefix + name, shape, value.dtype, source, finite=finite)
     return like.replace(**fields)

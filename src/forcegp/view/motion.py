@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,25 +15,21 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.models.base import Predictor
+from forcegp.plots import as_array
+from forcegp.report.animation import FRAMES_PER_SECOND
 from forcegp.rollout import Rollout, RolloutOptions
 from forcegp.rollout.comparison import tip_of
 from forcegp.rollout.inputs import sampling_period
 
 Array = NDArray[np.float64]
-RATE = 20.0
-"""Pictures per second."""
 LOGGED, MEAN, SAMPLE = "logged", "predicted", "sampled"
 
 
 @dataclass(frozen=True)
 class Force:
-    """The normal force of a contact with a surface, in each picture.
+    """The normal force of a contact in each picture, where it acts `(k, 3)` and the normal there [m].
 
-    Attributes:
-        contact: its name.
-        point, normal: `(k, 3)` where it acts, and the normal there [m].
-        value: `(k,)` [N]; NaN where the contact is open.
-        std: `(k,)` standard deviation [N]; 0 where it is not known.
+    `value` `(k,)` [N] is NaN where the contact is open; `std` is 0 where it is not known.
     """
 
     contact: str
@@ -45,12 +41,7 @@ class Force:
 
 @dataclass(frozen=True)
 class Path3D:
-    """The path of the tip.
-
-    Attributes:
-        kind: `logged`, `predicted` or `sampled`.
-        points: `(n, 3)` [m].
-    """
+    """The path of the tip, `(n, 3)` [m]; its kind is `logged`, `predicted` or `sampled`."""
 
     kind: str
     points: Array
@@ -58,15 +49,7 @@ class Path3D:
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion to look at.
-
-    Attributes:
-        system: robot and contacts.
-        t: `(k,)` time of each picture [s].
-        q: `(k, nq)` joint positions.
-        forces: of the contacts with a surface.
-        paths: of the tip.
-    """
+    """A motion: joint positions `(k, nq)` at times `(k,)` [s], forces of contacts, paths of the tip."""
 
     system: ConstrainedSystem
     t: Array
@@ -83,12 +66,7 @@ def at_rest(system: ConstrainedSystem) -> Motion:
 
 
 def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = None) -> Motion:
-    """The logged motion of one trajectory, with the contact force.
-
-    Args:
-        system: robot and contacts.
-        data: rows of one trajectory in the order of time.
-        model: predicts the force with its uncertainty; without one it is the logged multiplier, if any.
+    """The logged motion of one trajectory, with the force of a model or else the logged multiplier.
 
     Raises:
         DataError: no rows, or they do not fit the robot.
@@ -98,13 +76,8 @@ def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = N
         raise DataError("there is no motion to look at", expected="one row or more", got="none")
     rows = pictures(data.t)
     frames = data[rows]
-    return Motion(
-        system,
-        _array(frames.t - data.t[0]),
-        frames.q,
-        _forces(system, frames, model),
-        [Path3D(LOGGED, tip_path(system, data.q))],
-    )
+    path = Path3D(LOGGED, tip_path(system, data.q))
+    return Motion(system, as_array(frames.t - data.t[0]), frames.q, _forces(system, frames, model), [path])
 
 
 def with_rollout(motion: Motion, path: Rollout) -> Motion:
@@ -113,20 +86,11 @@ def with_rollout(motion: Motion, path: Rollout) -> Motion:
     if path.samples is not None:
         sampled = path.samples.q.reshape(-1, *path.samples.q.shape[-2:])
         paths += [Path3D(SAMPLE, tip_path(motion.system, q)) for q in sampled]
-    return Motion(motion.system, motion.t, motion.q, motion.forces, [*motion.paths, *paths])
+    return replace(motion, paths=[*motion.paths, *paths])
 
 
 def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float, seed: int = 0) -> Rollout:
-    """A model rolled out from the first state of a log under the logged torques.
-
-    Args:
-        model: a fitted model.
-        data: one trajectory.
-        samples: function samples; 0 for a model that has none.
-        seconds: how far ahead, at most to the end of the log.
-        seed: of the samples.
-    """
-    dt = sampling_period(data)
+    """A model rolled out under the logged torques from the first state of a trajectory."""
     return model.rollout(
         data.q[0],
         data.qd[0],
@@ -135,7 +99,7 @@ def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: floa
         samples=samples if model.has_function_samples else 0,
         seed=seed,
         active=data.active(model.system.contact_names)[0],
-        options=RolloutOptions(dt, on_divergence="keep"),
+        options=RolloutOptions(sampling_period(data), on_divergence="keep"),
     )
 
 
@@ -143,12 +107,13 @@ def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:
     """Positions of the tip `(n, 3)`, up to where a trajectory diverged [m]."""
     sound = int(torch.isfinite(q).all(-1).long().cumprod(0).sum())
     frame, point = tip_of(system)
-    return _array(kinematics.point_position(system.robot, q[:sound], frame, tuple(point)))
+    return as_array(kinematics.point_position(system.robot, q[:sound], frame, tuple(point)))
 
 
 def pictures(t: Tensor) -> Tensor:
     """The rows that are shown: the last one before each picture's time."""
-    times = torch.arange(float(t[0]), float(t[-1]) + 0.5 / RATE, 1.0 / RATE, dtype=t.dtype)
+    period = 1.0 / FRAMES_PER_SECOND
+    times = torch.arange(float(t[0]), float(t[-1]) + 0.5 * period, period, dtype=t.dtype)
     return torch.unique((torch.searchsorted(t.contiguous(), times, right=True) - 1).clamp(0, len(t) - 1))
 
 
@@ -171,10 +136,6 @@ def _forces(system: ConstrainedSystem, data: Dataset, model: Predictor | None) -
             spread = torch.zeros_like(multiplier) if std is None else std[:, row]
             shown = torch.where(active[:, i], multiplier, torch.nan)
             parts = (point.position, point.normal, shown, spread)
-            forces.append(Force(contact.name, *(_array(x) for x in parts)))
+            forces.append(Force(contact.name, *(as_array(x) for x in parts)))
         row += contact.rows
     return forces
-
-
-def _array(values: Tensor) -> Array:
-    return values.detach().to("cpu", torch.float64).numpy()

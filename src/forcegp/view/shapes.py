@@ -1,4 +1,4 @@
-"""What a robot looks like: the shapes of its URDF file, or else rods between its joints."""
+"""What a robot looks like: the shapes of its URDF file, or else rods between its joints, as convex solids."""
 
 from __future__ import annotations
 
@@ -9,49 +9,66 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from forcegp.robot import RobotModel
 from forcegp.robot.load import BUNDLED
-from forcegp.robot.model import BASE
 from forcegp.robot.safety import parse_numbers, parse_xml, read_bytes
 
 Array = NDArray[np.float64]
 MESHES = (".stl", ".obj", ".ply", ".glb")
 """Formats of meshes that are read; parts in another format are left out."""
 MESH_BYTES = 1 << 25
+MESH_CORNERS = 200
+"""Corners of the convex hull of a mesh that are kept at most."""
 LEAST = 1e-3
 """Rods shorter than this are left out [m]."""
-SIZES = {"box": ("size", 3), "cylinder": ("radius", 1), "sphere": ("radius", 1)}
+SIZES = {"box": {"size": 3}, "cylinder": {"radius": 1, "length": 1}, "sphere": {"radius": 1}}
+"""Attributes of the shapes of a URDF file, with the count of their numbers."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A rigid part of a link.
-
-    Attributes:
-        link: index of the joint that moves it, −1 for the base.
-        kind: `box`, `cylinder` (along its z axis), `sphere` or `mesh`.
-        size: sides of a box, radius and length of a cylinder, radius of a sphere, or scale of a mesh [m].
-        rotation, position: `(3, 3)`, `(3,)` pose in the link frame [m].
-        mesh: file of a mesh.
-    """
+    """A convex part of the link that joint `link` moves (−1: base): corners `(k, 3)` in its frame [m]."""
 
     link: int
-    kind: str
-    size: tuple[float, ...]
-    rotation: Array
-    position: Array
-    mesh: Path | None = None
+    points: Array
+
+
+def box(x: float, y: float, z: float) -> Array:
+    """Corners of a box about the origin, `(8, 3)`, from its sides [m]."""
+    signs = np.stack(np.meshgrid(*3 * [[-0.5, 0.5]], indexing="ij"), axis=-1)
+    return signs.reshape(-1, 3) * [x, y, z]
+
+
+def cylinder(radius: float, length: float, corners: int = 24) -> Array:
+    """Corners of a cylinder along z about the origin, `(2 corners, 3)` [m]."""
+    angle = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=-1)
+    half = np.array([0.0, 0.0, 0.5 * length])
+    return np.concatenate([ring - half, ring + half])
+
+
+def sphere(radius: float) -> Array:
+    """Corners of a sphere about the origin, `(k, 3)` [m]."""
+    angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 13)
+    return np.concatenate([cylinder(radius * np.cos(a), 2.0 * radius * np.sin(a), 24)[:24] for a in angles])
+
+
+def turn_z(direction: Array) -> Array:
+    """A rotation that turns the z axis to a unit direction, `(3, 3)`."""
+    axis = np.cross([0.0, 0.0, 1.0], direction)
+    sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
+    if sine < 1e-12:
+        return np.diag([1.0, np.sign(cosine), np.sign(cosine)])
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
 
 
 def shapes_of(robot: RobotModel, source: str | Path | None = None) -> list[Shape]:
-    """The parts of a robot.
+    """The parts of a robot, from its file or a bundled one; without a URDF file, rods between its joints.
 
-    Args:
-        robot: the robot.
-        source: its file, or the name of a bundled robot; by default a bundled robot of the same name and
-            frames is recognised. Without a URDF file the robot is made of rods between its joints.
+    By default a bundled robot of the same name and frames is recognised.
 
     Raises:
         RobotFileError: the shapes of the file are not valid.
@@ -69,7 +86,7 @@ def shapes_of(robot: RobotModel, source: str | Path | None = None) -> list[Shape
 
 
 def rods(robot: RobotModel) -> list[Shape]:
-    """A rod to each joint and to the last frame of each link, and a ball at each joint."""
+    """A rod to each joint and to the last frame of each link."""
     place, at = robot.placement_position.detach().cpu().numpy(), robot.frame_position.detach().cpu().numpy()
     ends = list(zip(robot.parents, place, strict=True))
     for link in range(robot.nq):
@@ -77,21 +94,11 @@ def rods(robot: RobotModel) -> list[Shape]:
         if link not in robot.parents and frames:
             ends.append((link, max(frames, key=lambda x: float(np.linalg.norm(x)))))
     radius = 0.02 * sum(float(np.linalg.norm(end)) for _, end in ends)
-    parts = [Shape(i, "sphere", (1.4 * radius,), np.eye(3), np.zeros(3)) for i in range(robot.nq)]
-    for link, end in ends:
-        length = float(np.linalg.norm(end))
-        if length > LEAST:
-            parts.append(Shape(link, "cylinder", (radius, length), turn_z(end / length), 0.5 * end))
-    return parts
-
-
-def turn_z(direction: Array) -> Array:
-    """A rotation that turns the z axis to a unit direction, `(3, 3)`."""
-    axis = np.cross([0.0, 0.0, 1.0], direction)
-    sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
-    if sine < 1e-12:
-        return np.diag([1.0, np.sign(cosine), np.sign(cosine)])
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
+    return [
+        Shape(link, cylinder(radius, length) @ turn_z(end / length).T + 0.5 * end)
+        for link, end in ends
+        if (length := float(np.linalg.norm(end))) > LEAST
+    ]
 
 
 def _visuals(root: Element, path: Path, robot: RobotModel) -> list[Shape]:
@@ -105,48 +112,50 @@ def _visuals(root: Element, path: Path, robot: RobotModel) -> list[Shape]:
         R = robot.frame_rotation[index].detach().cpu().numpy()
         p = robot.frame_position[index].detach().cpu().numpy()
         for visual in link.findall("visual"):
-            shape = _shape(visual, f"{path}: link {name!r}", path.parent)
-            if shape is not None:
-                parts.append(
-                    Shape(
-                        robot.frame_parents[index],
-                        shape.kind,
-                        shape.size,
-                        R @ shape.rotation,
-                        p + R @ shape.position,
-                        shape.mesh,
-                    )
-                )
+            points = _corners(visual, f"{path}: link {name!r}", path.parent)
+            if points is not None:
+                parts.append(Shape(robot.frame_parents[index], points @ R.T + p))
     return parts
 
 
-def _shape(visual: Element, where: str, folder: Path) -> Shape | None:
-    """One visual element, in the frame of its link; `None` for what cannot be shown."""
+def _corners(visual: Element, where: str, folder: Path) -> Array | None:
+    """Corners of one visual element, in the frame of its link; `None` for what cannot be shown."""
     origin, geometry = visual.find("origin"), visual.find("geometry")
     if geometry is None or not len(geometry):
         return None
     place = {} if origin is None else origin.attrib
     position = np.array(parse_numbers(place.get("xyz", "0 0 0"), f"{where}: origin xyz", 3))
     rpy = parse_numbers(place.get("rpy", "0 0 0"), f"{where}: origin rpy", 3)
-    rotation, body = Rotation.from_euler("xyz", rpy).as_matrix(), geometry[0]
+    body = geometry[0]
     if body.tag == "mesh":
-        mesh = _mesh_file(body.get("filename", ""), folder)
+        file = _mesh_file(body.get("filename", ""), folder)
         scale = parse_numbers(body.get("scale", "1 1 1"), f"{where}: mesh scale", 3)
-        return None if mesh is None else Shape(BASE, "mesh", tuple(scale), rotation, position, mesh)
-    if body.tag not in SIZES:
-        return None
-    attribute, count = SIZES[body.tag]
-    size = parse_numbers(body.get(attribute, ""), f"{where}: {body.tag} {attribute}", count)
-    if body.tag == "cylinder":
-        size += parse_numbers(body.get("length", ""), f"{where}: cylinder length", 1)
-    return Shape(BASE, body.tag, tuple(size), rotation, position)
+        points = None if file is None else _hull(file) * scale
+    else:
+        sizes = [
+            number
+            for name, count in SIZES.get(body.tag, {}).items()
+            for number in parse_numbers(body.get(name, ""), f"{where}: {body.tag} {name}", count)
+        ]
+        makers = {"box": box, "cylinder": cylinder, "sphere": sphere}
+        points = makers[body.tag](*sizes) if sizes else None
+    return None if points is None else points @ Rotation.from_euler("xyz", rpy).as_matrix().T + position
+
+
+def _hull(file: Path) -> Array:
+    """Corners of the convex hull of a mesh, thinned to `MESH_CORNERS`."""
+    import trimesh
+
+    points = np.asarray(trimesh.load(str(file), force="mesh").vertices, dtype=np.float64)  # pyright: ignore
+    try:
+        corners = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):  # flat, or fewer than four points
+        corners = points
+    return corners[:: -(-len(corners) // MESH_CORNERS) or 1]
 
 
 def _mesh_file(name: str, folder: Path) -> Path | None:
-    """A mesh that a robot file names, below its folder or the package that it names; `None` if none is found.
-
-    A name never leads out of these folders.
-    """
+    """A mesh that a robot file names, never outside of its folder or the package; `None` if none is found."""
     package, _, rest = name.removeprefix("package://").partition("/")
     if name.startswith("package://"):
         roots = [parent / package for parent in (folder, *folder.resolve().parents)] + [folder]

@@ -1,0 +1,42 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+SCENES = sorted(
+    entry.name.removesuffix(".toml") for entry in (files("forcegp") / "scene" / "bundled").iterdir()
+)
+"""Names of the bundled scenes, read without loading the library."""
+_SCENE = typer.Option("--scene", "-s", help=f"Scene file, or the name of a bundled one: {', '.join(SCENES)}.")
+SceneName = Annotated[str, _SCENE]
+SceneOrNone = Annotated[str | None, _SCENE]
+RobotName = Annotated[
+    str | None,
+    typer.Option(
+        "--robot", help="In place of a scene without contacts: URDF or MJCF file, or a bundled robot."
+    ),
+]
+ModelFile = Annotated[Path, typer.Option("--model", "-m", help="File of a fitted model.")]
+DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
+Config = Annotated[
+    Path | None,
+    typer.Option(help="TOML file with a table \\[model], in place of the scene's: priors, learning."),
+]
+DataFiles = Annotated[
+    list[Path],
+    typer.Option("--data", "-d", help="Data set, .parquet or .csv; may be given several times."),
+]
+Differentiate = Annotated[
+    int | None,
+    typer.Option(
+        metavar="WINDOW",
+        help="Compute velocities and accelerations that the log lacks by a Savitzky-Golay filter over an odd "
+        "number of samples.",
+    ),
+]

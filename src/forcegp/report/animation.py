@@ -1,0 +1,70 @@
+"""The arm in motion: an animation in a page, drawn by the page's own script."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+
+import torch
+from markupsafe import Markup
+from torch import Tensor
+
+from forcegp import kinematics
+from forcegp.robot.model import BASE, RobotModel
+
+FRAMES_PER_SECOND = 20
+"""Frame rate of an animation."""
+
+
+def animation(content: Mapping[str, object], label: str) -> Markup:
+    """A canvas with a slider, a play button and a checkbox for each arm.
+
+    Args:
+        content: what `templates/animation.js` draws: `times` of the frames [s]; `bodies`, points of an arm;
+            `films`, arms with `label`, `colour`, `dash` and flat `points` (frames, bodies, 3) [m].
+            Optional: convex `solids` with `colour`, `opacity`, flat `points` [m] and `link`, the column of
+            `poses` (frames, links, 12) that moves them; `paths` with `colour`, `width` and `points`;
+            `forces` with `start`, `tip` and `bar` in each frame; `texts` of each frame.
+        label: of the canvas, for readers who cannot see it.
+    """
+    # "</" would end the script element, even inside a string.
+    text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
+    return Markup(
+        '<figure class="animation"><canvas width="920" height="560" role="img" '
+        f'aria-label="{label}"></canvas>'
+        '<p><button type="button">Play</button> <input type="range" min="0" value="0" step="1" '
+        'aria-label="time"> <output></output></p><p class="films"></p>'
+        f'<script type="application/json">{text}</script><script>{_script()}</script></figure>'
+    )
+
+
+def animation_source() -> str:
+    """Hash of the animation's script for a content security policy."""
+    digest = hashlib.sha256(_script().encode()).digest()
+    return "sha256-" + base64.b64encode(digest).decode()
+
+
+def _script() -> str:
+    return (files("forcegp.report") / "templates" / "animation.js").read_text(encoding="utf-8")
+
+
+def arm_points(robot: RobotModel, q: Tensor, frame: str, point: Sequence[float]) -> Tensor:
+    """Base, link origins on the way to the tip, and the tip: `(frames, points, 3)` in the world [m]."""
+    poses = kinematics.link_poses(robot, q)
+    joint = robot.frame_parents[robot.frame_index(frame)]
+    chain: list[int] = []
+    while joint != BASE:
+        chain.insert(0, joint)
+        joint = robot.parents[joint]
+    origins = poses.position[:, chain] + robot.base_position
+    base = robot.base_position.expand(len(q), 1, 3)
+    tip = kinematics.point_position(robot, q, frame, tuple(point))[:, None]
+    return torch.cat([base, origins, tip], dim=1)
+
+
+def rounded(points: Tensor) -> list[float]:
+    """Points as flat coordinates, to 10 µm [m]."""
+    return [round(x, 5) for x in points.detach().flatten().tolist()]
