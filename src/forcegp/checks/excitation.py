@@ -239,7 +239,7 @@ def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[F
 
 def _rate(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """`(n, nq)` rate of change of the torque that the motion needs; the measured one has more noise."""
-    ahead, behind = (residual(system, log, rows + k).r + log.tau[rows + k] for k in (SPAN, -SPAN))
+    ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
     return (ahead - behind) / (2.0 * SPAN * log.dt)
 
 

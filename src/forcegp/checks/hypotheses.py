@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from forcegp import dynamics, kinematics
+from forcegp.checks.contact import tip_path
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import (
     TorqueFit,
@@ -71,10 +72,10 @@ def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
     """The torques of some rows, to be explained by joint friction and an offset per joint."""
-    remainder, nuisance = residual(system, log, rows), friction_columns(system, log, rows)
+    nuisance = friction_columns(system, log, rows)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
-    return TorqueProblem(remainder.r, remainder.J, nuisance, size, size if scale is None else scale)
+    return TorqueProblem(*residual(system, log, rows), nuisance, size, size if scale is None else scale)
 
 
 def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
@@ -102,21 +103,12 @@ def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarr
 
 def _sliding_columns(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> Array:
     """Torque −Jᵀv and −Jᵀv/|v| of a point that slides at v where the contact is closed, `(n, nq, 2)`."""
-    q, qd = tensors(log, rows, "q", "qd")
+    (q,), v = tensors(log, rows, "q"), tip_path(system, contact, log, rows).along
     with torch.no_grad():
-        p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
-        normal = contact.surface.gradient(p).numpy()
         J = kinematics.point_jacobian(system.robot, q, contact.frame, contact.point).numpy()
-    v = np.einsum("nkj,nj->nk", J, qd.numpy())
-    v = v - (v * normal).sum(axis=1, keepdims=True) * normal
     speed = np.sqrt((v**2).sum(axis=1, keepdims=True) + SLOW**2)
     closed = log.contact[contact.name][rows][:, None]
     return np.stack([np.einsum("nkj,nk->nj", J, closed * f) for f in (v, v / speed)], axis=-1)
-
-
-def with_log(problem: TorqueProblem, system: ConstrainedSystem, log: Log, rows: np.ndarray) -> TorqueProblem:
-    """The same problem on a log that a hypothesis has changed."""
-    return problem_of(system, log, rows, problem.scale)
 
 
 def _diagonal(x: Array) -> Array:
@@ -309,11 +301,7 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
 
 
 def finding_of(
-    system: ConstrainedSystem,
-    log: Log,
-    hypothesis: Hypothesis,
-    fit: TorqueFit,
-    alike: tuple[int, ...] = (),
+    system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit, alike: tuple[int, ...] = ()
 ) -> Finding:
     """The finding that a hypothesis stands for; `alike` are the joints of those that explain the same."""
     names = tuple(log.joint_names[j] for j in hypothesis.joints)

@@ -273,10 +273,10 @@ def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
     """`(nq,)` viscous friction that the robot file lacks, 0 where the torques do not show it [N m s/rad]."""
     rows = log.rows(FRICTION_ROWS)
     damping = np.zeros(log.nq)
-    remainder = residual(system, log, rows)
+    torque, J = residual(system, log, rows)
     for j in range(log.nq):
-        free = np.linalg.norm(remainder.J[:, :, j], axis=1) < LEVER
-        qd, r = log.qd[rows, j][free], remainder.r[free, j]
+        free = np.linalg.norm(J[:, :, j], axis=1) < LEVER
+        qd, r = log.qd[rows, j][free], torque[free, j]
         if len(r) < 20:
             continue
         X = -np.stack([qd, np.sign(qd), np.ones_like(qd)], axis=1)

@@ -278,10 +278,9 @@ def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np
     log, scale = explanation.log, explanation.problem.scale
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
-        remainder = residual(system, log, index)
+        r, J = residual(system, log, index)
         columns = [robot_columns(system, log, index, name)[0] for name in explanation.robot]
         columns = np.concatenate([*columns, friction_columns(system, log, index)], axis=-1)
-        r = remainder.r - columns @ coefficients
-        P = projector(remainder.J, scale)
-        parts.append((P @ (r / scale)[..., None])[..., 0] * scale)
+        r = r - columns @ coefficients
+        parts.append((projector(J, scale) @ (r / scale)[..., None])[..., 0] * scale)
     return np.concatenate(parts)

@@ -125,10 +125,7 @@ class Tip:
 
 
 def tip_of(
-    system: ConstrainedSystem,
-    contact: SurfaceContact,
-    q: torch.Tensor,
-    radius: float | Literal["fit"] | None,
+    system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor, radius: float | Literal["fit"] | None
 ) -> Tip:
     """The tip that touched at positions `(n, nq)`: that of the scene, or a ball that ends at its point.
 

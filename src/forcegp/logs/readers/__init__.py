@@ -107,8 +107,7 @@ def _format_of_folder(path: Path) -> str:
     endings = {child.suffix.lower() for child in path.iterdir() if child.is_file()}
     if endings & {".db3", ".mcap"}:
         raise DataError(
-            f"{path}: a folder with bag files and no metadata.yaml",
-            hint="name the .db3 or .mcap file itself",
+            f"{path}: a folder with bag files and no metadata.yaml", hint="name the .db3 or .mcap file itself"
         )
     if endings & set(_TEXT):
         return "text folder"
