@@ -15,12 +15,12 @@ import torch
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import DataHeader, Dataset
 from forcegp.errors import DataError
-from forcegp.logs.clock import usual_step
+from forcegp.logs.clock import even_clock, usual_step
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
 from forcegp.logs.signals import ImportFinding, ImportReport, Signals
-from forcegp.logs.smoothing import add_derivatives, even_clock, impact_mask
+from forcegp.logs.smoothing import add_derivatives, impact_mask
 from forcegp.resources import announce_memory
 from forcegp.robot import RobotModel
 from forcegp.scene import Scene, load_scene

@@ -18,6 +18,7 @@ from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
 from forcegp.logs import units
+from forcegp.logs.clock import even_clock
 from forcegp.logs.contact import force_levels, level_and_spread, multiplier
 from forcegp.logs.draft import Draft
 from forcegp.logs.gather import gather
@@ -25,7 +26,7 @@ from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
 from forcegp.logs.mapping import ContactStateSection, Mapping, parse_mapping
 from forcegp.logs.readers import read
 from forcegp.logs.signals import Array, ImportReport, Signals
-from forcegp.logs.smoothing import add_derivatives, even_clock
+from forcegp.logs.smoothing import add_derivatives
 from forcegp.logs.table import LogTable, Progress, Stream
 
 ROWS = 100_000
