@@ -140,7 +140,7 @@ def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) ->
 def _confounded(explanation: Explanation) -> list[Finding]:
     """The faults found; gains are no error beside masses that do not fit, which are their yardstick."""
     if "masses" not in explanation.robot:
-        return explanation.findings
+        return [*explanation.findings]
     return [
         replace(
             finding,
