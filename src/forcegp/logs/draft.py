@@ -22,7 +22,7 @@ class Family:
 
     pattern: str
     columns: dict[str, str]
-    stream: str
+    stream: str = ""
     unit: str | None = None
     declared: bool = False
     sign: float | dict[str, float] = 1.0

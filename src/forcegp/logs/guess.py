@@ -33,8 +33,6 @@ ROWS = 100_000
 """Rows that are looked at."""
 TRIED_ROWS = 3000
 """Rows on which the inverse dynamics are evaluated."""
-DEFAULT = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s2", "torque": "Nm"}
-"""Units that are assumed before any is tried."""
 MOST_RADIANS, LEAST_DEGREES = 60.0, 3.2
 """Positions beyond the first are in degrees; below the second, an arm in degrees would hardly move."""
 CLEARER = 1.5
@@ -95,7 +93,7 @@ def _possible_units(draft: Draft, stream: Stream) -> list[str]:
 def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:
     """Read the log by the draft, and settle what its values can: units, and the sign of the torque."""
     for quantity, family in draft.families.items():
-        family.unit = family.unit or DEFAULT[quantity]
+        family.unit = family.unit or units.SI[quantity]
     fits = {}
     for unit in possible:
         draft.families["position"].unit = unit
