@@ -99,7 +99,6 @@ class ImportReport:
     """What was found and done, in order.
 
     Attributes:
-        source, format: the log.
         rows_read: rows of the stream that sets the clock.
         findings: what is unusual in the log.
         steps: what was done to it, as lines of provenance.

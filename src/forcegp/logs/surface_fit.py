@@ -193,9 +193,8 @@ def fit_surface(
 ) -> SurfaceFit:
     """Fit a surface to the path of the touching point while a contact is closed.
 
-    Least squares of the signed distances; a rounded tip touches its radius below its centre. Rows that a
-    robust fit finds off the surface, such as those of bouncing, are left out and counted. The error bars
-    count residuals that are correlated in time as fewer independent ones.
+    Least squares of the signed distances, without the rows that a robust fit finds off the surface. The error
+    bars count residuals that are correlated in time as fewer independent ones.
 
     Args:
         data: a log with the contact's state.

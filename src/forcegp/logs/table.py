@@ -63,12 +63,9 @@ Wanted = Callable[[str], bool]
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Columns with a common clock: a table, a topic of a bag, arrays of one length.
+    """Columns `(n,)` with a common clock: a table, a topic of a bag, arrays of one length.
 
-    Args:
-        name: name of the topic or group; empty for the only table of a file.
-        columns: name → `(n,)` float64; a missing value is NaN.
-        units: name → unit, where the file declares one.
+    A missing value is NaN. The name is empty for the only table of a file; units are those it declares.
     """
 
     name: str
@@ -82,14 +79,7 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
-    """A log as it was read, before anything is known about the meaning of its columns.
-
-    Args:
-        source: name of the file or folder.
-        format: name of the format.
-        streams: the columns by clock.
-        remarks: what was left out or assumed by the reader, one sentence each.
-    """
+    """A log as it was read, with remarks on what the reader left out or assumed, one sentence each."""
 
     source: str
     format: str

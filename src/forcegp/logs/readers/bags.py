@@ -177,29 +177,23 @@ def _wrench(message: Any) -> tuple[tuple[str, ...], list[float]]:
     return (), [force.x, force.y, force.z, torque.x, torque.y, torque.z]
 
 
-def read_rosbag1(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag.
+def read_rosbag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2.
 
     Raises:
-        DataError: the bag is damaged or too large, or has no message of these types.
+        DataError: the bag is damaged, compressed or too large, or has no message of these types.
         MissingDependencyError: `rosbags` is not installed.
     """
-    package = optional_module("rosbags.rosbag1", "Reading ROS 1 bags", "import")
-    return read_bag(path, package.Reader, "rosbag1", wanted, rows, progress)
-
-
-def read_bag(
-    path: Path,
-    open_bag: Callable[[Path], Any],
-    format_: str,
-    wanted: Wanted,
-    rows: int | None,
-    progress: Progress | None,
-) -> LogTable:
-    """Read what a reader of the package `rosbags`, made by `open_bag`, finds in a bag."""
-    encoding = "ros1" if format_ == "rosbag1" else "cdr"
+    with (path if path.is_file() else path / "metadata.yaml").open("rb") as file:
+        first = file.read(12) == b"#ROSBAG V2.0"
+    number, encoding = (1, "ros1") if first else (2, "cdr")
+    package = optional_module(f"rosbags.rosbag{number}", f"Reading ROS {number} bags", "import")
+    if path.is_dir():
+        _check_metadata(path)
+    elif not first and path.suffix != ".db3":
+        raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
     collector = Collector(str(path))
-    with foreign(str(path), "a bag"), open_bag(path) as bag:
+    with foreign(str(path), "a bag"), package.Reader(path) as bag:
         check_count(str(path), "topics", len(bag.connections), limits.LOG_STREAMS)
         check_count(str(path), "messages", bag.message_count, limits.LOG_MESSAGES)
         topics = {c.topic: c.msgtype for c in bag.connections}
@@ -213,22 +207,7 @@ def read_bag(
                 progress(done, total)
             if rows is not None and collector.rows >= rows:
                 break
-        return collector.table(format_, topics, wanted)
-
-
-def read_rosbag2(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag.
-
-    Raises:
-        DataError: the bag is damaged, compressed or too large, or has no message of these types.
-        MissingDependencyError: `rosbags` is not installed.
-    """
-    package = optional_module("rosbags.rosbag2", "Reading ROS 2 bags", "import")
-    if path.is_dir():
-        _check_metadata(path)
-    elif path.suffix != ".db3":
-        raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
-    return read_bag(path, package.Reader, "rosbag2", wanted, rows, progress)
+        return collector.table(f"rosbag{number}", topics, wanted)
 
 
 def _check_metadata(path: Path) -> None:

@@ -133,11 +133,10 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, st
     first = rows[0][0]
     after = [fields for i, fields in kept if i >= first][:SAMPLE_LINES]
     width = len(after[0])
-    same = sum(len(fields) == width for fields in after) / len(after)
     values = sum(_is_value(f, decimal) for fields in after for f in fields) / len(after)
     # A comma inside numbers, taken for a separator, leaves fields such as "5;2" that are not values.
-    preferred = 0.01 if decimal == "." else 0.0
-    return (values**2 / width + preferred if same == 1.0 else 0.0), separator, decimal, first
+    score = values**2 / width + (0.01 if decimal == "." else 0.0)
+    return (score if all(len(fields) == width for fields in after) else 0.0), separator, decimal, first
 
 
 def _is_value(field: str, decimal: str) -> bool:
