@@ -160,11 +160,7 @@ def _contacts(
 
 
 def _dataset(
-    signals: Signals,
-    std: np.ndarray | None,
-    mapping: Mapping,
-    system: ConstrainedSystem,
-    report: ImportReport,
+    signals: Signals, std: Array | None, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
 ) -> Dataset:
     """The data set of finished signals."""
     robot = system.robot
