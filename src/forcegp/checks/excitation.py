@@ -173,12 +173,11 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
         return []
     robot = system.robot
     units = {name: position_unit(robot, j) for j, name in enumerate(robot.joint_names)}
-    texts = [
-        HIDDEN[kind][2 if size >= MOST.get(kind, LARGEST) else 1].format(
-            joint=joint, size=size, unit=units.get(joint)
-        )
-        for (kind, joint), size in hidden.items()
-    ]
+    texts = []
+    for (kind, joint), size in hidden.items():
+        _, below, never = HIDDEN[kind]
+        text = never if size >= MOST.get(kind, LARGEST) else below
+        texts.append(text.format(joint=joint, size=size, unit=units.get(joint)))
     more = f" and {len(texts) - 5} more" if len(texts) > 5 else ""
     text = f"this log does not show {'; '.join(texts[:5])}{more}"
     joints = tuple(dict.fromkeys(joint for _, joint in hidden if joint))

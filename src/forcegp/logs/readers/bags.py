@@ -80,7 +80,7 @@ class Messages:
         """The columns that are wanted and hold numbers, with times from `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
         columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps.T), strict=True))
-        units = dict.fromkeys(CLOCKS, "s")
+        units: dict[str, str] = dict.fromkeys(CLOCKS, "s")
         parts = {f"{quantity}.{n}": unit for quantity, unit in QUANTITIES.items() for n in self.names}
         values = np.ascontiguousarray(np.array(self.rows, dtype=np.float64).T)
         for (part, unit), column in zip((parts or WRENCH_COLUMNS).items(), values, strict=True):
