@@ -12,7 +12,6 @@ from forcegp.errors import DataError
 from forcegp.logs import surface_fit
 from forcegp.logs.surface_fit import Tip, correlation_time, tip_of
 
-
 UP = np.array([0.0, 0.0, 1.0])
 
 
