@@ -29,7 +29,7 @@ def kinds_of(take_off: float) -> list[str]:
     closed, segment = time < DT * SLIDES, np.zeros(rows, np.int64)
     log = Log(time, *[zero] * 4, segment, {"table": closed}, ("j",), DataHeader())
     path = Path(height, p, v, np.tile([0.0, 0.0, 1.0], (rows, 1)))
-    found = _labels(TABLE, path, closed, np.ones(rows, bool), height, 8e-4, log)
+    found = _labels(TABLE, path, closed, np.ones(rows, bool), height, log)
     return [finding.kind for finding in found]
 
 

@@ -37,7 +37,7 @@ def test_every_mapping_that_is_shipped_is_valid(name: str) -> None:
 def test_columns_and_numbers_of_joints() -> None:
     mapping = parse_mapping(GOOD.encode(), "m.toml")
     assert mapping.columns_of("position", ("shoulder", "elbow")) == ["q1", "q2"]
-    assert mapping.per_joint("torque", "gear_ratio", ("elbow", "shoulder")) == [50.0, 100.0]
+    assert mapping.per_joint("torque", "gear_ratio", ("elbow", "shoulder")).tolist() == [50.0, 100.0]
 
 
 @pytest.mark.parametrize(

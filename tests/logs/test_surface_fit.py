@@ -12,6 +12,12 @@ from forcegp.errors import DataError
 from forcegp.logs import surface_fit
 from forcegp.logs.surface_fit import Tip, correlation_time, tip_of
 
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def sharp(points: np.ndarray) -> Tip:
+    return Tip(np.zeros_like(points), 0.0)
+
 
 def on_plane(n: int, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, float]:
     """Points of a circle of 10 cm on a tilted plane; its normal and offset."""
@@ -25,7 +31,7 @@ def on_plane(n: int, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarra
 
 def test_a_plane_without_noise_is_found_exactly() -> None:
     points, normal, offset = on_plane(500, 0.0)
-    fit = surface_fit._plane("table", points, np.array([0.0, 0.0, 1.0]))
+    fit = surface_fit._plane("table", points, UP, sharp(points))
     assert isinstance(fit.surface, Plane)
     # Rounding, and the tolerance of the least squares, 1e-8 relative.
     np.testing.assert_allclose(fit.surface.normal, normal, atol=1e-8)
@@ -37,7 +43,7 @@ def test_the_error_bars_of_a_plane_hold() -> None:
     for seed in range(40):
         points, normal, _ = on_plane(400, 2e-4, seed)
         points[::37] += 0.02  # rows that were labelled wrongly
-        fit = surface_fit._plane("table", points, np.array([0.0, 0.0, 1.0]))
+        fit = surface_fit._plane("table", points, UP, sharp(points))
         plane = fit.surface
         assert isinstance(plane, Plane)
         tilt = np.linalg.norm(np.cross(plane.normal, normal))
@@ -57,7 +63,7 @@ def test_a_sphere_and_its_error_bars() -> None:
     )
     center = np.array([0.6, 0.1, -0.2])
     points = center + 0.3 * directions + 1e-4 * random.standard_normal((800, 3))
-    fit = surface_fit._sphere("ball", points, np.array([0.0, 0.0, 1.0]))
+    fit = surface_fit._sphere("ball", points, UP, sharp(points))
     assert isinstance(fit.surface, Sphere)
     assert np.abs(np.array(fit.surface.center) - center).max() < 4.0 * fit.std["center"] < 2e-4
     assert abs(fit.surface.radius - 0.3) < 4.0 * fit.std["radius"] < 2e-4
@@ -67,10 +73,10 @@ def test_paths_that_determine_no_surface() -> None:
     line = np.linspace(0.0, 1.0, 200)[:, None] * np.array([1.0, 2.0, 0.5])
     noisy = line + 1e-4 * np.random.default_rng(0).standard_normal((200, 3))
     with pytest.raises(DataError, match="nearly straight"):
-        surface_fit._plane("table", noisy, np.array([0.0, 0.0, 1.0]))
+        surface_fit._plane("table", noisy, UP, sharp(noisy))
     flat, _, _ = on_plane(300, 0.0)
     with pytest.raises(DataError, match="determine a sphere"):
-        surface_fit._sphere("ball", flat, np.array([0.0, 0.0, 1.0]))
+        surface_fit._sphere("ball", flat, UP, sharp(flat))
 
 
 def test_correlated_residuals_count_as_fewer() -> None:
@@ -121,7 +127,6 @@ def rounded(n: int, lean: float, noise: float = 0.0) -> tuple[np.ndarray, np.nda
 
 
 RADIUS = 0.02
-UP = np.array([0.0, 0.0, 1.0])
 
 
 def test_a_rounded_tip_of_known_radius_touches_below_its_centre() -> None:
@@ -135,8 +140,8 @@ def test_a_rounded_tip_of_known_radius_touches_below_its_centre() -> None:
     assert isinstance(of_centers.surface, Plane)
     assert of_centers.surface.offset == pytest.approx(0.2, abs=1e-8)
     # A tip that is taken for a point seems to slide on another plane.
-    sharp = surface_fit._plane("table", points, UP)
-    assert isinstance(sharp.surface, Plane) and abs(sharp.surface.offset - 0.2) > 5e-4
+    of_points = surface_fit._plane("table", points, UP, sharp(points))
+    assert isinstance(of_points.surface, Plane) and abs(of_points.surface.offset - 0.2) > 5e-4
 
 
 def test_the_radius_of_a_tip_that_leans_is_fitted() -> None:

@@ -22,6 +22,8 @@ NUMBERS = 24
 """Upper bound on the numbers of one joint in one row that are held at a time; twenty were measured."""
 OF_CONTACTS = frozenset({"contact", "contact force"})
 """Checks of contacts, which a scene without any does without."""
+OF_TIME = frozenset({"order of time", "held rows", "gaps", "jitter", "sampling period", "standing channels"})
+"""Checks that need rows in the order of time."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]
 Progress = Callable[[int, int], None]
 
@@ -104,7 +106,7 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
     for done, (name, run) in enumerate(CHECKS):
         if progress is not None:
             progress(done, len(CHECKS))
-        if name in OF_CONTACTS and not system.contacts:
+        if (name in OF_CONTACTS and not system.contacts) or (name in OF_TIME and not log.header.ordered):
             continue
         kinds = (kind for finding in findings for kind in finding.kinds)
         void = next((kind for kind in kinds if kind in VOIDS.get(name, ())), None)

@@ -5,14 +5,16 @@ The surface must push, and friction opposes the sliding.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 import torch
 
 from forcegp import kinematics
 from forcegp.checks.finding import Finding, Intervals
-from forcegp.checks.fit import CHUNK, blocks_of, residual, tensors
+from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors
 from forcegp.checks.log import Array, Log, Outcome, describe, evenly, intervals
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.robust import robust_std
@@ -59,28 +61,41 @@ class Path:
     v: Array
     normal: Array
 
-    @property
+    @cached_property
     def approach(self) -> Array:
         """Speed along the normal `(n,)` [m/s]."""
         return np.abs((self.v * self.normal).sum(axis=1))
 
+    @cached_property
+    def along(self) -> Array:
+        """Velocity along the surface `(n, 3)` [m/s]."""
+        return self.v - (self.v * self.normal).sum(axis=1, keepdims=True) * self.normal
 
-def tip_path(system: ConstrainedSystem, contact: SurfaceContact, log: Log) -> Path:
-    """Where the touching point was; NaN in rows that are not finite."""
-    n = len(log)
-    path = Path(np.full(n, np.nan), *(np.full((n, 3), np.nan) for _ in range(3)))
-    rows = np.flatnonzero(log.finite)
+
+def tip_path(
+    system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray | None = None
+) -> Path:
+    """Where the touching point was at some rows, or at all rows, with NaN in those that are not finite."""
+    parts = np.array_split(np.arange(len(log)) if rows is None else rows, -(-len(log) // CHUNK))
+    paths = []
     with torch.no_grad():
-        for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
-            q, qd = tensors(log, part, "q", "qd")
+        for q, qd in (tensors(log, part, "q", "qd") for part in parts):
             p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
-            path.p[part] = p.numpy()
-            path.v[part] = kinematics.point_velocity(
-                system.robot, q, qd, contact.frame, contact.point
-            ).numpy()
-            path.c[part] = contact.center_surface.value(p).numpy()
-            path.normal[part] = contact.surface.gradient(p).numpy()
-    return path
+            v = kinematics.point_velocity(system.robot, q, qd, contact.frame, contact.point)
+            paths.append((contact.center_surface.value(p), p, v, contact.surface.gradient(p)))
+    path = [np.concatenate(part) for part in zip(*paths, strict=True)]
+    if rows is None:
+        for value in path:
+            value[~log.finite] = np.nan
+    return Path(*path)
+
+
+def touching(system: ConstrainedSystem, log: Log) -> Iterator[tuple[SurfaceContact, np.ndarray]]:
+    """The contacts with surfaces that are labelled as closed in enough rows, and these rows."""
+    for contact in labelled_contacts(system, log):
+        rows = np.flatnonzero(log.contact[contact.name] & log.usable)
+        if isinstance(contact, SurfaceContact) and len(rows) >= LEAST_ROWS:
+            yield contact, rows
 
 
 def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -101,8 +116,7 @@ def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Findin
     if closed.sum() < LEAST_ROWS:
         return _missed(contact, path, usable & ~closed & (path.approach <= CREEP), path.c, TOUCH, log)
     findings, distance = _placement(contact, path, closed, log)
-    rough = ROUGH * float(robust_std(distance[closed]))
-    return [*findings, *_labels(contact, path, closed, usable, distance, rough, log)]
+    return [*findings, *_labels(contact, path, closed, usable, distance, log)]
 
 
 def _placement(
@@ -110,21 +124,20 @@ def _placement(
 ) -> tuple[list[Finding], Array]:
     """Displacement and tilt of the surface, and the distance from it once they are undone."""
     offset, tilt, shift = fit_surface(contact, path, closed)
-    rows = intervals(closed)
     name, evidence = contact.name, {"offset_m": offset, "tilt_deg": float(np.degrees(np.linalg.norm(tilt)))}
-    distance = path.c - shift
-    if abs(np.median(path.c[closed])) > FAR:
-        text = f"in contact {name!r} the tip is {1e3 * np.median(path.c[closed]):+.3g} mm from the surface"
-        return [Finding("contact-far", text, rows, contact=name, evidence=evidence)], distance
+    finding = partial(Finding, intervals=intervals(closed), contact=name)
+    if abs(middle := np.median(path.c[closed])) > FAR:
+        text = f"in contact {name!r} the tip is {1e3 * middle:+.3g} mm from the surface"
+        return [finding("contact-far", text, evidence=evidence)], path.c - shift
     findings = []
     if np.linalg.norm(tilt) > TILT:
         text = f"the surface of {name!r} is tilted by {evidence['tilt_deg']:.3g}° against the tip's path"
-        evidence |= {f"slope_{axis}": float(value) for axis, value in zip("xyz", tilt, strict=True)}
-        findings.append(Finding("surface-tilted", text, rows, contact=name, evidence=evidence))
+        slopes = {f"slope_{axis}": float(value) for axis, value in zip("xyz", tilt, strict=True)}
+        findings.append(finding("surface-tilted", text, evidence=evidence | slopes))
     if abs(offset) > OFFSET:
         text = f"the surface of {name!r} lies {1e3 * offset:+.3g} mm along its normal from the scene's"
-        findings.append(Finding("surface-offset", text, rows, contact=name, evidence={"offset_m": offset}))
-    return findings, distance if findings else path.c
+        findings.append(finding("surface-offset", text, evidence={"offset_m": offset}))
+    return findings, path.c - shift if findings else path.c
 
 
 def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
@@ -132,14 +145,12 @@ def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tupl
 
     Rows that stay off the fit, such as those labelled too early, are trimmed round by round.
     """
-    p = path.p - np.median(path.p[closed], axis=0)
-    keep, slope, theta = closed.copy(), np.zeros(3), np.zeros(3)
     offset = float(np.median(path.c[closed]))
     if not isinstance(contact.surface, Plane):
-        return offset, slope, np.full(len(p), offset)
-    n = np.asarray(contact.surface.normal)
-    tangent = np.linalg.svd(n[None])[2][1:]
-    x = p @ tangent.T
+        return offset, np.zeros(3), np.full(len(path.c), offset)
+    tangent = np.linalg.svd(np.asarray(contact.surface.normal)[None])[2][1:]
+    x = (path.p - np.median(path.p[closed], axis=0)) @ tangent.T
+    keep, theta = closed, np.zeros(3)
     for _ in range(10):
         A = np.column_stack([x[keep], np.ones(keep.sum())])
         # Directions along which the tip hardly moves do not show a tilt.
@@ -153,21 +164,16 @@ def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tupl
     slope = theta[:2] @ tangent
     if np.linalg.norm(slope) <= TILT:
         offset = float(np.median(path.c[keep]))
-        return offset, np.zeros(3), np.full(len(p), offset)
+        return offset, np.zeros(3), np.full(len(x), offset)
     return float(theta[2]), slope, x @ theta[:2] + theta[2]
 
 
 def _labels(
-    contact: SurfaceContact,
-    path: Path,
-    closed: np.ndarray,
-    usable: np.ndarray,
-    c: Array,
-    rough: float,
-    log: Log,
+    contact: SurfaceContact, path: Path, closed: np.ndarray, usable: np.ndarray, c: Array, log: Log
 ) -> list[Finding]:
     """Rows labelled closed off the surface, by their place in the interval, and open ones that slide."""
-    touch, moving = max(TOUCH, rough), closed & (np.linalg.norm(path.v, axis=1) > CREEP)
+    touch = max(TOUCH, ROUGH * float(robust_std(c[closed])))
+    moving = closed & (np.linalg.norm(path.v, axis=1) > CREEP)
     slow = max(CREEP, ROUGH * float(robust_std(path.approach[moving])) if moving.any() else 0.0)
     texts = {
         "contact-early": "labelled closed before the tip touches",
@@ -232,9 +238,7 @@ def _missed(
     """
     if not np.isfinite(log.dt):
         return []
-    near = open_ & (np.abs(c) <= touch)
-    along = path.v - (path.v * path.normal).sum(axis=1, keepdims=True) * path.normal
-    speed = np.linalg.norm(along, axis=1)
+    near, speed = open_ & (np.abs(c) <= touch), np.linalg.norm(path.along, axis=1)
     least = max(3, round(MISSED_SECONDS / log.dt))
     spans = tuple(
         (a, b)
@@ -262,16 +266,13 @@ NARROW = 0.05
 def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
     """Normal force, friction and directions of sliding of each contact, where the arm can tell the force."""
     findings = []
-    for contact in system.contacts:
-        if isinstance(contact, SurfaceContact) and contact.name in log.contact:
-            path = tip_path(system, contact, log)
-            rows = np.flatnonzero(log.contact[contact.name] & log.usable)
-            rows = evenly(rows, FORCE_ROWS)
-            if len(rows) >= LEAST_ROWS:
-                findings += _directions(contact, path, log)
-                force = _force(replace(system, contacts=[contact]), log, rows, path)
-                pulls = _pulls(contact, path, force, rows, log)
-                findings += pulls or (_friction(contact, path, force, rows, log) if log.nq > 3 else [])
+    for contact, rows in touching(system, log):
+        finding = partial(Finding, intervals=intervals(log.contact[contact.name]), contact=contact.name)
+        findings += _directions(finding, tip_path(system, contact, log, rows).v)
+        rows = evenly(rows, FORCE_ROWS)
+        path = tip_path(system, contact, log, rows)
+        force = _force(replace(system, contacts=[contact]), log, rows, path)
+        findings += _pulls(finding, path, force) or (_friction(finding, path, force) if log.nq > 3 else [])
     return findings, log
 
 
@@ -280,60 +281,52 @@ def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) ->
 
     With three torques or fewer, which any force would explain, it is the best one along the normal, r = Aᵀ λ.
     """
-    remainder = residual(system, log, rows)
+    r, J = residual(system, log, rows)
     if log.nq <= 3:
-        A = remainder.J[:, 0]
+        A = J[:, 0]
         size = np.maximum((A * A).sum(axis=1), 1e-12)
-        return ((A * remainder.r).sum(axis=1) / size)[:, None] * path.normal[rows]
-    gram = remainder.J @ remainder.J.transpose(0, 2, 1)
-    return np.linalg.solve(gram + 1e-9 * np.eye(3), (remainder.J @ remainder.r[..., None]))[..., 0]
+        return ((A * r).sum(axis=1) / size)[:, None] * path.normal
+    gram = J @ J.transpose(0, 2, 1)
+    return np.linalg.solve(gram + 1e-9 * np.eye(3), (J @ r[..., None]))[..., 0]
 
 
-def _pulls(contact: SurfaceContact, path: Path, force: Array, rows: np.ndarray, log: Log) -> list[Finding]:
-    normal = (force * path.normal[rows]).sum(axis=1)
-    # Away from the mean the scatter is noise and true change alike; an arm that presses stays above it.
-    if not (
-        np.median(normal) < 0.0 and (normal < 0.0).mean() > PULLS and -np.median(normal) > robust_std(normal)
-    ):
+def _pulls(finding: partial[Finding], path: Path, force: Array) -> list[Finding]:
+    normal = (force * path.normal).sum(axis=1)
+    middle = float(np.median(normal))
+    # The scatter holds noise and true changes alike; the force of an arm that presses stays above it.
+    if not (middle < 0.0 and (normal < 0.0).mean() > PULLS and -middle > robust_std(normal)):
         return []
-    text = f"the force at {contact.name!r} pulls with {-np.median(normal):.3g} N along the normal"
-    spans = intervals(log.contact[contact.name])
-    evidence = {"normal_force_N": float(np.median(normal))}
-    return [Finding("contact-pulls", text, spans, contact=contact.name, evidence=evidence)]
+    text = f"the force at {finding.keywords['contact']!r} pulls with {-middle:.3g} N along the normal"
+    return [finding("contact-pulls", text, evidence={"normal_force_N": middle})]
 
 
-def _friction(contact: SurfaceContact, path: Path, force: Array, rows: np.ndarray, log: Log) -> list[Finding]:
-    """Regression of the force along the sliding direction on speed and normal force."""
-    n, v = path.normal[rows], path.v[rows]
-    along = v - (v * n).sum(axis=1, keepdims=True) * n
-    speed = np.linalg.norm(along, axis=1)
+def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Finding]:
+    """Friction coefficient from the force against the direction of sliding."""
+    speed = np.linalg.norm(path.along, axis=1)
     sliding = speed > SLIDING_SLOW
     if sliding.sum() < LEAST_ROWS:
         return []
-    drag = -(force * along).sum(axis=1)[sliding] / speed[sliding]
-    press = np.maximum((force * n).sum(axis=1)[sliding], 0.0)
-    block = blocks_of(len(drag))
-    # One coefficient per block, so that the scatter between blocks tells how sure it is.
-    each = [
-        (drag[block == k] @ press[block == k]) / max(press[block == k] @ press[block == k], 1e-12)
-        for k in range(8)
-    ]
-    mean, error = float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(8))
+    drag = -(force * path.along).sum(axis=1)[sliding] / speed[sliding]
+    press = np.maximum((force * path.normal).sum(axis=1)[sliding], 0.0)
+    # One coefficient per block: the scatter between blocks gives the standard error.
+    parts = [blocks_of(len(drag)) == k for k in range(BLOCKS)]
+    each = [(drag[part] @ press[part]) / max(press[part] @ press[part], 1e-12) for part in parts]
+    mean, error = float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(BLOCKS))
     if mean <= SIGNIFICANT * error:
         return []
-    text = f"friction at {contact.name!r} is {100 * mean:.2g} % of the normal force while it slides"
-    spans = intervals(log.contact[contact.name])
-    evidence = {"friction_coefficient": mean, "standard_error": error}
-    return [Finding("contact-friction", text, spans, contact=contact.name, evidence=evidence)]
+    name = finding.keywords["contact"]
+    text = f"friction at {name!r} is {100 * mean:.2g} % of the normal force while it slides"
+    return [
+        finding("contact-friction", text, evidence={"friction_coefficient": mean, "standard_error": error})
+    ]
 
 
-def _directions(contact: SurfaceContact, path: Path, log: Log) -> list[Finding]:
+def _directions(finding: partial[Finding], v: Array) -> list[Finding]:
     """Sliding along one line only leaves friction across it unknown."""
-    v = path.v[log.contact[contact.name] & log.usable]
     size = np.linalg.svd(v.T @ v / len(v), compute_uv=False)
     if size[1] > NARROW**2 * size[0]:
         return []
-    text = f"the tip slides along one direction of {contact.name!r} only; friction across it is not seen"
-    spans = intervals(log.contact[contact.name])
+    name = finding.keywords["contact"]
+    text = f"the tip slides along one direction of {name!r} only; friction across it is not seen"
     evidence = {"share_across": float(np.sqrt(size[1] / max(size[0], 1e-300)))}
-    return [Finding("force-directions", text, spans, contact=contact.name, evidence=evidence)]
+    return [finding("force-directions", text, evidence=evidence)]

@@ -17,7 +17,7 @@ import torch
 from forcegp.checks.explain import Explanation, significant
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import BLOCKS, blocks_of, held_out, residual, tensors
-from forcegp.checks.hypotheses import MASS_SHARE, MOMENT_ARM, encoder_hypothesis, robot_columns
+from forcegp.checks.hypotheses import encoder_hypothesis, inertial_spread, robot_columns
 from forcegp.checks.log import Array, Log, Outcome, position_unit
 from forcegp.constraints import ConstrainedSystem
 from forcegp.identification import base_parameters, parameter_vector, regressor
@@ -49,8 +49,7 @@ def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def still_joints(log: Log) -> np.ndarray:
     """`(nq,)` bool, joints that stay within a hair of one position."""
-    q = log.q[log.usable]
-    return np.ptp(np.percentile(q, (0.5, 99.5), axis=0), axis=0) < STILL if len(q) else np.zeros(log.nq, bool)
+    return log.reach("q") < STILL if log.usable.any() else np.zeros(log.nq, bool)
 
 
 def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -67,17 +66,13 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
         return findings, log
     turns = np.zeros(log.nq, int)
     fast = HYSTERESIS * np.percentile(np.abs(log.qd[log.usable]), 99, axis=0)
-    for s in log.stretches:
-        for j in range(log.nq):
-            x = log.qd[s][:, j]
-            direction = np.sign(x[np.abs(x) > fast[j]])
-            turns[j] += int((np.diff(direction) != 0).sum())
+    for j, x in ((j, log.qd[s, j]) for s in log.stretches for j in range(log.nq)):
+        turns[j] += np.count_nonzero(np.diff(np.sign(x[np.abs(x) > fast[j]])))
     few = (turns < REVERSALS) & ~still
     if few.any():
         joints = log.named(few)
-        why = "friction looks like an offset"
-        verb = "changes" if len(joints) == 1 else "change"
-        text = f"{', '.join(joints)} {verb} direction fewer than {REVERSALS} times: {why}"
+        changes = f"{', '.join(joints)} {'changes' if len(joints) == 1 else 'change'} direction"
+        text = f"{changes} fewer than {REVERSALS} times: friction looks like an offset"
         findings.append(Finding("few-reversals", text, log.all_rows, joints))
     return findings, log
 
@@ -93,12 +88,10 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     joints = sorted({int(columns[k]) // 10 for k in np.flatnonzero(weak)})
     listed = ", ".join(names[k] for k in np.flatnonzero(weak)[:6])
-    more = int(weak.sum()) - 6
-    text = (
-        f"{int(weak.sum())} of {len(weak)} base parameters are not identified: {listed}"
-        + (f" and {more} more" if more > 0 else "")
-        + f"; missing: {_missing(system, log, joints)}"
-    )
+    more = f" and {weak.sum() - 6} more" if weak.sum() > 6 else ""
+    missing = _missing(system, log, joints)
+    count = f"{weak.sum()} of {len(weak)} base parameters are not identified"
+    text = f"{count}: {listed}{more}; missing: {missing}"
     evidence = {"identified": int((~weak).sum()), "base_parameters": len(weak)}
     named = tuple(log.joint_names[j] for j in joints)
     return [Finding("poor-excitation", text, log.all_rows, named, evidence=evidence)], log
@@ -117,10 +110,7 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
         Y = regressor(robot, *tensors(log, rows, "q", "qd", "qdd"))[..., list(base.columns)].numpy()
     tau = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     noise = np.maximum(0.01 * tau, 1e-3 * tau.max()) + 1e-12
-    mass = np.maximum(robot.mass.numpy(), 0.01 * float(robot.mass.max()))
-    share = np.array([MASS_SHARE, *[MOMENT_ARM] * 3, *[MOMENT_ARM**2] * 6])
-    prior = (mass[:, None] * share).ravel()[columns]
-    A = (Y / noise[:, None]).reshape(-1, len(columns)) * prior
+    A = (Y / noise[:, None]).reshape(-1, len(columns)) * inertial_spread(robot)[columns]
     # Neighbouring rows tell the same: the log counts as one look per tenth of a second.
     looks = int(log.usable.sum()) * log.dt / LOOK if log.header.ordered else len(rows)
     gram = A.T @ A * (looks / len(rows))
@@ -147,28 +137,19 @@ SIZES = np.geomspace(1e-3, LARGEST, 200)
 """Sizes that are tried."""
 SPAN = 1
 """Rows on either side of which the rate of the torque is taken; fewer than the margin of `explain`."""
-WORTH = {
-    "torque-gain": 0.5,
-    "encoder-offset": 0.1,
-    "base-tilted": 6.0,
-    "torque-delay": 0.04,
-    "masses-mismatch": 0.5,
+HIDDEN = {
+    "torque-gain": (0.5, "a gain of {joint} wrong by less than {size:.0%}", "any wrong gain of {joint}"),
+    "encoder-offset": (
+        0.1,
+        "an encoder offset of {joint} under {size:.2g} {unit}",
+        "any encoder offset of {joint}",
+    ),
+    "base-tilted": (6.0, "a base tilted by less than {size:.2g}°", "any tilt of the base"),
+    "torque-delay": (0.04, "a torque delay under {size:.2g} s", "any torque delay"),
+    "masses-mismatch": (0.5, "masses wrong by less than {size:.0%}", "any error of the masses"),
 }
-"""Sizes that a user expects a check to see: share, rad, degrees, s, share of a link's inertial parameters."""
-UNITS = {
-    "torque-gain": "a gain of {joint} wrong by less than {size:.0%}",
-    "encoder-offset": "an encoder offset of {joint} under {size:.2g} {unit}",
-    "base-tilted": "a base tilted by less than {size:.2g}°",
-    "torque-delay": "a torque delay under {size:.2g} s",
-    "masses-mismatch": "masses wrong by less than {size:.0%}",
-}
-NEVER = {
-    "torque-gain": "any wrong gain of {joint}",
-    "encoder-offset": "any encoder offset of {joint}",
-    "base-tilted": "any tilt of the base",
-    "torque-delay": "any torque delay",
-    "masses-mismatch": "any error of the masses",
-}
+"""Size that a user expects a check to see [share, rad, degrees, s, share of the inertial parameters], and
+what is hidden if only larger faults show, or none."""
 
 
 @dataclass(frozen=True)
@@ -187,17 +168,16 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
         (fault.kind, fault.joint): visible_size(explanation, fault)
         for fault in _faults(system, explanation.log, explanation.rows)
     }
-    hidden = {key: size for key, size in sizes.items() if size > WORTH[key[0]]}
+    hidden = {key: size for key, size in sizes.items() if size > HIDDEN[key[0]][0]}
     if not hidden:
         return []
     robot = system.robot
     units = {name: position_unit(robot, j) for j, name in enumerate(robot.joint_names)}
-    texts = [
-        NEVER[kind].format(joint=joint)
-        if size >= MOST.get(kind, LARGEST)
-        else UNITS[kind].format(joint=joint, size=size, unit=units.get(joint))
-        for (kind, joint), size in hidden.items()
-    ]
+    texts = []
+    for (kind, joint), size in hidden.items():
+        _, below, never = HIDDEN[kind]
+        text = never if size >= MOST.get(kind, LARGEST) else below
+        texts.append(text.format(joint=joint, size=size, unit=units.get(joint)))
     more = f" and {len(texts) - 5} more" if len(texts) > 5 else ""
     text = f"this log does not show {'; '.join(texts[:5])}{more}"
     joints = tuple(dict.fromkeys(joint for _, joint in hidden if joint))
@@ -239,7 +219,7 @@ def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[F
 
 def _rate(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """`(n, nq)` rate of change of the torque that the motion needs; the measured one has more noise."""
-    ahead, behind = (residual(system, log, rows + k).r + log.tau[rows + k] for k in (SPAN, -SPAN))
+    ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
     return (ahead - behind) / (2.0 * SPAN * log.dt)
 
 
@@ -254,9 +234,6 @@ def _tilt(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
 
 def _masses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """Torque of all inertial parameters of every other link, which are taken as wrong by the same share."""
-    robot = system.robot
-    with torch.no_grad():
-        Y = regressor(robot, *tensors(log, rows, "q", "qd", "qdd")).numpy()
-    parameters = parameter_vector(robot).numpy()
-    sign = np.repeat((-1.0) ** np.arange(robot.nq), 10)
-    return Y @ (sign * parameters)
+    parameters = parameter_vector(system.robot).numpy()
+    sign = np.repeat((-1.0) ** np.arange(log.nq), 10)
+    return robot_columns(system, log, rows, "masses")[0] @ (-sign * parameters)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from forcegp.checks.hypotheses import (
     plausible,
     problem_of,
     robot_hypotheses,
-    with_log,
 )
 from forcegp.checks.log import Array, Log
 from forcegp.checks.placement import leaves_surface
@@ -57,197 +56,179 @@ MATERIAL_EACH = 0.05
 """Drop of log error per joint that matters where all joints are concerned."""
 
 
+Tried = tuple[Hypothesis, TorqueFit]
+
+
 @dataclass(frozen=True)
 class Explanation:
-    """What the torque says about log and robot file.
+    """What explains the torque: faults of the log, which are undone, and of the robot file.
 
     Attributes:
-        findings: faults found, the most telling first.
-        log: the log without them.
-        repairs: what takes the faults out of a log, in order.
+        system: the robot with its contacts.
+        log: the log without the faults.
+        rows: rows that are looked at.
         problem: the torques that remain, over `rows`.
-        robot: names of the accepted hypotheses about the robot, which stay in the model.
-        columns, prior: their columns, and how large their parameters may be.
-        fit: the model that remains.
-        rows: rows that were looked at.
+        columns, prior: columns of the accepted hypotheses on the robot, and the sizes of their parameters.
+        robot: names of these hypotheses, which stay in the model.
+        findings: faults found, the most telling first.
+        repairs: what takes the faults out of a log, in order.
+        taken: names and joints of the accepted hypotheses.
     """
 
-    findings: list[Finding]
+    system: ConstrainedSystem
     log: Log
-    repairs: tuple[Callable[[Log], Log], ...]
+    rows: np.ndarray
     problem: TorqueProblem
-    robot: tuple[str, ...]
     columns: Array
     prior: Array
-    fit: TorqueFit
-    rows: np.ndarray
+    robot: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    repairs: tuple[Callable[[Log], Log], ...] = ()
+    taken: frozenset[tuple[str, tuple[int, ...]]] = frozenset()
 
+    @cached_property
+    def fit(self) -> TorqueFit:
+        """The model that remains."""
+        return cross_validate(self.problem, self.columns, self.prior)
 
-@dataclass(frozen=True)
-class Choice:
-    """The hypothesis that one round accepts.
+    def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
+        """The problem on a log that a hypothesis has changed, with the present weights of the joints."""
+        return problem_of(self.system, log, self.rows if rows is None else rows, self.problem.scale)
 
-    Attributes:
-        tried: the hypothesis and its fit.
-        alike: joints of those of its kind that explain exactly as much.
-        alternatives: hypotheses of other kinds or joints that the log cannot tell from it.
-    """
+    def weighed(self) -> Explanation:
+        """The same with joints weighed by the noise that it leaves."""
+        result = self
+        for _ in range(2):
+            # The typical block counts: a disturbance must not make a joint look noisy.
+            noise = np.median(result.fit.error, axis=0) * result.problem.scale
+            scale = np.maximum(noise, 1e-3 * result.problem.size)
+            result = replace(result, problem=replace(result.problem, scale=scale))
+        return result
 
-    tried: Tried
-    alike: tuple[int, ...]
-    alternatives: tuple[Tried, ...]
+    def with_(self, hypothesis: Hypothesis) -> TorqueFit:
+        """Fit of a hypothesis with parameters, beside those that the model holds already."""
+        assert hypothesis.columns is not None and hypothesis.prior is not None
+        columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
+        gains = hypothesis.joints if hypothesis.name == "gains" else ()
+        prior = np.concatenate([hypothesis.prior, self.prior])
+        return cross_validate(self.problem, columns, prior, gains, hypothesis.instruments)
 
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     """Find the faults that explain the torque that the robot file leaves."""
     rows = log.rows(ROWS, margin=max(LAGS))
-    problem = _weighed(problem_of(system, log, rows))
-    kept, prior = np.zeros((*problem.r.shape, 0)), np.zeros(0)
-    findings, taken, robot, repairs = [], set(), (), []
+    problem = problem_of(system, log, rows)
+    model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
     for _ in range(ROUNDS):
-        chosen = _best(system, log, rows, problem, kept, prior, taken)
-        if chosen is None:
+        accepted = _round(model)
+        if accepted is None:
             break
-        hypothesis, fit = chosen.tried
-        finding = finding_of(system, log, hypothesis, fit, chosen.alike)
-        others = [finding_of(system, log, *pair) for pair in chosen.alternatives]
-        findings.append(with_alternatives(finding, others))
-        taken.add((hypothesis.name, hypothesis.joints))
-        if hypothesis.name not in ROBOT:
-            theta = fit.theta
-            if hypothesis.name == "encoder-offset":
-                theta = _refined(system, log, rows, problem, hypothesis, theta[:1])
-            repairs.append(partial(corrected, hypothesis=hypothesis, theta=theta))
-            log = repairs[-1](log)
-            problem = _weighed(problem_of(system, log, rows), kept, prior)
-        else:
-            assert hypothesis.columns is not None and hypothesis.prior is not None
-            kept = np.concatenate([hypothesis.columns, kept], axis=-1)
-            prior = np.concatenate([hypothesis.prior, prior])
-            problem, robot = _weighed(problem, kept, prior), (hypothesis.name, *robot)
-    return Explanation(
-        findings, log, tuple(repairs), problem, robot, kept, prior, cross_validate(problem, kept, prior), rows
-    )
+        model = accepted
+    return model
 
 
-def _refined(
-    system: ConstrainedSystem,
-    log: Log,
-    rows: np.ndarray,
-    problem: TorqueProblem,
-    hypothesis: Hypothesis,
-    theta: Array,
-) -> Array:
-    """An encoder offset after two more Gauss-Newton steps, as its effect on the torque is not linear."""
-    for _ in range(2):
-        moved = corrected(log, hypothesis, theta)
-        refined = encoder_hypothesis(system, moved, rows, hypothesis.joints[0])
-        theta = theta + cross_validate(with_log(problem, system, moved, rows), refined.columns).theta
-    return theta
-
-
-def _weighed(
-    problem: TorqueProblem, columns: Array | None = None, prior: Array | None = None
-) -> TorqueProblem:
-    """The problem with joints weighed by the noise that the present explanation leaves."""
-    for _ in range(2):
-        error = cross_validate(problem, columns, prior).error
-        # The typical block counts: a disturbance must not make a joint look noisy.
-        noise = np.median(error, axis=0) * problem.scale
-        problem = replace(problem, scale=np.maximum(noise, 1e-3 * problem.size))
-    return problem
-
-
-def _best(
-    system: ConstrainedSystem,
-    log: Log,
-    rows: np.ndarray,
-    problem: TorqueProblem,
-    kept: Array,
-    prior: Array,
-    taken: set,
-) -> Choice | None:
-    """The simplest hypothesis within one standard error of the best, if it explains enough."""
-    null = cross_validate(problem, kept, prior)
+def _round(model: Explanation) -> Explanation | None:
+    """Accept the simplest hypothesis within one standard error of the best, if it explains enough."""
+    system, log = model.system, model.log
     tried = [
         (hypothesis, fit)
-        for hypothesis, fit in _fits(system, log, rows, problem, kept, prior)
-        if (hypothesis.name, hypothesis.joints) not in taken
-    ]
-    tried = [
-        (hypothesis, fit)
-        for hypothesis, fit in tried
-        if plausible(system, hypothesis, fit)
+        for hypothesis, fit in _fits(model)
+        if (hypothesis.name, hypothesis.joints) not in model.taken
+        and plausible(system, hypothesis, fit)
         and not leaves_surface(system, log, corrected(log, hypothesis, fit.theta))
     ]
     good = [
         (hypothesis, fit)
         for hypothesis, fit in tried
-        if significant(fit.shares, null.shares, len(hypothesis.joints) or log.nq)
+        if significant(fit.shares, model.fit.shares, len(hypothesis.joints) or log.nq)
     ]
     if not good:
         return None
-    best = min(good, key=lambda pair: pair[1].score.mean())
-    most, near = gain_of(best[1].score, null.score)[0], []
+    best = min((fit for _, fit in good), key=lambda fit: fit.score.mean())
+    most, near = gain_of(best.score, model.fit.score)[0], []
     for hypothesis, fit in good:
-        loss, error = gain_of(best[1].score, fit.score)
+        loss, error = gain_of(best.score, fit.score)
         if loss <= max(error, SHARE * most) + 1e-9:
             near.append((hypothesis, fit))
     chosen, fit = min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
-    alike = [h.joints for h, other in near if h.name == chosen.name and _same(other, fit)]
-    others = tuple(alternatives_of(system, (chosen, fit), tried, null))
-    return Choice((chosen, fit), tuple(dict.fromkeys(j for joints in alike for j in joints)), others)
+    # The errors of an arm and of its mirror image are equal but for rounding.
+    alike = [
+        joint
+        for other, its in near
+        if other.name == chosen.name and np.allclose(its.error, fit.error, rtol=SAME, atol=0.0)
+        for joint in other.joints
+    ]
+    finding = finding_of(system, log, chosen, fit, tuple(dict.fromkeys(alike)))
+    alternatives = alternatives_of(system, (chosen, fit), tried, model.fit)
+    finding = with_alternatives(finding, [finding_of(system, log, *pair) for pair in alternatives])
+    return _accepted(model, chosen, fit.theta, finding)
 
 
-def _same(fit: TorqueFit, other: TorqueFit) -> bool:
-    """Whether two fits leave the same errors but for rounding: those of an arm and of its mirror image."""
-    return bool(np.allclose(fit.error, other.error, rtol=SAME, atol=0.0))
+def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding: Finding) -> Explanation:
+    """The explanation with one hypothesis more: its fault undone, or its parameters in the model."""
+    taken = model.taken | {(hypothesis.name, hypothesis.joints)}
+    model = replace(model, findings=(*model.findings, finding), taken=taken)
+    if hypothesis.name in ROBOT:
+        assert hypothesis.columns is not None and hypothesis.prior is not None
+        columns = np.concatenate([hypothesis.columns, model.columns], axis=-1)
+        prior = np.concatenate([hypothesis.prior, model.prior])
+        return replace(model, columns=columns, prior=prior, robot=(hypothesis.name, *model.robot)).weighed()
+    if hypothesis.name == "encoder-offset":
+        theta = theta[:1]
+        for _ in range(2):  # Gauss-Newton steps, as the effect of an offset on the torque is not linear
+            moved = corrected(model.log, hypothesis, theta)
+            refined = encoder_hypothesis(model.system, moved, model.rows, hypothesis.joints[0])
+            theta = theta + cross_validate(model.on(moved), refined.columns).theta
+    repair = partial(corrected, hypothesis=hypothesis, theta=theta)
+    log = repair(model.log)
+    problem = problem_of(model.system, log, model.rows)
+    return replace(model, log=log, problem=problem, repairs=(*model.repairs, repair)).weighed()
 
 
-def _fits(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: TorqueProblem, kept: Array, prior: Array
-) -> Iterator[tuple[Hypothesis, TorqueFit]]:
-    # Once the robot is at fault and its parameters are free, they bend to any sign and order.
-    for hypothesis in _promising(system, log, rows, problem) if not len(prior) else ():
-        changed = with_log(problem, system, hypothesis.change(log), rows)
-        yield hypothesis, cross_validate(changed)
-    for hypothesis in delays(log) if len(prior) else ():
-        # A delay leaves the motion, and with it the columns of the robot's parameters, as they are.
-        yield hypothesis, cross_validate(with_log(problem, system, hypothesis.change(log), rows), kept, prior)
-    tried = continuous(system, log, rows) if not len(prior) else robot_hypotheses(system, log, rows)
-    null, off = cross_validate(problem, kept, prior), []
+def _fits(model: Explanation) -> Iterator[Tried]:
+    system, log, rows = model.system, model.log, model.rows
+    if len(model.prior):
+        # Once the robot is at fault and its parameters are free, they bend to any sign and order. A delay
+        # leaves the motion, and with it the columns of the robot's parameters, as they are.
+        for hypothesis in delays(log):
+            yield hypothesis, cross_validate(model.on(hypothesis.change(log)), model.columns, model.prior)
+        tried = robot_hypotheses(system, log, rows)
+    else:
+        for hypothesis in _promising(model):
+            yield hypothesis, cross_validate(model.on(hypothesis.change(log)))
+        tried = continuous(system, log, rows)
+    off = []
     for hypothesis in tried:
-        fit = _fit(problem, hypothesis, kept, prior)
+        fit = model.with_(hypothesis)
         yield hypothesis, fit
-        if hypothesis.name == "gains" and significant(fit.shares, null.shares, 1):
+        if hypothesis.name == "gains" and significant(fit.shares, model.fit.shares, 1):
             off += hypothesis.joints
     if len(off) > 1:
         together = gain_hypothesis(log, rows, tuple(off))
-        yield together, _fit(problem, together, kept, prior)
+        yield together, model.with_(together)
     if 2 * len(off) > log.nq > 1:
-        yield from _currents(log, rows, problem, kept, prior)
+        yield from _currents(model)
 
 
-def _currents(
-    log: Log, rows: np.ndarray, problem: TorqueProblem, kept: Array, prior: Array
-) -> Iterator[Tried]:
+def _currents(model: Explanation) -> Iterator[Tried]:
     """Gains of all joints that the log determines, tried where most torques are scaled wrongly."""
-    fit = _fit(problem, current_hypothesis(log, rows, problem, tuple(range(log.nq))), kept, prior)
-    gains = 1.0 + fit.theta[: log.nq]
-    determined = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[: log.nq])
+    log, rows, nq = model.log, model.rows, model.log.nq
+    fit = model.with_(current_hypothesis(log, rows, model.problem, tuple(range(nq))))
+    gains = 1.0 + fit.theta[:nq]
+    determined = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[:nq])
     # A current has the sign of its torque, so gains of both signs have another cause.
-    if 2 * len(determined) > log.nq and (gains[determined] > 0.0).all():
-        hypothesis = current_hypothesis(log, rows, problem, tuple(int(j) for j in determined))
-        yield hypothesis, _fit(problem, hypothesis, kept, prior)
+    if 2 * len(determined) > nq and (gains[determined] > 0.0).all():
+        hypothesis = current_hypothesis(log, rows, model.problem, tuple(int(j) for j in determined))
+        yield hypothesis, model.with_(hypothesis)
 
 
-def _fit(problem: TorqueProblem, hypothesis: Hypothesis, kept: Array, prior: Array) -> TorqueFit:
-    """A hypothesis with parameters, beside those that the model holds already."""
-    assert hypothesis.columns is not None and hypothesis.prior is not None
-    columns = np.concatenate([hypothesis.columns, kept], axis=-1)
-    gains = hypothesis.joints if hypothesis.name == "gains" else ()
-    every = np.concatenate([hypothesis.prior, prior])
-    return cross_validate(problem, columns, every, gains, hypothesis.instruments)
+def _promising(model: Explanation) -> Iterator[Hypothesis]:
+    """Hypotheses without parameters that lower the error on a part of the rows."""
+    few = model.rows[::SCREENING]
+    null = cross_validate(model.on(model.log, few)).score.mean()
+    for hypothesis in discrete(model.log):
+        if cross_validate(model.on(hypothesis.change(model.log), few)).score.mean() < null:
+            yield hypothesis
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:
@@ -264,18 +245,6 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
     return gains[0][0] > least and agree and any(gain > SIGNIFICANT * error for gain, error in gains)
 
 
-def _promising(
-    system: ConstrainedSystem, log: Log, rows: np.ndarray, problem: TorqueProblem
-) -> Iterator[Hypothesis]:
-    """Hypotheses without parameters that lower the error on a part of the rows."""
-    few = rows[::SCREENING]
-    null = cross_validate(with_log(problem, system, log, few)).score.mean()
-    for hypothesis in discrete(log):
-        if cross_validate(with_log(problem, system, hypothesis.change(log), few)).score.mean() < null:
-            yield hypothesis
-
-
-Tried = tuple[Hypothesis, TorqueFit]
 SMALL_MASS = 1e-6
 """Share of the robot's mass below which a mass is zero."""
 ALONE = 2.0
@@ -326,8 +295,7 @@ def _says_the_same(chosen: Hypothesis, other: Hypothesis) -> bool:
 
 
 def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Whether every link keeps a mass that is positive, or zero in the robot file; the fit does not enforce
-    it."""
+    """Whether every link keeps a mass that is positive, or zero in the robot file."""
     if hypothesis.name != "masses":
         return True
     masses = system.robot.mass.numpy()

@@ -187,18 +187,13 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """The finding as JSON holds it."""
-        return {
-            "kind": self.kind,
+        plain = ("kind", "severity", "message", "remedy", "contact", "told_apart_by")
+        return {name: getattr(self, name) for name in plain} | {
             "kinds": list(self.kinds),
-            "severity": self.severity,
-            "message": self.message,
-            "remedy": self.remedy,
             "intervals": [list(interval) for interval in self.intervals],
             "joints": list(self.joints),
-            "contact": self.contact,
             "evidence": {name: float(value) for name, value in self.evidence.items()},
             "alternatives": [other.to_dict() for other in self.alternatives],
-            "told_apart_by": self.told_apart_by,
         }
 
 

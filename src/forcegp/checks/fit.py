@@ -21,26 +21,16 @@ CHUNK = 8192
 """Rows whose dynamics are in memory at once."""
 
 
-@dataclass(frozen=True)
-class Residual:
-    """Unexplained torque at some rows.
-
-    Attributes:
-        r: `(n, nq)` [N m, N].
-        J: `(n, k, nq)` Jacobian of the touching points, zero where they do not touch.
-    """
-
-    r: Array
-    J: Array
-
-
 def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
     """Columns at some rows, as tensors."""
     return [torch.from_numpy(np.ascontiguousarray(getattr(log, name)[rows])) for name in names]
 
 
-def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Residual:
-    """The unexplained torque at some rows; the robot must be in double precision on the CPU."""
+def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, Array]:
+    """The unexplained torque at some rows, r `(n, nq)` [N m, N], and J `(n, k, nq)` of the touching points.
+
+    J is zero where they do not touch. The robot must be in double precision on the CPU.
+    """
     robot, r, J = system.robot, [], []
     with torch.no_grad():
         for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
@@ -48,11 +38,11 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Residual:
             needed = dynamics.inverse_dynamics(robot, q, qd, qdd) - dynamics.damping_force(robot, qd)
             r.append((needed - tau).numpy())
             J.append(_contact_jacobian(system, log, part, q, qd))
-    return Residual(np.concatenate(r), np.concatenate(J))
+    return np.concatenate(r), np.concatenate(J)
 
 
 def labelled_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
-    """The contacts whose state the log knows."""
+    """The contacts whose state is logged."""
     return [c for c in system.contacts if c.name in log.contact]
 
 
@@ -114,6 +104,11 @@ class TorqueProblem:
     nuisance: Array
     size: Array
     scale: Array
+
+    def without_contact(self, x: Array) -> Array:
+        """P x/scale of columns x `(n, nq, p)`."""
+        x = x / self.scale[:, None]
+        return projector(self.J, self.scale) @ x if self.J.any() else x
 
 
 @dataclass(frozen=True)
@@ -186,11 +181,8 @@ def _equations(
     """Columns of size one and right-hand side without contact forces, unit and weight of the columns."""
     extra = columns if columns is not None else np.zeros((*problem.r.shape, 0))
     p = extra.shape[-1]
-    A = np.concatenate([extra, problem.nuisance], axis=-1) / problem.scale[:, None]
-    y = problem.r / problem.scale
-    if problem.J.any():
-        P = projector(problem.J, problem.scale)
-        A, y = P @ A, (P @ y[..., None])[..., 0]
+    every = problem.without_contact(np.concatenate([problem.r[..., None], extra, problem.nuisance], axis=-1))
+    y, A = every[..., 0], every[..., 1:]
     unit = np.sqrt((A**2).sum(axis=(0, 1)))
     # A column that does nothing gets no parameter.
     unit = np.where(unit > 1e-12 * unit.max(), unit, np.inf)
@@ -203,9 +195,7 @@ def _equations(
 
 def _with_instruments(A: Array, problem: TorqueProblem, instruments: Array) -> Array:
     """The columns, the leading ones replaced by their instruments, in the same units."""
-    Z = instruments / problem.scale[:, None]
-    if problem.J.any():
-        Z = projector(problem.J, problem.scale) @ Z
+    Z = problem.without_contact(instruments)
     size = np.sqrt((Z**2).sum(axis=(0, 1)))
     Z = Z / np.where(size > 0.0, size, np.inf)
     return np.concatenate([Z, A[..., Z.shape[-1] :]], axis=-1)
@@ -217,11 +207,9 @@ def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> A
     Huber's weights, min(1, k/|r|) with k twice the median residual (*Robust Statistics*, 1981, ch. 7).
     """
     A, y, unit, weight = _equations(problem, columns, prior)
-    w = np.ones(len(y))
-    theta = np.zeros(A.shape[-1])
+    w, theta = np.ones(len(y)), np.zeros(A.shape[-1])
     for _ in range(REWEIGHTED):
-        scaled = A * w[:, None, None]
-        flat = scaled.reshape(-1, A.shape[-1])
+        flat = (A * w[:, None, None]).reshape(-1, A.shape[-1])
         theta = _solve(A.reshape(flat.shape).T @ flat, flat.T @ y.ravel(), weight)
         size = np.sqrt(((y - A @ theta) ** 2).mean(axis=1))
         w = np.minimum(1.0, 2.0 * np.median(size) / np.maximum(size, 1e-300))
@@ -230,7 +218,7 @@ def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> A
 
 def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tuple[Array, Array, Array]:
     """Residual of each block under the parameters of the others, these parameters, and those of all."""
-    block, rest, solve = blocks_of(len(y)), np.zeros_like(y), _solve if Z is None else _solve_instrumented
+    block, rest, symmetric = blocks_of(len(y)), np.zeros_like(y), Z is None
     Z = A if Z is None else Z
     grams, sides, thetas = [], [], []
     for rows in (block == k for k in range(BLOCKS)):
@@ -239,9 +227,9 @@ def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tupl
         sides.append(z.T @ y[rows].ravel())
     gram, side = np.sum(grams, axis=0), np.sum(sides, axis=0)
     for k in range(BLOCKS):
-        thetas.append(solve(gram - grams[k], side - sides[k], weight))
+        thetas.append(_solve(gram - grams[k], side - sides[k], weight, symmetric))
         rest[block == k] = y[block == k] - A[block == k] @ thetas[-1]
-    return rest, np.stack(thetas), solve(gram, side, weight)
+    return rest, np.stack(thetas), _solve(gram, side, weight, symmetric)
 
 
 def held_out(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
@@ -257,15 +245,12 @@ def gains_of(theta: Array, joints: tuple[int, ...], nq: int) -> Array:
     return gains
 
 
-def _solve(gram: Array, side: Array, weight: Array) -> Array:
+def _solve(gram: Array, side: Array, weight: Array, symmetric: bool = True) -> Array:
+    """Solve the normal equations, or those with instruments, whose `gram` is not symmetric."""
     from scipy.linalg import cho_factor, cho_solve
 
-    return cho_solve(cho_factor(gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram))), side)
-
-
-def _solve_instrumented(gram: Array, side: Array, weight: Array) -> Array:
-    """Solve the instrumental equations, whose `gram` is not symmetric."""
-    return np.linalg.solve(gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram)), side)
+    gram = gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram))
+    return cho_solve(cho_factor(gram), side) if symmetric else np.linalg.solve(gram, side)
 
 
 def score_of(shares: Array) -> Array:

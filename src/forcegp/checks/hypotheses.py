@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from forcegp import dynamics, kinematics
+from forcegp.checks.contact import tip_path
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import (
     TorqueFit,
@@ -25,6 +26,7 @@ from forcegp.checks.fit import (
 from forcegp.checks.log import Array, Log, displacement
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.identification import regressor
+from forcegp.robot.model import RobotModel
 
 LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
 """Delays between torque and motion that are tried, in samples either way."""
@@ -71,10 +73,10 @@ def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
     """The torques of some rows, to be explained by joint friction and an offset per joint."""
-    remainder, nuisance = residual(system, log, rows), friction_columns(system, log, rows)
+    nuisance = friction_columns(system, log, rows)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
-    return TorqueProblem(remainder.r, remainder.J, nuisance, size, size if scale is None else scale)
+    return TorqueProblem(*residual(system, log, rows), nuisance, size, size if scale is None else scale)
 
 
 def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
@@ -102,21 +104,12 @@ def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarr
 
 def _sliding_columns(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> Array:
     """Torque −Jᵀv and −Jᵀv/|v| of a point that slides at v where the contact is closed, `(n, nq, 2)`."""
-    q, qd = tensors(log, rows, "q", "qd")
+    (q,), v = tensors(log, rows, "q"), tip_path(system, contact, log, rows).along
     with torch.no_grad():
-        p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
-        normal = contact.surface.gradient(p).numpy()
         J = kinematics.point_jacobian(system.robot, q, contact.frame, contact.point).numpy()
-    v = np.einsum("nkj,nj->nk", J, qd.numpy())
-    v = v - (v * normal).sum(axis=1, keepdims=True) * normal
     speed = np.sqrt((v**2).sum(axis=1, keepdims=True) + SLOW**2)
     closed = log.contact[contact.name][rows][:, None]
     return np.stack([np.einsum("nkj,nk->nj", J, closed * f) for f in (v, v / speed)], axis=-1)
-
-
-def with_log(problem: TorqueProblem, system: ConstrainedSystem, log: Log, rows: np.ndarray) -> TorqueProblem:
-    """The same problem on a log that a hypothesis has changed."""
-    return problem_of(system, log, rows, problem.scale)
 
 
 def _diagonal(x: Array) -> Array:
@@ -215,42 +208,34 @@ def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: s
     """Torque `(n, nq, p)` per unit of each parameter that may be off, and how far it may be `(p,)`."""
     robot = system.robot
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
-    if name == "gravity":
-        return _gravity_columns(system, q), np.full(3, GRAVITY)
     with torch.no_grad():
+        if name == "gravity":  # r = Q_G(δ) for gravity off by δ
+            axes = torch.eye(3, dtype=q.dtype)
+            columns = [dynamics.gravity_force(replace(robot, gravity=axis), q) for axis in axes]
+            return torch.stack(columns, dim=-1).numpy(), np.full(3, GRAVITY)
         Y = regressor(robot, q, qd, qdd).numpy()
     # r = Y π₀ − τ = −Y δ for parameters that are off by δ.
     if name == "payload":
-        tool = [TOOL_MASS, *[TOOL_MASS * MOMENT_ARM] * 3, *[TOOL_MASS * MOMENT_ARM**2] * 6]
-        return -Y[..., -10:], np.array(tool)
+        return -Y[..., -10:], TOOL_MASS * np.repeat([1.0, MOMENT_ARM, MOMENT_ARM**2], (1, 3, 6))
+    return -Y, inertial_spread(robot)
+
+
+def inertial_spread(robot: RobotModel) -> Array:
+    """How far the inertial parameters of a robot file may be off, `(10 nq,)`."""
     mass = robot.mass.numpy()[:, None]
-    share = np.array([MASS_SHARE, *[MOMENT_ARM] * 3, *[MOMENT_ARM**2] * 6])
-    return -Y, (np.maximum(mass, 0.01 * mass.max()) * share).ravel()
+    share = np.repeat([MASS_SHARE, MOMENT_ARM, MOMENT_ARM**2], (1, 3, 6))
+    return (np.maximum(mass, 0.01 * mass.max()) * share).ravel()
 
 
 def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j: int) -> Hypothesis:
     """The encoder of joint j is off by δ: u(q + δ) − τ vanishes, so that r = u(q) − τ = −∂u/∂q δ."""
-    columns = _offset_column(system, j, *tensors(log, rows, "q", "qd", "qdd"))
-    return Hypothesis("encoder-offset", 1, unchanged, -columns[..., None], np.full(1, 1.0), (j,))
-
-
-def _offset_column(system: ConstrainedSystem, j: int, *motion: torch.Tensor) -> Array:
-    """∂u/∂q_j of the inverse dynamics by central differences, `(n, nq)`."""
-    q, qd, qdd = motion
-    step = torch.zeros(q.shape[-1], dtype=q.dtype)
+    q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
+    step = torch.zeros(log.nq, dtype=q.dtype)
     step[j] = 1e-4
     with torch.no_grad():
-        ahead = dynamics.inverse_dynamics(system.robot, q + step, qd, qdd)
-        behind = dynamics.inverse_dynamics(system.robot, q - step, qd, qdd)
-    return ((ahead - behind) / 2e-4).numpy()
-
-
-def _gravity_columns(system: ConstrainedSystem, q: torch.Tensor) -> Array:
-    """Q_G per unit of gravity along each world axis, `(n, nq, 3)`: r = Q_G(δ) for gravity off by δ."""
-    axes = torch.eye(3, dtype=q.dtype)
-    with torch.no_grad():
-        columns = [dynamics.gravity_force(replace(system.robot, gravity=axis), q) for axis in axes]
-    return torch.stack(columns, dim=-1).numpy()
+        ahead, behind = (dynamics.inverse_dynamics(system.robot, q + s, qd, qdd) for s in (step, -step))
+    columns = ((behind - ahead) / 2e-4).numpy()[..., None]
+    return Hypothesis("encoder-offset", 1, unchanged, columns, np.full(1, 1.0), (j,))
 
 
 CURRENT = 1.6
@@ -261,8 +246,6 @@ WEIGHTLESS = 0.3
 """Share of gravity below which the torque holds none of it."""
 SIGNIFICANT = 3.0
 """Standard errors from which a parameter of a tool counts."""
-
-
 SMALL_ANGLE = np.radians(0.5)
 """Encoder offsets below this are within calibration, or an error of a centre of mass [rad]."""
 SMALL_GAIN = 0.2
@@ -309,70 +292,66 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
 
 
 def finding_of(
-    system: ConstrainedSystem,
-    log: Log,
-    hypothesis: Hypothesis,
-    fit: TorqueFit,
-    alike: tuple[int, ...] = (),
+    system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit, alike: tuple[int, ...] = ()
 ) -> Finding:
     """The finding that a hypothesis stands for; `alike` are the joints of those that explain the same."""
-    names = tuple(log.joint_names[j] for j in hypothesis.joints)
-    listed = "all joints" if len(names) == log.nq > 1 else " and ".join(names)
-    if hypothesis.name == "joint-sign" and len(alike) > 1:
-        names = tuple(log.joint_names[j] for j in alike)
-        listed = " or ".join(names)
-    texts = {
-        "torque-sign": f"the torque of {listed} fits the motion with the opposite sign",
-        "joint-sign": f"{listed} fits the robot file when it turns the other way",
-        "torque-order": f"the torques of {listed} fit when exchanged",
-        "joint-order": f"{listed} fit the robot file when exchanged",
-    }
-    if hypothesis.name in texts:
-        return Finding(hypothesis.name, texts[hypothesis.name], log.all_rows, names)
-    return _PARAMETRIC[hypothesis.name](system, log, hypothesis, fit)
+    name, theta, spread = hypothesis.name, fit.theta, fit.spread
+    one_of = name == "joint-sign" and len(alike) > 1
+    names = tuple(log.joint_names[j] for j in (alike if one_of else hypothesis.joints))
+    listed = "all joints" if len(names) == log.nq > 1 else (" or " if one_of else " and ").join(names)
+    evidence: dict[str, float] = {}
+    if name == "gains":
+        return _gains(log, names, 1.0 + theta[: len(names)])
+    if name == "gravity":
+        return _gravity(system, log, theta[:3])
+    if name == "torque-sign":
+        text = f"the torque of {listed} fits the motion with the opposite sign"
+    elif name == "joint-sign":
+        text = f"{listed} fits the robot file when it turns the other way"
+    elif name == "torque-order":
+        text = f"the torques of {listed} fit when exchanged"
+    elif name == "joint-order":
+        text = f"{listed} fit the robot file when exchanged"
+    elif name == "torque-delay":
+        rows, seconds = abs(hypothesis.shift), abs(hypothesis.shift) * log.dt
+        word = "after" if hypothesis.shift > 0 else "before"
+        text = f"the torque is logged about {1e3 * seconds:.3g} ms ({rows} rows) {word} the motion"
+        evidence = {"rows": hypothesis.shift, "seconds": seconds}
+    elif name == "encoder-offset":
+        added = displacement(system.robot, hypothesis.joints[0], float(theta[0]))
+        text = f"{listed} fits with {added} added to its position, ± {spread[0]:.4f}"
+        evidence = {"add_rad": float(theta[0])}
+    elif name == "payload":
+        name, names = "payload-missing", (log.joint_names[-1],)
+        text = f"the torque fits with {theta[0]:.3g} ± {spread[0]:.2g} kg more on the last link"
+        evidence = {"mass_kg": float(theta[0]), "spread_kg": spread[0]}
+    else:
+        text = "the torque fits better with other masses and centres of mass than those of the robot file"
+        worst = int(np.argmax(np.abs(theta[: 10 * log.nq : 10])))
+        name, names = "masses-mismatch", (log.joint_names[worst],)
+        evidence = {"largest_mass_change_kg": theta[10 * worst]}
+    return Finding(name, text, log.all_rows, names, evidence=evidence)
 
 
-def _delay(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
-    seconds = abs(hypothesis.shift) * log.dt
-    word = "after" if hypothesis.shift > 0 else "before"
-    text = (
-        f"the torque is logged about {1e3 * seconds:.3g} ms ({abs(hypothesis.shift)} rows) {word} the motion"
-    )
-    return Finding(
-        "torque-delay", text, log.all_rows, evidence={"rows": hypothesis.shift, "seconds": seconds}
-    )
-
-
-def _gains(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
-    gains = 1.0 + fit.theta[: len(hypothesis.joints)]
-    names = tuple(log.joint_names[j] for j in hypothesis.joints)
+def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
+    """Torques that have to be scaled: a wrong sign, a current, or a wrong gain."""
     evidence = {f"factor {name}": gain for name, gain in zip(names, gains, strict=True)}
     listed = ", ".join(f"{name} {gain:.3g}" for name, gain in zip(names, gains, strict=True))
-    negative = tuple(name for name, gain in zip(names, gains, strict=True) if gain < 0.0)
-    if negative:
-        text = f"torques fit when multiplied by {listed}: the sign is wrong"
-        return Finding("torque-sign", text, log.all_rows, negative, evidence=evidence)
-    factor = np.exp(np.abs(np.log(np.abs(gains) + 1e-12)))
-    if 2 * len(names) > log.nq > 1 and np.median(factor) > CURRENT:
-        text = f"torques fit when multiplied by {listed}: currents, or torques on the motor side"
-        return Finding("torque-current", text, log.all_rows, names, evidence=evidence)
-    off = [k for k in range(len(names)) if factor[k] > 1.05]
     text = f"torques fit when multiplied by {listed}"
-    return Finding(
-        "torque-gain", text, log.all_rows, tuple(names[k] for k in off) or names, evidence=evidence
-    )
+    factor = np.exp(np.abs(np.log(np.abs(gains) + 1e-12)))
+    kind, among = "torque-gain", factor > 1.05
+    if (gains < 0.0).any():
+        kind, among, text = "torque-sign", gains < 0.0, f"{text}: the sign is wrong"
+    elif 2 * len(names) > log.nq > 1 and np.median(factor) > CURRENT:
+        kind, among, text = "torque-current", gains > 0.0, f"{text}: currents, or torques on the motor side"
+    joints = tuple(name for name, hit in zip(names, among, strict=True) if hit) or names
+    return Finding(kind, text, log.all_rows, joints, evidence=evidence)
 
 
-def _encoder(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
-    name, offset = log.joint_names[hypothesis.joints[0]], float(fit.theta[0])
-    added = displacement(system.robot, hypothesis.joints[0], offset)
-    text = f"{name} fits with {added} added to its position, ± {fit.spread[0]:.4f}"
-    return Finding("encoder-offset", text, log.all_rows, (name,), evidence={"add_rad": offset})
-
-
-def _gravity(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
+def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
+    """Gravity that is absent from the torque, or has another direction than in the scene."""
     assumed = system.robot.gravity.numpy()
-    fitted = assumed + fit.theta[:3]
+    fitted = assumed + change
     strength = float(np.linalg.norm(assumed))
     angle, size = _turn(assumed, fitted)
     evidence = {"angle_deg": angle, **{f"g{axis}": value for axis, value in zip("xyz", fitted, strict=True)}}
@@ -390,27 +369,3 @@ def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:
     lengths = float(np.linalg.norm(assumed)), float(np.linalg.norm(fitted))
     cosine = fitted @ assumed / max(lengths[0] * lengths[1], 1e-12)
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), lengths[1] / max(lengths[0], 1e-12)
-
-
-def _payload(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
-    mass = float(fit.theta[0])
-    text = f"the torque fits with {mass:.3g} ± {fit.spread[0]:.2g} kg more on the last link"
-    evidence = {"mass_kg": mass, "spread_kg": fit.spread[0]}
-    return Finding("payload-missing", text, log.all_rows, (log.joint_names[-1],), evidence=evidence)
-
-
-def _masses(system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit) -> Finding:
-    text = "the torque fits better with other masses and centres of mass than those of the robot file"
-    worst = int(np.argmax(np.abs(fit.theta[: 10 * log.nq].reshape(log.nq, 10)[:, 0])))
-    evidence = {"largest_mass_change_kg": fit.theta[10 * worst]}
-    return Finding("masses-mismatch", text, log.all_rows, (log.joint_names[worst],), evidence=evidence)
-
-
-_PARAMETRIC = {
-    "torque-delay": _delay,
-    "gains": _gains,
-    "encoder-offset": _encoder,
-    "gravity": _gravity,
-    "payload": _payload,
-    "masses": _masses,
-}

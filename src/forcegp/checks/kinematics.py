@@ -171,7 +171,7 @@ def _one_factor(level: Match, factor: float) -> bool:
 
 def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
     """Velocities that are not the derivative of the positions: unit, sign, order, or nothing alike."""
-    if not log.stretches or "qd" in log.derived:
+    if "qd" in log.derived:
         return [], log
     level = match(log, "q", "qd")
     if level is None:
@@ -181,9 +181,9 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     permutation = _permutation(level)
     if permutation is not None:
-        names = [log.joint_names[j] for j in np.flatnonzero(permutation != np.arange(log.nq))]
+        names = log.named(permutation != np.arange(log.nq))
         text = f"the velocities of {', '.join(names)} belong to each other's positions"
-        finding = Finding("velocity-order", text, log.all_rows, tuple(names))
+        finding = Finding("velocity-order", text, log.all_rows, names)
         return [finding], log.replace(qd=log.qd[:, permutation], qdd=_follow(log, permutation))
     findings, factor = _velocity_findings(log, level, wrong)
     return findings, log.replace(qd=log.qd * factor)
@@ -191,29 +191,33 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
     """One finding per cause, and the factors that undo it."""
-    causes = {"velocity-sign": -1.0, "degrees": 1.0 / DEGREE, "degrees ": DEGREE}
+    causes = (
+        ("velocity-sign", -1.0, "runs against"),
+        ("degrees", 1.0 / DEGREE, "is 1/57 of"),
+        ("degrees", DEGREE, "is 57 times"),
+    )
     findings, factor, unexplained = [], np.ones(log.nq), wrong.copy()
-    for name, slope in causes.items():
-        kind = name.strip()
+    for kind, slope, what in causes:
         hit = unexplained & level.right(slope) & (np.abs(level.correlation) >= RELATED)
-        if not hit.any():
-            continue
-        joints = log.named(hit)
-        evidence = {"slope": float(np.median(level.low[hit]))}
-        what = {-1.0: "runs against", 1.0 / DEGREE: "is 1/57 of", DEGREE: "is 57 times"}[slope]
-        text = f"qd of {', '.join(joints)} {what} the rate of change of q"
-        findings.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
-        factor[hit], unexplained = slope, unexplained & ~hit
+        if hit.any():
+            joints, evidence = log.named(hit), {"slope": float(np.median(level.low[hit]))}
+            text = f"qd of {', '.join(joints)} {what} the rate of change of q"
+            findings.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
+            factor[hit], unexplained = slope, unexplained & ~hit
     if unexplained.any():
-        joints = log.named(unexplained)
-        j = int(np.flatnonzero(unexplained)[0])
-        text = (
-            f"qd of {', '.join(joints)} is not the rate of change of q: slope {level.low[j]:.3g}, "
-            f"correlation {level.correlation[j]:.3g}"
-        )
-        evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
-        findings.append(Finding("velocity-mismatch", text, log.all_rows, joints, evidence=evidence))
+        findings.append(_mismatch("velocity-mismatch", log, level, unexplained, "qd", "q"))
     return findings, factor
+
+
+def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, value: str) -> Finding:
+    """A rate without relation to its value."""
+    joints, j = log.named(wrong), int(np.flatnonzero(wrong)[0])
+    evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
+    text = (
+        f"{rate} of {', '.join(joints)} is not the rate of change of {value}: slope {level.low[j]:.3g}, "
+        f"correlation {level.correlation[j]:.3g}"
+    )
+    return Finding(kind, text, log.all_rows, joints, evidence=evidence)
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
@@ -273,10 +277,10 @@ def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
     """`(nq,)` viscous friction that the robot file lacks, 0 where the torques do not show it [N m s/rad]."""
     rows = log.rows(FRICTION_ROWS)
     damping = np.zeros(log.nq)
-    remainder = residual(system, log, rows)
+    torque, J = residual(system, log, rows)
     for j in range(log.nq):
-        free = np.linalg.norm(remainder.J[:, :, j], axis=1) < LEVER
-        qd, r = log.qd[rows, j][free], remainder.r[free, j]
+        free = np.linalg.norm(J[:, :, j], axis=1) < LEVER
+        qd, r = log.qd[rows, j][free], torque[free, j]
         if len(r) < 20:
             continue
         X = -np.stack([qd, np.sign(qd), np.ones_like(qd)], axis=1)
@@ -290,7 +294,7 @@ def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
 
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     """Accelerations that are not the derivative of the velocities, beyond what their noise explains."""
-    if not log.stretches or log.derived:
+    if log.derived:
         return [], log
     level = match(log, "qd", "qdd")
     if level is None:
@@ -302,14 +306,7 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))
     if not wrong.any():
         return [], log
-    joints = log.named(wrong)
-    j = int(np.flatnonzero(wrong)[0])
-    text = (
-        f"qdd of {', '.join(joints)} is not the rate of change of qd: slope {level.low[j]:.3g}, "
-        f"correlation {level.correlation[j]:.3g}"
-    )
-    evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
-    finding = Finding("acceleration-mismatch", text, log.all_rows, joints, evidence=evidence)
+    finding = _mismatch("acceleration-mismatch", log, level, wrong, "qdd", "qd")
     qdd = log.qdd.copy()
     for s in log.stretches:
         qdd[s, wrong] = np.gradient(log.qd[s][:, wrong], log.t[s], axis=0)
@@ -345,22 +342,20 @@ def noise_levels(log: Log) -> tuple[Array, Array] | None:
 
 def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
     """The noise of the logged acceleration against that of the header."""
-    levels = noise_levels(log) if np.isfinite(log.dt) and "qdd" not in log.derived else None
+    levels = noise_levels(log) if "qdd" not in log.derived else None
     if levels is None:
         return [], log
     top, middle = levels
     stated = log.header.noise_std
     filtered = top < FILTERED * middle
     evidence = {"white_noise_std": float(np.median(top)), "std_at_a_third": float(np.median(middle))}
-    if stated is None:
-        # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
-        weight = "note"
-    else:
+    if stated is not None:
         evidence["stated_std"] = stated
         filtered &= top < stated / NOISE_FACTOR
-        weight = "warning"
     if filtered.mean() > 0.5 and not log.header.filtered:
         joints = log.named(filtered)
+        # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
+        weight = "note" if stated is None else "warning"
         text = (
             f"the acceleration is filtered: at the highest frequencies it holds "
             f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them, "
@@ -371,15 +366,14 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _stated(log: Log, noise: Array, stated: float, evidence: dict[str, float]) -> list[Finding]:
-    kinds = {"noise-understated": noise > NOISE_FACTOR * stated}
+    kinds = [("noise-understated", noise > NOISE_FACTOR * stated, np.max)]
     if not log.header.filtered:  # the highest frequencies show little of what a filter lets through
-        kinds["noise-overstated"] = noise < stated / NOISE_FACTOR
+        kinds.append(("noise-overstated", noise < stated / NOISE_FACTOR, np.min))
     result = []
-    for kind, wrong in kinds.items():
+    for kind, wrong, worst in kinds:
         if wrong.any():
             joints = log.named(wrong)
-            worst = noise[wrong].max() if kind == "noise-understated" else noise[wrong].min()
-            place = f"{worst:.3g} rad/s² at {', '.join(joints)}"
+            place = f"{worst(noise[wrong]):.3g} rad/s² at {', '.join(joints)}"
             text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
             result.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
     return result

@@ -55,11 +55,9 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
     radians = log.replace(**{name: getattr(log, name) * factor for name in _angles(log, turning)})
     if _misfit(system, radians) > _misfit(system, log):
         return [], log
-    text = (
-        f"angles reach {largest:.4g}, beyond the joint limits in {100 * outside:.0f} % of the rows: degrees"
-    )
-    names = tuple(np.array(log.joint_names)[turning])
-    return [Finding("degrees", text, log.all_rows, names, evidence={"largest": largest})], radians
+    beyond = f"beyond the joint limits in {100 * outside:.0f} % of the rows"
+    text, evidence = f"angles reach {largest:.4g}, {beyond}: degrees", {"largest": largest}
+    return [Finding("degrees", text, log.all_rows, log.named(turning), evidence=evidence)], radians
 
 
 def _misfit(system: ConstrainedSystem, log: Log) -> float:
@@ -93,12 +91,10 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
         with np.errstate(invalid="ignore"):
             beyond = ((value < low - slack) | (value > high + slack)) & log.usable[:, None]
         if beyond.any():
-            rows = intervals(beyond.any(axis=1))
-            joints = log.named(beyond.any(axis=0))
+            hit, joints = any_row(beyond), log.named(beyond.any(axis=0))
+            rows = intervals(hit)
             text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in {describe(rows)}"
-            findings.append(
-                Finding(kinds[name], text, rows, joints, evidence={"rows": beyond.any(axis=1).sum()})
-            )
+            findings.append(Finding(kinds[name], text, rows, joints, evidence={"rows": hit.sum()}))
     return findings, log
 
 

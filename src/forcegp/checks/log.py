@@ -185,6 +185,10 @@ class Log:
         """`(n,)` rows that are finite and not masked."""
         return self.finite if self.masked is None else self.finite & ~self.masked
 
+    def reach(self, name: str) -> Array:
+        """`(nq,)` range of a column without its outermost values."""
+        return np.ptp(np.percentile(getattr(self, name)[self.usable], (0.5, 99.5), axis=0), axis=0)
+
     @cached_property
     def steps(self) -> Array:
         """`(n − 1,)` time steps, NaN between segments."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -97,60 +97,35 @@ def _without_torque(log: Log) -> list[Finding]:
     return [Finding("torque-zero", text, log.all_rows, joints, weight=weight)]
 
 
-@dataclass(frozen=True)
-class _Part:
-    """What leaving out a part of the nuisance costs a joint."""
-
-    gain: float
-    error: float
-
-    @property
-    def there(self) -> bool:
-        return self.gain > MATERIAL and self.gain > SIGNIFICANT * self.error
-
-
-def _part(explanation: Explanation, j: int, columns: list[int]) -> _Part:
-    """Compare the error of joint j with and without some columns of the nuisance."""
+def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
+    """Whether leaving out some columns of the nuisance raises the error of joint j."""
     problem = explanation.problem
     keep = np.setdiff1d(np.arange(problem.nuisance.shape[-1]), columns)
     less = replace(problem, nuisance=problem.nuisance[..., keep])
     without = cross_validate(less, explanation.columns, explanation.prior)
     floor = FLOOR * problem.size[j] / problem.scale[j]
     gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (explanation.fit, without)))
-    return _Part(gain, error)
+    return gain > MATERIAL and gain > SIGNIFICANT * error
 
 
 def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) -> Explanation:
     """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
-    columns = np.concatenate(
-        [
-            contact_friction_columns(system, explanation.log, explanation.rows),
-            sharper_friction_columns(system, explanation.log, explanation.rows),
-        ],
-        axis=-1,
-    )
-    if not columns.shape[-1]:
-        return explanation
-    nuisance = np.concatenate([explanation.problem.nuisance, columns], axis=-1)
-    problem = replace(explanation.problem, nuisance=nuisance)
-    fit = cross_validate(problem, explanation.columns, explanation.prior)
-    return replace(explanation, problem=problem, fit=fit)
+    functions = (contact_friction_columns, sharper_friction_columns)
+    columns = [columns(system, explanation.log, explanation.rows) for columns in functions]
+    nuisance = np.concatenate([explanation.problem.nuisance, *columns], axis=-1)
+    return replace(explanation, problem=replace(explanation.problem, nuisance=nuisance))
 
 
 def _confounded(explanation: Explanation) -> list[Finding]:
     """The faults found; gains are no error beside masses that do not fit, which are their yardstick."""
-    if "masses" not in explanation.robot:
-        return explanation.findings
-    return [
-        replace(
-            finding,
-            message=f"{finding.message}; or the masses, which do not fit either, are to blame for both",
-            weight="warning",
-        )
-        if finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds
-        else finding
-        for finding in explanation.findings
-    ]
+    findings = []
+    for finding in explanation.findings:
+        current = finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds
+        if current and "masses" in explanation.robot:
+            text = f"{finding.message}; or the masses, which do not fit either, are to blame for both"
+            finding = replace(finding, message=text, weight="warning")
+        findings.append(finding)
+    return findings
 
 
 def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
@@ -162,22 +137,21 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     speeds = np.percentile(np.abs(rows), SPEEDS, axis=0)
     damping, declared = robot.damping.numpy(), robot.friction.numpy()
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
-    significant = np.array([_part(explanation, j, [j, nq + j]).there for j in range(nq)])
+    significant = np.array([_matters(explanation, j, [j, nq + j]) for j in range(nq)])
     significant &= resists & ~still_joints(log)
     findings = []
     for hit, word in ((significant & (power > 0.0), "more"), (significant & (power <= 0.0), "less")):
         if not hit.any():
             continue
-        index = np.flatnonzero(hit)
-        joints = tuple(log.joint_names[j] for j in index)
+        joints, units = log.named(hit), [force_unit(robot, j) for j in range(nq)]
         listed = ", ".join(
-            f"{log.joint_names[j]} {viscous[j]:.3g} {force_unit(robot, j)} s/{position_unit(robot, j)}, "
-            f"{coulomb[j]:.3g} {force_unit(robot, j)}"
-            for j in index
+            f"{log.joint_names[j]} {viscous[j]:.3g} {units[j]} s/{position_unit(robot, j)}, "
+            f"{coulomb[j]:.3g} {units[j]}"
+            for j in np.flatnonzero(hit)
         )
         text = f"joints show {word} friction than the robot file declares (viscous, Coulomb): {listed}"
-        evidence = {f"viscous {log.joint_names[j]}": viscous[j] for j in index}
-        evidence |= {f"coulomb {log.joint_names[j]}": coulomb[j] for j in index}
+        evidence = dict(zip((f"viscous {joint}" for joint in joints), viscous[hit], strict=True))
+        evidence |= dict(zip((f"coulomb {joint}" for joint in joints), coulomb[hit], strict=True))
         findings.append(Finding("friction-undeclared", text, log.all_rows, joints, evidence=evidence))
     return findings
 
@@ -185,12 +159,12 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
 def _offsets(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     log, nq = explanation.log, explanation.log.nq
     offset = -explanation.fit.nuisance[2 * nq : 3 * nq]
-    index = [j for j in range(nq) if _part(explanation, j, [2 * nq + j]).there]
-    if not index:
+    off = {j: log.joint_names[j] for j in range(nq) if _matters(explanation, j, [2 * nq + j])}
+    if not off:
         return []
-    joints = tuple(log.joint_names[j] for j in index)
-    listed = ", ".join(f"{log.joint_names[j]} {offset[j]:+.3g} {force_unit(robot, j)}" for j in index)
-    evidence = {f"offset {log.joint_names[j]}": offset[j] for j in index}
+    joints = tuple(off.values())
+    listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(robot, j)}" for j, joint in off.items())
+    evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
     text = f"the logged torque is off by a constant: {listed}"
     return [Finding("torque-offset", text, log.all_rows, joints, evidence=evidence)]
 
@@ -230,8 +204,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
         f"torque of up to {peak:.3g} {force_unit(system.robot, worst)} at {log.joint_names[worst]} that "
         f"neither robot nor labelled contacts explain, in {describe(whole)}"
     )
-    evidence = {"peak": peak}
-    return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence=evidence)], mask
+    return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence={"peak": peak})], mask
 
 
 def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
@@ -278,10 +251,9 @@ def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np
     log, scale = explanation.log, explanation.problem.scale
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
-        remainder = residual(system, log, index)
+        r, J = residual(system, log, index)
         columns = [robot_columns(system, log, index, name)[0] for name in explanation.robot]
         columns = np.concatenate([*columns, friction_columns(system, log, index)], axis=-1)
-        r = remainder.r - columns @ coefficients
-        P = projector(remainder.J, scale)
-        parts.append((P @ (r / scale)[..., None])[..., 0] * scale)
+        r = r - columns @ coefficients
+        parts.append((projector(J, scale) @ (r / scale)[..., None])[..., 0] * scale)
     return np.concatenate(parts)

@@ -8,20 +8,15 @@ surface in all rows.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
-from itertools import combinations
+from dataclasses import replace
 
 import numpy as np
-import torch
 
-from forcegp import kinematics
-from forcegp.checks.contact import FAR, LEAST_ROWS, OFFSET, fit_surface, tip_path
+from forcegp.checks.contact import FAR, OFFSET, fit_surface, tip_path, touching
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import tensors
-from forcegp.checks.hypotheses import Hypothesis, flipped, swapped, unchanged
-from forcegp.checks.log import Array, Log, Outcome, displacement, evenly
+from forcegp.checks.hypotheses import Hypothesis, corrected, discrete, unchanged
+from forcegp.checks.log import Log, Outcome, displacement, evenly
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.data.fields import JOINT_VECTORS
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
 
@@ -36,12 +31,11 @@ STEPS = 6
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
     """Joints that turn the other way, are exchanged or have an offset, told by the tip in contact."""
-    for contact, rows in _touching(system, log):
-        path = tip_path(system, contact, log)
-        if abs(np.median(path.c[rows])) <= FAR:
+    for contact, rows in touching(system, log):
+        path = tip_path(system, contact, log, rows)
+        if abs(np.median(path.c)) <= FAR:
             continue
-        closed = log.contact[contact.name] & log.usable
-        scatter = robust_std((path.c - fit_surface(contact, path, closed)[2])[closed])
+        scatter = robust_std(path.c - fit_surface(contact, path, np.ones(len(rows), bool))[2])
         rows = evenly(rows, ROWS)
         outcome = _explanation(system, contact, log, rows, min(OFFSET, BETTER * float(scatter)))
         if outcome is not None:
@@ -49,20 +43,11 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
     return [], log
 
 
-def _touching(system: ConstrainedSystem, log: Log) -> Iterator[tuple[SurfaceContact, np.ndarray]]:
-    """The contacts with surfaces that are labelled as closed in enough rows, and these rows."""
-    for contact in system.contacts:
-        if isinstance(contact, SurfaceContact) and contact.name in log.contact:
-            rows = np.flatnonzero(log.contact[contact.name] & log.usable)
-            if len(rows) >= LEAST_ROWS:
-                yield contact, rows
-
-
 def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
     """Whether changed angles take a tip off the surface in rows that are labelled as contact."""
     if after.q is before.q:
         return False
-    for contact, rows in _touching(system, before):
+    for contact, rows in touching(system, before):
         rows = rows[:: max(1, len(rows) // ROWS)]
         if _off(system, contact, before, rows) <= FAR < _off(system, contact, after, rows):
             return True
@@ -73,9 +58,9 @@ def _explanation(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, most: float
 ) -> Outcome | None:
     """The change of angles that leaves the tip on the surface, if there is one."""
-    for candidates in (_discrete(log), _offsets(system, contact, log, rows)):
-        tried = [(h, changed, _off(system, contact, changed, rows)) for h, changed in candidates]
-        near = [(h, changed) for h, changed, off in tried if off <= most]
+    angles = ((h, h.change(log)) for h in discrete(log) if h.name in ("joint-sign", "joint-order"))
+    for candidates in (angles, _offsets(system, contact, log, rows)):
+        near = [(h, changed) for h, changed in candidates if _off(system, contact, changed, rows) <= most]
         if near:
             # Two joints that turn in one plane and their mirror image touch alike.
             alike = [h for h, _ in near if h.name == near[0][0].name]
@@ -85,23 +70,7 @@ def _explanation(
 
 def _off(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> float:
     """Median distance of the tip from the surface [m]."""
-    return float(np.median(np.abs(_distance(system, contact, log, rows))))
-
-
-def _distance(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> Array:
-    (q,) = tensors(log, rows, "q")
-    with torch.no_grad():
-        p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
-        return contact.center_surface.value(p).numpy()
-
-
-def _discrete(log: Log) -> Iterator[tuple[Hypothesis, Log]]:
-    for j in range(log.nq):
-        change = partial(flipped, j=j, names=JOINT_VECTORS)
-        yield Hypothesis("joint-sign", 0, change, joints=(j,)), change(log)
-    for i, j in combinations(range(log.nq), 2):
-        change = partial(swapped, i=i, j=j, names=JOINT_VECTORS)
-        yield Hypothesis("joint-order", 0, change, joints=(i, j)), change(log)
+    return float(np.median(np.abs(tip_path(system, contact, log, rows).c)))
 
 
 def _offsets(
@@ -109,20 +78,14 @@ def _offsets(
 ) -> Iterator[tuple[Hypothesis, Log]]:
     """Each encoder with the offset that takes the tip to the surface, by Gauss-Newton steps."""
     for j in range(log.nq):
-        offset = 0.0
+        hypothesis, offset = Hypothesis("encoder-offset", 1, unchanged, joints=(j,)), np.zeros(1)
         for _ in range(STEPS):
-            c = _distance(system, contact, _moved(log, j, offset), rows)
-            slope = (_distance(system, contact, _moved(log, j, offset + 1e-5), rows) - c) / 1e-5
-            offset -= float((slope @ c) / max(slope @ slope, 1e-12))
-        if abs(offset) <= LARGEST:
-            hypothesis = Hypothesis("encoder-offset", 1, unchanged, np.array([offset]), joints=(j,))
-            yield hypothesis, _moved(log, j, offset)
-
-
-def _moved(log: Log, j: int, offset: float) -> Log:
-    q = log.q.copy()
-    q[:, j] += offset
-    return log.replace(q=q)
+            c = tip_path(system, contact, corrected(log, hypothesis, offset), rows).c
+            ahead = tip_path(system, contact, corrected(log, hypothesis, offset + 1e-5), rows).c
+            slope = (ahead - c) / 1e-5
+            offset = offset - (slope @ c) / max(slope @ slope, 1e-12)
+        if abs(offset[0]) <= LARGEST:
+            yield replace(hypothesis, columns=offset), corrected(log, hypothesis, offset)
 
 
 def _finding(robot: RobotModel, log: Log, contact: SurfaceContact, alike: list[Hypothesis]) -> Finding:

@@ -26,16 +26,15 @@ def _after(mask: np.ndarray) -> tuple[tuple[int, int], ...]:
 
 def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
     """Time stamps that repeat or run backward within a segment."""
-    if not log.header.ordered:
-        return [], log
-    findings = []
-    for kind, mask in (("time-repeated", log.steps == 0.0), ("time-backward", log.steps < 0.0)):
+    findings, repeated, backward = [], log.steps == 0.0, log.steps < 0.0
+    for kind, word, mask in (
+        ("time-repeated", "repeats", repeated),
+        ("time-backward", "runs backward", backward),
+    ):
         if mask.any():
             rows = _after(mask)
-            word = "repeats" if kind == "time-repeated" else "runs backward"
-            findings.append(
-                Finding(kind, f"time {word} in {describe(rows)}", rows, evidence={"steps": mask.sum()})
-            )
+            text = f"time {word} in {describe(rows)}"
+            findings.append(Finding(kind, text, rows, evidence={"steps": mask.sum()}))
     wrong = np.concatenate([[False], log.steps <= 0.0])
     return findings, log.mask(wrong) if findings else log
 
@@ -47,7 +46,7 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
     if log.masked is not None:
         # The step after a wrong time stamp is long because of that stamp.
         gaps &= ~log.masked[:-1]
-    if not gaps.any() or not log.header.ordered:
+    if not gaps.any():
         return [], log
     rows, longest = _after(gaps), float(np.nanmax(log.steps))
     missing = int(np.round(log.steps[gaps] / log.dt - 1.0).sum())
@@ -62,7 +61,7 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
     """Steps that are so uneven that filters for even sampling do not apply."""
     with np.errstate(invalid="ignore"):
         regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
-    if len(regular) < 2 or not log.header.ordered:
+    if len(regular) < 2:
         return [], log
     spread = float(robust_std(regular) / log.dt)
     if spread <= UNIFORM_TOLERANCE:
@@ -75,12 +74,7 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
 def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
     """The sampling period against that of the header."""
     stated = log.header.dt
-    if (
-        stated is None
-        or not log.header.ordered
-        or not np.isfinite(log.dt)
-        or abs(log.dt / stated - 1.0) <= UNIFORM_TOLERANCE
-    ):
+    if stated is None or not abs(log.dt / stated - 1.0) > UNIFORM_TOLERANCE:
         return [], log
     text = f"the header states a period of {stated:.4g} s, and the rows are {log.dt:.4g} s apart"
     evidence = {"stated_s": stated, "period_s": log.dt}
@@ -135,8 +129,6 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
     """Rows in which every logged channel repeats while the arm moves."""
-    if not log.header.ordered:
-        return [], log
     same = np.ones(len(log) - 1, bool)
     for value in logged(log).values():
         same &= (np.diff(value, axis=0) == 0.0).all(axis=1)
@@ -152,7 +144,7 @@ def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
     """A channel that keeps one value while its joint moves by more than its own resolution explains."""
-    if not log.header.ordered or not np.isfinite(log.dt):
+    if not np.isfinite(log.dt):
         return [], log
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
     for name, value in logged(log).items():
@@ -196,9 +188,9 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     """Single values far off the curve through their neighbours."""
     bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
-    for name, value in vectors.items():
+    for name in vectors:
         departure, around, scale = departures[name]
-        reach = np.ptp(np.percentile(value[log.usable], (0.5, 99.5), axis=0), axis=0)
+        reach = log.reach(name)
         least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
         # Next to a contact switch values jump by nature.
         outlier = (
@@ -211,10 +203,9 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
         if name == "qdd" and "tau" in vectors:
             outlier &= ~_driven(system, log, departure, outlier)
         # The neighbours of a spike are off as well, by less.
-        for j in np.flatnonzero(outlier.any(axis=0)):
-            peak = outlier[:, j] & (np.abs(departure[:, j]) >= _neighbour_peak(np.abs(departure[:, j])))
-            bad |= peak
-            hit += [f"{name}.{log.joint_names[j]}"] * bool(peak.any())
+        peak = outlier & (np.abs(departure) >= _within_two(np.abs(departure)))
+        bad |= any_row(peak)
+        hit += [f"{name}.{joint}" for joint in log.named(peak.any(axis=0))]
     if not bad.any():
         return [], log
     rows = intervals(bad)
@@ -258,7 +249,7 @@ def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.n
     """`(n, nq)` bool, accelerations that a step of the joint's own torque makes: Δτ_j (M⁻¹)_jj."""
     step = np.pad(np.abs(np.diff(log.tau, axis=0)), ((1, 1), (0, 0)))
     step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
-    rows = np.flatnonzero(outlier.any(axis=1))
+    rows = np.flatnonzero(any_row(outlier))
     if len(rows):
         M = dynamics.mass_matrix(system.robot, tensors(log, rows, "q")[0])
         inverse = torch.linalg.inv(M).diagonal(dim1=-2, dim2=-1).detach().numpy()
@@ -268,10 +259,8 @@ def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.n
 
 def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) -> Array:
     """Largest departure within two rows over the range of the column; zero where it may be noise."""
-    reach = np.ptp(np.percentile(getattr(log, name)[log.usable], (0.5, 99.5), axis=0), axis=0)
-    large = np.where(np.abs(departure) > SPIKE * scale, np.abs(departure) / np.maximum(reach, 1e-300), 0.0)
-    padded = np.pad(large, ((2, 2), (0, 0)))
-    return np.max([padded[k : len(departure) + k] for k in range(5)], axis=0)
+    size, reach = np.abs(departure), log.reach(name)
+    return _within_two(np.where(size > SPIKE * scale, size / np.maximum(reach, 1e-300), 0.0))
 
 
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
@@ -279,10 +268,9 @@ def _one_value(departure: Array, scale: Array) -> np.ndarray:
 
     A value that is off by h departs by h, its neighbours by −4h/6 and h/6; a kink or a step has other shapes.
     """
-    padded = np.pad(departure, ((2, 2), (0, 0)))
-    n, misfit = len(departure), np.zeros_like(departure)
-    for k, share in ((0, 1.0 / 6.0), (1, -4.0 / 6.0), (3, -4.0 / 6.0), (4, 1.0 / 6.0)):
-        misfit = np.maximum(misfit, np.abs(padded[k : n + k] - share * departure))
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
+    shape = departure[..., None] * np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
+    misfit = np.abs(around - shape).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
 
 
@@ -290,15 +278,15 @@ def _switches(log: Log) -> np.ndarray:
     """`(n,)` bool, rows within two of a contact switch."""
     near = np.zeros(len(log), bool)
     for label in log.contact.values():
-        for k in np.flatnonzero(label[1:] != label[:-1]) + 1:
-            near[max(k - 2, 0) : k + 3] = True
-    return near
+        near[1:] |= label[1:] != label[:-1]
+    return _within_two(near)
 
 
-def _neighbour_peak(x: Array) -> Array:
-    """Largest of the two neighbours on either side."""
-    padded = np.pad(x, 2)
-    return np.max([padded[k : len(x) + k] for k in (0, 1, 3, 4)], axis=0)
+def _within_two(x: Array) -> Array:
+    """Largest value within two rows."""
+    from scipy.ndimage import maximum_filter1d
+
+    return maximum_filter1d(x, 5, axis=0, mode="constant")
 
 
 def resolution(x: Array) -> Array:
@@ -317,7 +305,7 @@ def resolution(x: Array) -> Array:
 def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
     """Encoder steps so coarse that they dominate a differentiated position."""
     q = log.q[log.usable]
-    if len(q) < 50 or not np.isfinite(log.dt):
+    if len(q) < FEWEST:
         return [], log
     step = resolution(q)
     # A step Δ is noise of Δ/√12; the difference of two samples over dt has √2 of it.
@@ -367,7 +355,7 @@ def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
 
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
     """Positions that jump beyond what the velocity accounts for: rows are missing, or a joint wrapped."""
-    if not log.stretches or "qd" in log.derived:
+    if "qd" in log.derived:
         return [], log
     jumps = _jumps(log.q, log.qd, log)
     if not jumps.any():
@@ -381,14 +369,13 @@ def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
     """Velocities that jump where the acceleration does not account for it: impacts."""
-    if not log.stretches or log.derived:
+    if log.derived:
         return [], log
     jumps = _jumps(log.qd, log.qdd, log)
     if not jumps.any():
         return [], log
-    rows = intervals(any_row(jumps))
-    joints = log.named(jumps.any(axis=0))
-    text = f"the velocity jumps, as at an impact, at {describe(rows)}"
     around = any_row(jumps)
+    rows = intervals(around)
+    text = f"the velocity jumps, as at an impact, at {describe(rows)}"
     around[:-1] |= around[1:]
-    return [Finding("impact", text, rows, joints)], log.mask(around)
+    return [Finding("impact", text, rows, log.named(jumps.any(axis=0)))], log.mask(around)

@@ -15,12 +15,12 @@ import torch
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import DataHeader, Dataset
 from forcegp.errors import DataError
-from forcegp.logs.clock import usual_step
+from forcegp.logs.clock import even_clock, usual_step
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
-from forcegp.logs.signals import ImportFinding, ImportReport, Signals
-from forcegp.logs.smoothing import add_derivatives, even_clock, impact_mask
+from forcegp.logs.signals import Array, ImportFinding, ImportReport, Signals
+from forcegp.logs.smoothing import add_derivatives, impact_mask
 from forcegp.resources import announce_memory
 from forcegp.robot import RobotModel
 from forcegp.scene import Scene, load_scene
@@ -121,7 +121,8 @@ def import_log(
     report.did(f"read {Path(path).name} by mapping {Path(log_mapping.source).name}")
     try:
         signals = gather(path, log_mapping, robot.joint_names, report, progress)
-        announce_memory(_bytes(signals), f"importing {len(signals):,} rows")
+        numbers = NUMBERS * len(signals.joint_names) * len(signals)
+        announce_memory(8 * numbers, f"importing {len(signals):,} rows")
         even_clock(signals, log_mapping.sections.time.period, report)
         evidence = _contacts(signals, system, log_mapping, report)
         std = add_derivatives(signals, log_mapping.sections.derivatives, report)
@@ -138,10 +139,6 @@ def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> Con
     if isinstance(scene, RobotModel):
         return ConstrainedSystem(scene)
     return (scene if isinstance(scene, Scene) else load_scene(scene)).system()
-
-
-def _bytes(signals: Signals) -> int:
-    return 8 * NUMBERS * len(signals.joint_names) * len(signals)
 
 
 def _contacts(
@@ -163,11 +160,7 @@ def _contacts(
 
 
 def _dataset(
-    signals: Signals,
-    std: np.ndarray | None,
-    mapping: Mapping,
-    system: ConstrainedSystem,
-    report: ImportReport,
+    signals: Signals, std: Array | None, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
 ) -> Dataset:
     """The data set of finished signals."""
     robot = system.robot
@@ -203,8 +196,7 @@ def _contact_extras(
     signals: Signals, margin: float, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
 ) -> dict[str, dict[str, torch.Tensor]]:
     """Rows at impacts of each contact, and the forces that a sensor measured there."""
-    masks = impact_mask(signals, margin)
-    impact = {name: torch.from_numpy(value.astype(np.float64)) for name, value in masks.items()}
+    impact = {name: _tensor(mask.astype(np.float64)) for name, mask in impact_mask(signals, margin).items()}
     extras = {"impact": impact} if impact else {}
     if "wrench" in signals.vectors and signals.contact:
         sensed = per_contact(signals, system, mapping)

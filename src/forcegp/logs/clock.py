@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.errors import DataError
-from forcegp.logs.signals import Array, ImportReport, Signals, listed, runs
+from forcegp.logs.signals import Array, ImportReport, Signals, listed
 
 RESTART_STEPS = 2.0
 """A clock that falls back to within so many steps of where its trajectory began, or before, has restarted."""
@@ -28,7 +28,9 @@ def usual_step(t: Array) -> float:
     steps = steps[steps > 0.0]
     if not len(steps):
         raise DataError(
-            "time never increases in the log", expected="a column of time stamps", got=listed_values(t)
+            "time never increases in the log",
+            expected="a column of time stamps",
+            got=", ".join(f"{stamp:.6g}" for stamp in t[:5]) + (", …" if len(t) > 5 else ""),
         )
     return float(np.median(steps))
 
@@ -80,7 +82,13 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
                 wrong.append(row)
             else:
                 start = row
-        _refuse_steps_back(signals, np.array(wrong, dtype=np.int64))
+        if wrong:
+            raise DataError(
+                f"time goes back in row{'s' * (len(wrong) > 1)} {listed(signals.row[wrong])}",
+                expected=f"more than {t[wrong[0] - 1]:.9g} s in row {signals.row[wrong[0]]}",
+                got=f"{t[wrong[0]]:.9g} s",
+                hint="sort the log by time, or take a column of time that increases within a trajectory",
+            )
         report.find("restart", f"the clock restarts {back.sum()} times: a trajectory each", signals.row[back])
     longest = gap if gap is not None else GAP_STEPS * step
     gaps = np.concatenate([[False], np.diff(t) > longest]) & ~new & ~back
@@ -90,28 +98,11 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
     signals.segment = np.cumsum(new | back | gaps) - 1
 
 
-def _refuse_steps_back(signals: Signals, rows: NDArray[np.int64]) -> None:
-    if not len(rows):
-        return
-    first, t = int(rows[0]), signals.t
-    raise DataError(
-        f"time goes back in row{'s' * (len(rows) > 1)} {listed(signals.row[rows])}",
-        expected=f"more than {t[first - 1]:.9g} s in row {signals.row[first]}",
-        got=f"{t[first]:.9g} s",
-        hint="sort the log by time, or take a column of time that increases within a trajectory",
-    )
-
-
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
-    """Find rows whose positions and torques are those of the row before, to the last bit.
+    """Find, and if asked drop, rows whose positions and torques are those of the row before, to the last bit.
 
     A logger that is faster than its source writes such rows; they flatten derivatives. At rest, an
     encoder's position stays the same, so only rows in which the torque stays too are counted.
-
-    Args:
-        signals: the log.
-        drop: drop them; the clock is made even again later.
-        report: gets what was found.
     """
     held = np.zeros(len(signals), dtype=bool)
     held[1:] = signals.segment[1:] == signals.segment[:-1]
@@ -120,51 +111,10 @@ def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
         held[1:] &= (values[1:] == values[:-1]).all(axis=1)
     if held.any():
         done = "were dropped" if drop else 'are kept; held = "drop" under [time] drops them'
-        report.find(
-            "held", f"{held.sum()} rows hold the values of the row before and {done}", signals.row[held]
-        )
+        message = f"{held.sum()} rows hold the values of the row before and {done}"
+        report.find("held", message, signals.row[held])
         if drop:
             signals.keep(~held)
-
-
-def unevenness(t: Array, segment: NDArray[np.int64]) -> float:
-    """Largest departure of a step within a trajectory from that trajectory's median step, as a fraction."""
-    worst = 0.0
-    for rows in runs(segment):
-        steps = np.diff(t[rows])
-        if len(steps):
-            median = float(np.median(steps))
-            worst = max(worst, float(np.abs(steps - median).max()) / median)
-    return worst
-
-
-def listed_values(values: Array) -> str:
-    """The first values of a column."""
-    return ", ".join(f"{v:.6g}" for v in values[:5]) + (", …" if len(values) > 5 else "")
-
-
-SMOOTH = ("q", "qd")
-"""What is interpolated by a cubic spline; noisier quantities are interpolated linearly."""
-
-
-def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
-    """Values of a stream at other times, column by column.
-
-    Args:
-        t: `(n,)` increasing stamps of the stream [s].
-        values: `(n, d)`.
-        at: `(k,)` times within the stream's [s].
-        cubic: by a cubic spline (not-a-knot) instead of linearly.
-    """
-    from scipy.interpolate import CubicSpline
-
-    result = np.empty((len(at), values.shape[1]))
-    for i in range(values.shape[1]):
-        if cubic and len(t) >= 4:
-            result[:, i] = CubicSpline(t, values[:, i])(at)
-        else:
-            result[:, i] = np.interp(at, t, values[:, i])
-    return result
 
 
 def join_stream(
@@ -179,7 +129,7 @@ def join_stream(
         signals: the log.
         name: under which the vector is added.
         t, values: the stream, `(k,)` and `(k, d)`.
-        gap: longest step of the stream that is interpolated over [s], or `None` for five usual steps.
+        gap: longest step of the stream that is interpolated over [s], or `None` for `GAP_STEPS` usual steps.
         report: gets what was dropped.
 
     Raises:
@@ -192,7 +142,7 @@ def join_stream(
             expected="increasing stamps, to align it with the positions",
             hint="import the trajectories one by one",
         )
-    longest = gap if gap is not None else 5.0 * usual_step(t)
+    longest = gap if gap is not None else GAP_STEPS * usual_step(t)
     after = np.searchsorted(t, signals.t, side="left").clip(1, len(t) - 1)
     covered = (signals.t >= t[0]) & (signals.t <= t[-1])
     covered &= (t[after] - t[after - 1] <= longest) | (signals.t == t[after])
@@ -206,47 +156,61 @@ def join_stream(
     if not covered.all():
         message = f"{(~covered).sum()} rows without {name} were dropped"
         report.find("uncovered", message, signals.row[~covered])
-        # What lies on two sides of dropped rows is not one trajectory.
-        cut = np.concatenate([[False], covered[1:] & ~covered[:-1]])
-        signals.segment = signals.segment + np.cumsum(cut)
-        signals.keep(covered)
+        signals.keep(covered, split=True)
     signals.vectors[name] = onto(t, values, signals.t)
     report.did(f"interpolated {name} from {1.0 / usual_step(t):.4g} Hz onto the clock of the positions")
 
 
-def make_even(signals: Signals, period: float | None, report: ImportReport) -> None:
-    """Put every trajectory on an evenly spaced clock of its own start.
+UNEVEN = 0.02
+"""Largest departure of a time step from the usual one, as a fraction, that passes for even."""
+SMOOTH = ("q", "qd")
+"""What is interpolated by a cubic spline; noisier quantities are interpolated linearly."""
+
+
+def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
+    """Values `(n, d)` of a stream with increasing stamps t, at other times within its own `(k, d)`.
+
+    The interpolation is linear, or by a cubic spline (not-a-knot) where there are four rows.
+    """
+    from scipy.interpolate import CubicSpline, make_interp_spline
+
+    return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)
+
+
+def even_clock(signals: Signals, period: float | None, report: ImportReport) -> None:
+    """Put every trajectory on an evenly spaced clock of its own start, if its own is uneven.
 
     Args:
         signals: the log.
         period: the time step [s], or `None` for the log's usual step.
-        report: gets the step.
+        report: gets the step, and how uneven the clock was.
     """
+    steps = [np.diff(signals.t[rows]) for rows in signals.runs() if rows.stop - rows.start > 1]
+    worst = max((float(np.abs(s - np.median(s)).max() / np.median(s)) for s in steps), default=0.0)
+    if worst > UNEVEN:
+        report.find("uneven", f"time steps depart by up to {100.0 * worst:.3g} % from the usual step")
+    elif period is None:
+        return
     step = period if period is not None else usual_step(signals.t)
-    grids, rows, segments = [], [], []
-    stretches = [s for s in signals.runs() if s.stop - s.start > 1]
-    for stretch in stretches:
-        t = signals.t[stretch]
-        count = int(np.floor((t[-1] - t[0]) / step + 1e-6)) + 1
-        grid = np.minimum(t[0] + step * np.arange(count), t[-1])
-        grids.append(grid)
-        nearest = np.searchsorted(t, grid + 0.5 * step).clip(1, len(t)) - 1
-        rows.append(nearest + stretch.start)
-        segments.append(np.full(count, signals.segment[stretch.start]))
-    if not grids:
+    stretches = [rows for rows in signals.runs() if rows.stop - rows.start > 1]
+    if not stretches:
         raise DataError("the log has no trajectory of two rows or more")
+    grids, nearest = [], []
+    for rows in stretches:
+        t = signals.t[rows]
+        count = int(np.floor((t[-1] - t[0]) / step + 1e-6)) + 1
+        grids.append(np.minimum(t[0] + step * np.arange(count), t[-1]))
+        nearest.append(np.searchsorted(t, grids[-1] + 0.5 * step).clip(1, len(t)) - 1 + rows.start)
     for name in list(signals.vectors):
         old = signals.vectors.pop(name)
-        parts = [
-            onto(signals.t[s], old[s], grid, cubic=name in SMOOTH)
-            for s, grid in zip(stretches, grids, strict=True)
-        ]
+        pairs = zip(stretches, grids, strict=True)
+        parts = [onto(signals.t[s], old[s], grid, cubic=name in SMOOTH) for s, grid in pairs]
         signals.vectors[name] = np.concatenate(parts)
-    index: NDArray[np.int64] = np.concatenate(rows)
+    index: NDArray[np.int64] = np.concatenate(nearest)
     signals.contact = {name: value[index] for name, value in signals.contact.items()}
     signals.t, signals.row, signals.segment = (
         np.concatenate(grids),
         signals.row[index],
-        np.concatenate(segments),
+        signals.segment[index],
     )
     report.did(f"resampled to steps of {step:.9g} s (positions by cubic splines, torques linearly)")

@@ -14,7 +14,7 @@ The tool's inertial force m_T p̈_T is not taken off: it is small for light tool
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
-from forcegp.logs.mapping import ContactStateSection, Mapping, WrenchSection
+from forcegp.logs.mapping import ContactStateSection, Mapping
 from forcegp.logs.signals import Array, ImportReport, Signals, runs
 from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
@@ -33,15 +33,30 @@ CHUNK = 1 << 12
 """Rows that are computed at a time."""
 
 
-def _chunks(signals: Signals, *names: str) -> Iterator[tuple[slice, list[torch.Tensor]]]:
-    """Blocks of rows, with their vectors as tensors."""
+def _rowwise(signals: Signals, names: Sequence[str], function: Callable[..., torch.Tensor]) -> Array:
+    """A function of some vectors of the log, block by block of its rows."""
+    blocks = []
     for start in range(0, len(signals), CHUNK):
         rows = slice(start, start + CHUNK)
-        yield rows, [torch.from_numpy(np.ascontiguousarray(signals.vectors[name][rows])) for name in names]
+        vectors = (torch.from_numpy(np.ascontiguousarray(signals.vectors[name][rows])) for name in names)
+        blocks.append(function(*vectors).numpy())
+    return np.concatenate(blocks)
 
 
-def at_sensor(signals: Signals, robot: RobotModel, mapping: Mapping) -> tuple[Array, Array]:
-    """Force, and moment about the sensor, in world axes, without the tool's weight; `(n, 3)` each [N], [N m].
+def _tip(system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor) -> torch.Tensor:
+    return kinematics.point_position(system.robot, q, contact.frame, tuple(contact.point))
+
+
+def _wrench(
+    robot: RobotModel, mapping: Mapping, q: torch.Tensor, reading: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Force, moment about the sensor and its position, `(n, 3)` each, in the world, less the tool's weight.
+
+    Args:
+        robot: the robot.
+        mapping: describes the sensor.
+        q: `(n, nq)` positions.
+        reading: `(n, 6)` force and moment in the sensor's axes or the world's [N], [N m].
 
     Raises:
         MappingError: the sensor's frame is none of the robot.
@@ -51,33 +66,14 @@ def at_sensor(signals: Signals, robot: RobotModel, mapping: Mapping) -> tuple[Ar
     if section.frame not in robot.frame_names:
         listing = ", ".join(robot.frame_names)
         raise mapping.error(("wrench", "frame"), "no such frame of the robot", listing, repr(section.frame))
-    force, moment = np.empty((len(signals), 3)), np.empty((len(signals), 3))
-    for rows, (q, reading) in _chunks(signals, "q", "wrench"):
-        f, m = contact_wrench(robot, section, q, reading)
-        force[rows], moment[rows] = f.numpy(), m.numpy()
-    return force, moment
-
-
-def contact_wrench(
-    robot: RobotModel, section: WrenchSection, q: torch.Tensor, reading: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Force and moment about the sensor that the environment exerts on the robot, in world axes.
-
-    Args:
-        robot: the robot.
-        section: the sensor.
-        q: `(n, nq)` positions.
-        reading: `(n, 6)` force and moment in the sensor's axes or the world's [N], [N m].
-    """
-    rotation, _ = kinematics.frame_pose(robot, q, section.frame)
+    rotation, position = kinematics.frame_pose(robot, q, section.frame)
     sign = 1.0 if section.acts_on == "robot" else -1.0
     force, moment = sign * reading[:, :3], sign * reading[:, 3:]
     if section.axes == "frame":
-        force = (rotation @ force[..., None])[..., 0]
-        moment = (rotation @ moment[..., None])[..., 0]
+        force, moment = ((rotation @ x[..., None])[..., 0] for x in (force, moment))
     weight = section.tool_mass * robot.gravity
     arm = rotation @ torch.tensor(section.tool_com, dtype=q.dtype)
-    return force - weight, moment - torch.linalg.cross(arm, weight.expand_as(arm))
+    return force - weight, moment - torch.linalg.cross(arm, weight.expand_as(arm)), position
 
 
 def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
@@ -86,37 +82,17 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
     Raises:
         MappingError: the sensor's frame is none of the robot.
     """
-    force, moment = at_sensor(signals, system.robot, mapping)
-    section = mapping.sections.wrench
-    assert section is not None
     touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
-    moments = {contact.name: np.empty_like(moment) for contact in touching}
-    for rows, (q,) in _chunks(signals, "q"):
-        _, sensor = kinematics.frame_pose(system.robot, q, section.frame)
-        for contact in touching:
-            arm = (_tip(system, contact, q) - sensor).numpy()
-            moments[contact.name][rows] = moment[rows] - np.cross(arm, force[rows])
-    return {"F_sensor": dict.fromkeys(moments, force), "M_sensor": moments}
 
+    def sensed(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
+        F, moment, sensor = _wrench(system.robot, mapping, q, reading)
+        arms = [_tip(system, contact, q) - sensor for contact in touching]
+        return torch.stack([F, *(moment - torch.linalg.cross(arm, F) for arm in arms)], dim=1)
 
-def surface_distance(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
-    """c(q) `(n,)`: how far the touching point is from the surface [m]."""
-    c = np.empty(len(signals))
-    for rows, (q,) in _chunks(signals, "q"):
-        c[rows] = contact.center_surface.value(_tip(system, contact, q)).numpy()
-    return c
-
-
-def normal_force(
-    signals: Signals, system: ConstrainedSystem, mapping: Mapping, contact: SurfaceContact
-) -> Array:
-    """n·F `(n,)`: the sensor's force along the surface's normal [N]."""
-    force, _ = at_sensor(signals, system.robot, mapping)
-    along = np.empty(len(signals))
-    for rows, (q,) in _chunks(signals, "q"):
-        normal = contact.surface.gradient(_tip(system, contact, q)).numpy()
-        along[rows] = (normal * force[rows]).sum(axis=1)
-    return along
+    values = _rowwise(signals, ("q", "wrench"), sensed)
+    names = [contact.name for contact in touching]
+    moments = {name: values[:, 1 + i] for i, name in enumerate(names)}
+    return {"F_sensor": dict.fromkeys(names, values[:, 0]), "M_sensor": moments}
 
 
 def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
@@ -131,16 +107,29 @@ def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceCont
         contact: which of them.
     """
     alone = ConstrainedSystem(system.robot, [contact])
-    result = np.empty(len(signals))
-    for rows, (q, qd, qdd, tau) in _chunks(signals, "q", "qd", "qdd", "tau"):
+
+    def value(q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
         eom = alone.equations(q, qd)
         rest = qdd - eom.free_acceleration(eom.Q_K + tau)
-        result[rows] = (eom.constraint_inertia @ (eom.A @ rest[..., None]))[:, 0, 0].numpy()
-    return result
+        return (eom.constraint_inertia @ (eom.A @ rest[..., None]))[:, 0, 0]
+
+    return _rowwise(signals, ("q", "qd", "qdd", "tau"), value)
 
 
-def _tip(system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor) -> torch.Tensor:
-    return kinematics.point_position(system.robot, q, contact.frame, tuple(contact.point))
+def _evidence(
+    signals: Signals, system: ConstrainedSystem, mapping: Mapping, contact: SurfaceContact, source: str
+) -> Array:
+    """What a contact's state is read from, `(n,)`: c(q) [m], the sensor's n·F [N], or λ [N]."""
+
+    def normal_force(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
+        force = _wrench(system.robot, mapping, q, reading)[0]
+        return (contact.surface.gradient(_tip(system, contact, q)) * force).sum(1)
+
+    if source == "distance":
+        return _rowwise(signals, ("q",), lambda q: contact.center_surface.value(_tip(system, contact, q)))
+    if source == "wrench":
+        return _rowwise(signals, ("q", "wrench"), normal_force)
+    return multiplier(signals, system, contact)
 
 
 SEPARATION = 6.0
@@ -185,11 +174,12 @@ class Evidence:
     def sentence(self) -> str:
         """The evidence in one sentence."""
         unit, scale = ("mm", 1e3) if self.source == "distance" else ("N", 1.0)
-        closed, spread = scale * self.closed_level, scale * self.closed_spread
+        levels = (self.closed_level, self.closed_spread, self.open_level, self.open_spread, self.threshold)
+        closed, closed_spread, open_, open_spread, threshold = (scale * level for level in levels)
         return (
             f"contact {self.contact!r} by {self.source}: {len(self.intervals)} closed intervals, "
-            f"{closed:.3g} ± {spread:.2g} {unit} closed, {scale * self.open_level:.3g} ± "
-            f"{scale * self.open_spread:.2g} {unit} open, threshold {scale * self.threshold:.3g} {unit}"
+            f"{closed:.3g} ± {closed_spread:.2g} {unit} closed, {open_:.3g} ± {open_spread:.2g} {unit} open, "
+            f"threshold {threshold:.3g} {unit}"
         )
 
 
@@ -218,63 +208,50 @@ def detect(
             raise mapping.error(("contact", name), f"the scene has no contact {name!r}", listing)
     evidence, states = [], {}
     for contact in system.contacts:
-        if contact.name not in sections:
+        name = contact.name
+        if name not in sections:
             raise mapping.error(
                 ("contact",),
-                f"nothing says whether contact {contact.name!r} is closed",
-                expected=f"[contact.{contact.name}] with source = column, wrench, multiplier, distance, "
-                "always or never",
+                f"nothing says whether contact {name!r} is closed",
+                f"[contact.{name}] with source = column, wrench, multiplier, distance, always or never",
             )
-        section = sections[contact.name]
-        if section.source in ("always", "never"):
-            states[contact.name] = np.full(len(signals), section.source == "always")
-        elif section.source == "column":
-            states[contact.name] = signals.contact[contact.name]
+        source = sections[name].source
+        if source in ("always", "never"):
+            states[name] = np.full(len(signals), source == "always")
+        elif source == "column":
+            states[name] = signals.contact[name]
         elif not isinstance(contact, SurfaceContact):
-            key = ("contact", contact.name, "source")
+            key = ("contact", name, "source")
             raise mapping.error(
                 key, "only a contact with a surface can be detected", "column, always or never"
             )
         else:
-            state, detection = _detect(signals, system, mapping, contact, section)
-            states[contact.name] = state
+            values = _evidence(signals, system, mapping, contact, source)
+            states[name], detection = _detect(signals, values, name, sections[name])
             evidence.append(detection)
-            report.find("contact", detection.sentence(), signals.row[state])
+            report.find("contact", detection.sentence(), signals.row[states[name]])
             if detection.merged:
-                report.find(
-                    "short contact", f"{detection.merged} intervals of {contact.name!r} were too short"
-                )
+                report.find("short contact", f"{detection.merged} intervals of {name!r} were too short")
     signals.contact = states
     return evidence
 
 
 def _detect(
-    signals: Signals,
-    system: ConstrainedSystem,
-    mapping: Mapping,
-    contact: SurfaceContact,
-    section: ContactStateSection,
+    signals: Signals, values: Array, name: str, section: ContactStateSection
 ) -> tuple[NDArray[np.bool_], Evidence]:
     if section.source == "distance":
-        values = surface_distance(signals, system, contact)
         high = section.threshold if section.threshold is not None else touching(values)
         low = section.release if section.release is not None else high
         below = section.threshold if section.threshold is not None else TOUCHING
         closed = hysteresis(-values, -high, -low, signals.segment) & (values >= -below)
     else:
-        if section.source == "wrench":
-            values = normal_force(signals, system, mapping, contact)
-        else:
-            values = multiplier(signals, system, contact)
-        high, low = force_levels(values, contact.name, section)
+        high, low = force_levels(values, name, section)
         closed = hysteresis(values, high, low, signals.segment)
     merged = _merge_short(closed, signals, section.shortest)
     level = {state: level_and_spread(values[closed == state]) for state in (True, False)}
-    spans = [rows for rows in runs(signals.segment, closed) if closed[rows.start]]
+    spans = [rows for rows in signals.runs(closed) if closed[rows.start]]
     times = tuple((float(signals.t[s.start]), float(signals.t[s.stop - 1])) for s in spans)
-    return closed, Evidence(
-        contact.name, section.source, high, low, *level[True], *level[False], times, merged
-    )
+    return closed, Evidence(name, section.source, high, low, *level[True], *level[False], times, merged)
 
 
 def touching(distance: Array) -> float:
@@ -341,8 +318,7 @@ def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -
     """Give intervals that are shorter than `shortest` [s], between two of the other state, that state."""
     count = 0
     for trajectory in signals.runs():
-        inner = runs(closed[trajectory])[1:-1]
-        for rows in inner:
+        for rows in runs(closed[trajectory])[1:-1]:
             span = slice(trajectory.start + rows.start, trajectory.start + rows.stop)
             if signals.t[span.stop - 1] - signals.t[span.start] < shortest:
                 closed[span] = ~closed[span]

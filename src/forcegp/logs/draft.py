@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 
@@ -13,8 +14,6 @@ class Family:
     Attributes:
         pattern: their common name, with `{joint}` where they differ.
         columns: what stands for `{joint}` → column.
-        stream: where they are.
-        unit: of the columns, or `None` where it is not known.
         declared: whether the log declares the unit.
         sign: +1, −1, or one of them for each joint of the robot.
         by_joint: joint of the robot → column, where `columns` does not name the joints as the positions do.
@@ -22,7 +21,7 @@ class Family:
 
     pattern: str
     columns: dict[str, str]
-    stream: str
+    stream: str = ""
     unit: str | None = None
     declared: bool = False
     sign: float | dict[str, float] = 1.0
@@ -39,7 +38,6 @@ class Draft:
         joints: joint of the robot → what the log calls it.
         families: quantity → its columns.
         wrench: columns of the force and, if any, of the moment.
-        wrench_stream, wrench_frame: where they are, and a guess of the sensor's frame.
         contacts: contact of the scene → lines of its table.
         comments: table → sentences above it.
         doubts: what the user must check.
@@ -68,40 +66,39 @@ class Draft:
         """The mapping file."""
         lines = [f"# Mapping of {_plain(self.source)}, proposed from its headings and values."]
         lines += ["# Check it, above all the lines marked CHECK, and import with --mapping.", ""]
-        lines += self._table(
-            "time", ["column", self.time], ["unit", self.time_unit], ["segment", self.segment]
-        )
-        lines += self._table("joints", *([joint, name] for joint, name in self.joints.items()))
+        time = {"column": self.time, "unit": self.time_unit, "segment": self.segment}
+        lines += self._table("time", time) + self._table("joints", self.joints)
         for name in ("position", "velocity", "acceleration", "torque"):
             if name in self.families:
-                lines += self._family(name, self.families[name])
+                lines += self._table(name, _keys(name, self.families[name]))
         if self.wrench:
-            pairs = [["stream", self.wrench_stream or None], ["frame", self.wrench_frame]]
-            parts = zip(("force", "torque"), self.wrench, strict=False)
-            lines += self._table("wrench", *([key, columns] for key, columns in parts), *pairs)
+            columns: dict = dict(zip(("force", "torque"), self.wrench, strict=False))
+            wrench = columns | {"stream": self.wrench_stream or None, "frame": self.wrench_frame}
+            lines += self._table("wrench", wrench)
         for name, body in self.contacts.items():
             lines += [*self._above(f"contact {name}"), f"[contact.{json.dumps(name)}]", *body, ""]
         lines += [
             "[derivatives]",
             'method = "savitzky_golay"   # or "smoother", with error bars from a model',
         ]
-        lines += ["window = 11", "order = 3", "filter_torque = true"]
-        return "\n".join(lines) + "\n"
-
-    def _family(self, name: str, family: Family) -> list[str]:
-        named: list[object] = ["columns", family.by_joint] if family.by_joint else ["column", family.pattern]
-        pairs: list[list[object]] = [named, ["stream", family.stream or None]]
-        pairs += [["unit", family.unit], ["sign", None if family.sign == 1.0 else family.sign]]
-        if name == "torque" and family.unit in ("A", "mA"):
-            pairs += [["side", "motor"], ["gear_ratio", 1.0], ["torque_constant", 1.0]]
-        return self._table(name, *pairs)
+        return "\n".join([*lines, "window = 11", "order = 3", "filter_torque = true", ""])
 
     def _above(self, table: str) -> list[str]:
         return [f"# {_plain(sentence)}" for sentence in self.comments.get(table, [])]
 
-    def _table(self, table: str, *pairs: list) -> list[str]:
-        body = [f"{_key(key)} = {_value(value)}" for key, value in pairs if value is not None]
+    def _table(self, table: str, keys: Mapping[str, object]) -> list[str]:
+        body = [f"{_key(key)} = {_value(value)}" for key, value in keys.items() if value is not None]
         return [*self._above(table), f"[{table}]", *body, ""] if body else []
+
+
+def _keys(name: str, family: Family) -> dict[str, object]:
+    """The table of a quantity."""
+    keys: dict[str, object] = {"columns": family.by_joint} if family.by_joint else {"column": family.pattern}
+    keys |= {"stream": family.stream or None, "unit": family.unit}
+    keys["sign"] = None if family.sign == 1.0 else family.sign
+    if name == "torque" and family.unit in ("A", "mA"):
+        keys |= {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
+    return keys
 
 
 def _plain(text: str) -> str:

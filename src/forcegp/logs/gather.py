@@ -21,36 +21,20 @@ from forcegp.logs.readers import read
 from forcegp.logs.signals import Array, ImportReport, Signals, listed
 from forcegp.logs.table import LogTable, Progress, Stream
 
-QUANTITIES = ("position", "velocity", "acceleration", "torque")
-"""Joint vectors of a mapping."""
 
-
-def joint_factors(mapping: Mapping, name: str, joints: Sequence[str]) -> tuple[list[float], list[float]]:
-    """Factor s k and offset o of a quantity for each joint.
-
-    Args:
-        mapping: says unit, sign, side, gear ratio, torque constant and offset.
-        name: `position`, `velocity`, `acceleration` or `torque`.
-        joints: the robot's joints.
-
-    Returns:
-        Factors to SI on the joint side, and offsets in the unit of the column.
+def joint_factors(mapping: Mapping, name: str, joints: Sequence[str]) -> tuple[Array, Array]:
+    """Factors s k to SI on the joint side, and offsets o in the unit of the column, `(nq,)` each.
 
     Raises:
         MappingError: a joint has no number.
     """
     section = mapping.quantity(name)
     assert section is not None
-    unit = units.QUANTITY[name][section.unit]
-    gear = [1.0] * len(joints)
+    scale = mapping.per_joint(name, "sign", joints) * units.QUANTITY[name][section.unit]
     if section.side == "motor":
-        ratios = mapping.per_joint(name, "gear_ratio", joints)
-        gear = [ratio if name == "torque" else 1.0 / ratio for ratio in ratios]
-    constant = [1.0] * len(joints)
+        scale *= mapping.per_joint(name, "gear_ratio", joints) ** (1.0 if name == "torque" else -1.0)
     if name == "torque" and mapping.sections.torque.torque_constant is not None:
-        constant = mapping.per_joint(name, "torque_constant", joints)
-    signs = mapping.per_joint(name, "sign", joints)
-    scale = [s * unit * g * k for s, g, k in zip(signs, gear, constant, strict=True)]
+        scale *= mapping.per_joint(name, "torque_constant", joints)
     return scale, mapping.per_joint(name, "offset", joints)
 
 
@@ -66,15 +50,7 @@ def gather(
     progress: Progress | None = None,
     rows: int | None = None,
 ) -> Signals:
-    """Read the mapped columns of a log onto one clock.
-
-    Args:
-        path: the log.
-        mapping: what its columns mean.
-        joints: the robot's joints.
-        report: gets what was found.
-        progress: called while the log is read.
-        rows: read no more rows than this, where the format allows to stop early.
+    """Read the mapped columns of a log onto one clock, at most `rows` rows where the format allows it.
 
     Raises:
         DataError: the log cannot be read, or a value or a time stamp is not usable; names the rows.
@@ -114,22 +90,18 @@ class _Gathering:
 
     def run(self) -> Signals:
         """The quantities, those of the reference stream first."""
-        reference, others = {}, {}
-        for name, symbol in SYMBOLS.items():
-            if self.mapping.quantity(name) is not None:
-                stream, values = self._vector(name)
-                (reference if stream is self.reference else others)[symbol] = (stream, values)
+        quantities = [name for name in SYMBOLS if self.mapping.quantity(name) is not None]
+        vectors = {SYMBOLS[name]: self._vector(name) for name in quantities}
         if self.mapping.sections.wrench is not None:
-            stream, values = self._wrench()
-            (reference if stream is self.reference else others)["wrench"] = (stream, values)
+            vectors["wrench"] = self._wrench()
         flags = self._flags()
-        for name, (stream, values) in flags.items():
-            (reference if stream is self.reference else others)[f"contact {name}"] = (stream, values)
-        signals = self._reference({name: values for name, (_, values) in reference.items()})
-        for name, (stream, values) in others.items():
-            t = self._stamps(stream)
-            good = np.isfinite(values).all(axis=1) & np.isfinite(t)
-            join_stream(signals, name, t[good], values[good], self.time.gap, self.report)
+        vectors |= {f"contact {name}": flag for name, flag in flags.items()}
+        signals = self._reference({n: x for n, (stream, x) in vectors.items() if stream is self.reference})
+        for name, (stream, values) in vectors.items():
+            if stream is not self.reference:
+                t = self._stamps(stream)
+                good = np.isfinite(values).all(axis=1) & np.isfinite(t)
+                join_stream(signals, name, t[good], values[good], self.time.gap, self.report)
         for name in flags:
             signals.contact[name] = signals.vectors.pop(f"contact {name}")[:, 0] >= 0.5
         return signals
@@ -146,10 +118,10 @@ class _Gathering:
         scale, offset = joint_factors(self.mapping, name, self.joints)
         result = np.empty((len(stream), len(self.joints)))
         for i, column in enumerate(columns):
-            values = self._take(stream, column)
-            np.subtract(values, offset[i], out=result[:, i])
+            np.subtract(self._take(stream, column), offset[i], out=result[:, i])
             result[:, i] *= scale[i]
-            _release(stream, column)
+            if isinstance(stream.columns, dict) and len(stream.columns) > 1:
+                del stream.columns[column]  # memory holds it once
         return stream, result
 
     def _wrench(self) -> tuple[Stream, Array]:
@@ -158,12 +130,8 @@ class _Gathering:
         assert section is not None
         stream = self.table.stream_of(section.force[0], section.stream)
         result = np.zeros((len(stream), 6))
-        names = (*section.force, *(section.torque or ()))
-        force, moment = (
-            units.QUANTITY["force"][section.force_unit],
-            units.QUANTITY["moment"][section.torque_unit],
-        )
-        for i, column in enumerate(names):
+        force, moment = units.FORCE[section.force_unit], units.TORQUE[section.torque_unit]
+        for i, column in enumerate((*section.force, *(section.torque or ()))):
             result[:, i] = (self._take(stream, column) - section.offset[i]) * (force if i < 3 else moment)
         return stream, result
 
@@ -240,9 +208,3 @@ class _Gathering:
         if not inside.all():
             self.report.did(f"kept the {inside.sum()} rows from {start:g} to {stop:g} s")
             signals.keep(inside)
-
-
-def _release(stream: Stream, column: str) -> None:
-    """Let go of a column that has been taken, so that memory holds it once."""
-    if isinstance(stream.columns, dict) and len(stream.columns) > 1:
-        del stream.columns[column]

@@ -18,6 +18,7 @@ from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
 from forcegp.logs import units
+from forcegp.logs.clock import even_clock
 from forcegp.logs.contact import force_levels, level_and_spread, multiplier
 from forcegp.logs.draft import Draft
 from forcegp.logs.gather import gather
@@ -25,15 +26,13 @@ from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
 from forcegp.logs.mapping import ContactStateSection, Mapping, parse_mapping
 from forcegp.logs.readers import read
 from forcegp.logs.signals import Array, ImportReport, Signals
-from forcegp.logs.smoothing import add_derivatives, even_clock
+from forcegp.logs.smoothing import add_derivatives
 from forcegp.logs.table import LogTable, Progress, Stream
 
 ROWS = 100_000
 """Rows that are looked at."""
 TRIED_ROWS = 3000
 """Rows on which the inverse dynamics are evaluated."""
-DEFAULT = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s2", "torque": "Nm"}
-"""Units that are assumed before any is tried."""
 MOST_RADIANS, LEAST_DEGREES = 60.0, 3.2
 """Positions beyond the first are in degrees; below the second, an arm in degrees would hardly move."""
 CLEARER = 1.5
@@ -62,11 +61,6 @@ class Guess:
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Guess:
     """Propose a mapping for a log.
 
-    Args:
-        path: the log.
-        system: the robot with its contacts.
-        progress: called while the log is read.
-
     Raises:
         DataError: the log cannot be read.
         MappingError: time, positions or torques are not recognised.
@@ -94,15 +88,14 @@ def _possible_units(draft: Draft, stream: Stream) -> list[str]:
 def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:
     """Read the log by the draft, and settle what its values can: units, and the sign of the torque."""
     for quantity, family in draft.families.items():
-        family.unit = family.unit or DEFAULT[quantity]
+        family.unit = family.unit or units.SI[quantity]
     fits = {}
     for unit in possible:
         draft.families["position"].unit = unit
         _, correlation = torque_slopes(_signals(path, draft, system, without="velocity"), system)
         fits[unit] = float((correlation**2).mean())
-    best = max(fits, key=fits.__getitem__)
-    if fits[best] < CLEARER * fits[possible[0]]:
-        best = possible[0]
+    # A later unit has to fit clearly better than the first.
+    best = max(fits, key=lambda unit: fits[unit] * (CLEARER if unit == possible[0] else 1.0))
     draft.families["position"].unit = best
     if len(fits) > 1:
         listing = ", ".join(f"{fit:.2f} in {unit}" for unit, fit in fits.items())
@@ -116,17 +109,13 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
 def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
     """The log by the draft, `without` one quantity, with accelerations; incomplete rows left out."""
     families = {name: family for name, family in draft.families.items() if name != without}
-    toml = (
-        replace(draft, families=families, contacts={})
-        .toml()
-        .replace("[time]\n", '[time]\nmissing = "drop"\n', 1)
-    )
-    mapping = parse_mapping(toml.encode(), "proposed mapping")
-    signals = gather(path, mapping, system.robot.joint_names, ImportReport(str(path)), rows=ROWS)
-    even_clock(signals, None, ImportReport(str(path)))
-    signals.contact = {}
+    toml = replace(draft, families=families, contacts={}).toml()
+    toml = toml.replace("[time]\n", '[time]\nmissing = "drop"\n', 1)
+    mapping, report = parse_mapping(toml.encode(), "proposed mapping"), ImportReport(str(path))
+    signals = gather(path, mapping, system.robot.joint_names, report, rows=ROWS)
+    even_clock(signals, None, report)
     settings = mapping.sections.derivatives.model_copy(update={"source": "position"})
-    add_derivatives(signals, settings, ImportReport(str(path)))
+    add_derivatives(signals, settings, report)
     return signals
 
 
@@ -143,12 +132,10 @@ def _velocity_unit(draft: Draft, trial: Signals) -> None:
     ratios = {u: 1.0 / units.VELOCITY[u] for u in ("rad/s", "deg/s", "rpm", "rev/s", "mrad/s")}
     unit = min(ratios, key=lambda u: abs(np.log(ratios[u]) - np.log(max(abs(slope / current), 1e-12))))
     miss = abs(slope) / current / ratios[unit]
-    near = 1.0 / NEAR < miss < NEAR
     if family.declared and unit != family.unit:
-        draft.say(
-            "velocity", f"{family.unit} is declared; it is {slope:.3g} times the derivative of q", doubt=True
-        )
-    elif not near:
+        text = f"{family.unit} is declared; it is {slope:.3g} times the derivative of q"
+        draft.say("velocity", text, doubt=True)
+    elif not 1.0 / NEAR < miss < NEAR:
         draft.say("velocity", f"the velocity is {slope:.3g} times the derivative of the position", doubt=True)
     else:
         family.unit = unit
@@ -174,9 +161,8 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
     listing = ", ".join(f"{j} {c:+.2f}" for j, c in zip(trial.joint_names, correlation, strict=True))
     draft.say("torque", f"correlation with the robot's inverse dynamics: {listing}")
     if not clear.any():
-        draft.say(
-            "torque", "no joint's torque follows the robot's inverse dynamics: sign unknown", doubt=True
-        )
+        unknown = "no joint's torque follows the robot's inverse dynamics: sign unknown"
+        draft.say("torque", unknown, doubt=True)
         return
     family.sign = _signs(slopes, clear, trial.joint_names)
     if isinstance(family.sign, dict):
@@ -200,10 +186,6 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
 
     τ_log = k τ_rigid + v q̇ + f sign(q̇) + Aᵀλ + const by least squares, joint by joint, with a constant λ of
     each contact; the correlation is that of what the other terms leave of both sides.
-
-    Args:
-        trial: the log, with `qd`, `qdd` and `tau`.
-        system: the robot with its contacts.
     """
     nq = system.robot.nq
     rows = np.linspace(0, len(trial) - 1, min(TRIED_ROWS, len(trial))).astype(int)
@@ -230,20 +212,12 @@ LEAST_FORCE = 1.0
 def propose_contacts(
     table: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
 ) -> None:
-    """Write into a draft how the state of each contact of the scene may be known.
-
-    Args:
-        table: the log.
-        draft: gets a table for each contact.
-        system: the robot with its contacts.
-        signals: reads the log by the draft, with accelerations.
-    """
+    """Write into a draft how the state of each contact of the scene may be known; `signals` reads the log."""
     trial: Signals | None = None
     for contact in system.contacts:
         name = contact.name
-        column = next(
-            (c for c in table.names if "contact" in c.lower() and (name in c or system.m == 1)), None
-        )
+        named = (c for c in table.names if "contact" in c.lower() and (name in c or system.m == 1))
+        column = next(named, None)
         if column is not None and np.isin(table.stream_of(column).columns[column], (0.0, 1.0)).all():
             draft.contacts[name] = ['source = "column"', f"column = {json.dumps(column)}"]
         elif draft.wrench or not isinstance(contact, SurfaceContact):

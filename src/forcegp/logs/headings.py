@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from difflib import SequenceMatcher
+from itertools import permutations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -84,30 +85,26 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
         steps = np.diff(values[np.isfinite(values)])
         if not len(steps) or not (steps > 0.0).mean() > 0.95:
             continue
-        middle = np.median(steps[steps > 0.0])
-        even = float((np.abs(steps - middle) < 0.5 * middle).mean())
+        step = float(np.median(steps[steps > 0.0]))
+        even = float((np.abs(steps - step) < 0.5 * step).mean())
         named = bool(_TIME.match(name.lower())) or name == "header"
-        candidates.append((2.0 * named + even + (name == "header"), name))
+        candidates.append((2.0 * named + even + (name == "header"), name, step))
     if not candidates:
         raise MappingError(
             f"{table.source}: no column increases like time",
             expected="a column of time stamps",
             got=", ".join(stream.columns)[:300],
         )
-    draft.time = max(candidates)[1]
-    values = stream.columns[draft.time]
+    _, draft.time, step = max(candidates)
     unit = declared_unit(draft.time, stream)
-    steps = np.diff(values[np.isfinite(values)])
-    step = float(np.median(steps[steps > 0.0]))
     if unit in units.TIME:
         draft.time_unit = unit
         draft.say("time", f"the unit {unit} is declared; steps are {step:.6g} {unit}")
     else:
         # Robots are logged at 10 Hz to 10 kHz, so the step alone tells s, ms, µs and ns apart.
         draft.time_unit = "s" if step <= 0.1 else "ms" if step <= 100.0 else "us" if step <= 1e5 else "ns"
-        draft.say(
-            "time", f"steps of {step:.6g} were taken for {draft.time_unit}", doubt=draft.time_unit != "s"
-        )
+        doubt = draft.time_unit != "s"
+        draft.say("time", f"steps of {step:.6g} were taken for {draft.time_unit}", doubt)
     draft.segment = next((name for name in _SEGMENTS if name in stream.columns), None)
     return stream
 
@@ -123,17 +120,13 @@ def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
         find_by_values(stream, robot.joint_names, draft)
         families = []
     for quantity in WORDS:
-        rated = [(rating, family) for family in families if (rating := _rate(family, quantity)) > 0.0]
-        rated.sort(key=lambda item: -item[0])
+        rated = [family for family in families if _rate(family, quantity) > 0.0]
         if rated:
-            draft.families[quantity] = rated[0][1]
-            others = [family.pattern for _, family in rated[1:]]
+            best, *others = sorted(rated, key=lambda family: -_rate(family, quantity))
+            draft.families[quantity] = best
             if others:
-                draft.say(
-                    quantity,
-                    f"{rated[0][1].pattern!r} was taken; also there: {', '.join(others)}",
-                    doubt=True,
-                )
+                listing = ", ".join(family.pattern for family in others)
+                draft.say(quantity, f"{best.pattern!r} was taken; also there: {listing}", doubt=True)
     for quantity in ("position", "torque"):
         if quantity not in draft.families:
             raise MappingError(
@@ -191,31 +184,22 @@ def _rate(family: Family, quantity: str) -> float:
 def _match_joints(robot: RobotModel, draft: Draft) -> None:
     """What the log calls each joint, from the names of the positions."""
     names = list(draft.families["position"].columns)
-    if set(names) == set(robot.joint_names):
-        _match_others(robot, draft, set(names))
-        return
     if all(name.isdigit() for name in names):
-        ordered = sorted(names, key=int)
         draft.say("joints", "the log numbers its joints; they were taken from base to tip", doubt=True)
-        draft.joints = dict(zip(robot.joint_names, ordered, strict=True))
-    else:
+        draft.joints = dict(zip(robot.joint_names, sorted(names, key=int), strict=True))
+    elif set(names) != set(robot.joint_names):
         likeness = np.array([[_likeness(j, name) for name in names] for j in robot.joint_names])
         # Among names that are equally alike, the order of the log decides; the user confirms it.
         likeness += 0.3 * np.eye(len(names))
         rows, columns = linear_sum_assignment(-likeness)
         draft.joints = {robot.joint_names[i]: names[k] for i, k in zip(rows, columns, strict=True)}
         draft.say("joints", "the names were matched by their likeness", doubt=True)
-    _match_others(robot, draft, set(names))
-
-
-def _match_others(robot: RobotModel, draft: Draft, names: set[str]) -> None:
-    """Families that call the joints otherwise than the positions do: numbered ones get a column per joint."""
+    # Numbered families that call the joints otherwise than the positions do get a column per joint.
     for quantity, family in list(draft.families.items()):
-        if set(family.columns) == names:
+        if set(family.columns) == set(names):
             continue
         if all(name.isdigit() for name in family.columns):
-            ordered = sorted(family.columns, key=int)
-            columns = [family.columns[name] for name in ordered]
+            columns = [family.columns[name] for name in sorted(family.columns, key=int)]
             family.by_joint = dict(zip(robot.joint_names, columns, strict=True))
             draft.say(quantity, "numbered joints were taken from base to tip", doubt=True)
         else:
@@ -246,11 +230,8 @@ def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
             parts = [0, 1] if all((1, axis) in columns for axis in "xyz") else [0]
             draft.wrench = [[columns[part, axis] for axis in "xyz"] for part in parts]
             draft.wrench_frame = robot.frame_names[-1]
-            draft.say(
-                "wrench",
-                "the sensor's frame, its sign (acts_on) and the tool's weight are not in the log",
-                True,
-            )
+            unknown = "the sensor's frame, its sign (acts_on) and the tool's weight are not in the log"
+            draft.say("wrench", unknown, doubt=True)
             return
 
 
@@ -271,33 +252,20 @@ def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> Non
         return
     t = stream.columns[draft.time]
     values = [np.stack([stream.columns[name] for name in block], axis=1) for block in blocks]
-    pairs = [
-        (k, other)
-        for k in range(len(blocks))
-        for other in range(len(blocks))
-        if other != k and _is_rate(t, values[k], values[other])
-    ]
-    firsts = {k for k, _ in pairs} - {other for _, other in pairs}
-    roles: dict[str, int] = {}
-    if len(firsts) == 1:
-        at = firsts.pop()
-        for quantity in ("position", "velocity", "acceleration"):
-            roles[quantity] = at
-            following = [other for k, other in pairs if k == at]
-            if len(following) != 1:
-                break
-            at = following[0]
-    unassigned = [k for k in range(len(blocks)) if k not in roles.values()]
-    if "velocity" not in roles or len(unassigned) != 1:
+    every = range(len(blocks))
+    pairs = [(k, other) for k, other in permutations(every, 2) if _is_rate(t, values[k], values[other])]
+    chain = list({k for k, _ in pairs} - {other for _, other in pairs})
+    while len(chain) < 3 and len(following := [other for k, other in pairs if k in chain[-1:]]) == 1:
+        chain += following
+    torque = set(every) - set(chain)
+    if len(chain) < 2 or (chain[0], chain[1]) not in pairs or len(torque) != 1:
         return
-    roles["torque"] = unassigned[0]
-    for quantity, k in roles.items():
+    roles = dict(zip(("position", "velocity", "acceleration"), chain, strict=False))
+    for quantity, k in {**roles, "torque": torque.pop()}.items():
         columns = dict(zip(joints, blocks[k], strict=True))
         draft.families[quantity] = Family("", columns, stream.name, by_joint=columns)
-        text = (
-            f"columns {blocks[k][0]} to {blocks[k][-1]} have no headings; their values look like a {quantity}"
-        )
-        draft.say(quantity, text, doubt=True)
+        where = f"columns {blocks[k][0]} to {blocks[k][-1]}"
+        draft.say(quantity, f"{where} have no headings; their values look like a {quantity}", doubt=True)
 
 
 def _is_rate(t: np.ndarray, x: np.ndarray, v: np.ndarray) -> bool:

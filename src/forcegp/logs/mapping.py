@@ -8,20 +8,22 @@ file.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.checks import lock_hint
 from forcegp.errors import MappingError, did_you_mean
 from forcegp.logs import units
+from forcegp.logs.draft import Draft, Family
 from forcegp.logs.readers import read
-from forcegp.logs.table import LogTable
 from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
 
@@ -173,20 +175,20 @@ class Mapping:
             raise self.error((name,), f"column {twice!r} is given for two joints", expected="'{joint}' in it")
         return columns
 
-    def per_joint(self, name: str, key: str, joints: Sequence[str]) -> list[float]:
-        """The numbers of a key that holds one for all joints or one for each.
+    def per_joint(self, name: str, key: str, joints: Sequence[str]) -> NDArray[np.float64]:
+        """The numbers `(nq,)` of a key that holds one for all joints or one for each.
 
         Raises:
             MappingError: a joint is missing or unknown.
         """
         value: PerJoint = getattr(self.quantity(name), key)
         if not isinstance(value, dict):
-            return [float(value)] * len(joints)
+            return np.full(len(joints), float(value))
         self._check_joints((name, key), value, joints)
         for joint in joints:
             if joint not in value:
                 raise self.error((name, key), f"joint {joint!r} is missing", expected=", ".join(joints))
-        return [value[joint] for joint in joints]
+        return np.array([value[joint] for joint in joints])
 
     def error(
         self, key: Key, message: str, expected: object = None, got: object = None, hint: str | None = None
@@ -243,70 +245,55 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
 
 def _check(mapping: Mapping) -> None:
     """What the tables cannot say by themselves: units, and keys that need each other."""
+    sections = mapping.sections
     for name in ("position", "velocity", "acceleration", "torque"):
         section = mapping.quantity(name)
-        if section is None:
-            continue
-        allowed = units.QUANTITY[name]
-        if section.unit not in allowed:
-            near = units.spelled(section.unit)
-            hint = f"did you mean {near!r}?" if near in allowed else None
-            raise mapping.error(
-                (name, "unit"), "unknown unit", f"one of {', '.join(allowed)}", repr(section.unit), hint
-            )
-        if section.column is None and not section.columns:
-            raise mapping.error((name,), "no column", expected='column = "…{joint}…", or columns = {…}')
-        if section.side == "motor" and section.gear_ratio is None:
-            raise mapping.error(
-                (name, "side"), "the motor's side needs a gear ratio", expected="gear_ratio = …"
-            )
-        _check_numbers(mapping, name, section)
-    _check_current(mapping)
-    for name, contact in mapping.sections.contact.items():
-        if contact.source == "column" and contact.column is None:
-            raise mapping.error(("contact", name, "source"), "key 'column' is missing", expected="column = …")
-        if contact.source == "wrench" and mapping.sections.wrench is None:
-            raise mapping.error(
-                ("contact", name, "source"), "the log's wrench is not mapped", "a table [wrench]"
-            )
-    _check_time(mapping)
-
-
-def _check_numbers(mapping: Mapping, name: str, section: QuantitySection) -> None:
-    for key, what in (
-        ("sign", "1 or -1"),
-        ("gear_ratio", "a number that is not 0"),
-        ("torque_constant", "> 0"),
-    ):
-        value = getattr(section, key, None)
-        numbers = value.values() if isinstance(value, dict) else [] if value is None else [value]
-        wrong = [n for n in numbers if n == 0 or (key == "sign" and abs(n) != 1) or (key[0] == "t" and n < 0)]
-        if wrong:
-            raise mapping.error((name, key), f"not a valid {key.replace('_', ' ')}", what, wrong[0])
-
-
-def _check_current(mapping: Mapping) -> None:
-    torque = mapping.sections.torque
-    if (torque.unit in units.CURRENT) != (torque.torque_constant is not None):
+        if section is not None:
+            _check_quantity(mapping, name, section)
+    if (sections.torque.unit in units.CURRENT) != (sections.torque.torque_constant is not None):
         raise mapping.error(
             ("torque", "unit"),
             "a current needs a torque constant, and nothing else has one",
             expected='unit = "A" with torque_constant = … [N m/A], or a unit of torque without it',
-            got=repr(torque.unit),
+            got=repr(sections.torque.unit),
         )
-
-
-def _check_time(mapping: Mapping) -> None:
-    time, derivatives = mapping.sections.time, mapping.sections.derivatives
+    for name, contact in sections.contact.items():
+        key = ("contact", name, "source")
+        if contact.source == "column" and contact.column is None:
+            raise mapping.error(key, "key 'column' is missing", expected="column = …")
+        if contact.source == "wrench" and sections.wrench is None:
+            raise mapping.error(key, "the log's wrench is not mapped", "a table [wrench]")
+    time, derivatives = sections.time, sections.derivatives
     if time.start is not None and time.stop is not None and time.start >= time.stop:
         raise mapping.error(("time", "stop"), "the log would be empty", f"more than {time.start}", time.stop)
     if derivatives.window % 2 == 0 or derivatives.order >= derivatives.window:
-        got = f"window {derivatives.window}, order {derivatives.order}"
-        raise mapping.error(
-            ("derivatives", "window"), "the filter is not defined", "an odd window > order", got
-        )
-    if derivatives.source == "velocity" and mapping.sections.velocity is None:
+        key, got = ("derivatives", "window"), f"window {derivatives.window}, order {derivatives.order}"
+        raise mapping.error(key, "the filter is not defined", "an odd window > order", got)
+    if derivatives.source == "velocity" and sections.velocity is None:
         raise mapping.error(("derivatives", "source"), "the velocity is not mapped", "a table [velocity]")
+
+
+def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> None:
+    allowed = units.QUANTITY[name]
+    if section.unit not in allowed:
+        near, listing = units.spelled(section.unit), f"one of {', '.join(allowed)}"
+        hint = f"did you mean {near!r}?" if near in allowed else None
+        raise mapping.error((name, "unit"), "unknown unit", listing, repr(section.unit), hint)
+    if section.column is None and not section.columns:
+        raise mapping.error((name,), "no column", expected='column = "…{joint}…", or columns = {…}')
+    if section.side == "motor" and section.gear_ratio is None:
+        raise mapping.error((name, "side"), "the motor's side needs a gear ratio", expected="gear_ratio = …")
+    valid: dict[str, tuple[str, Callable[[float], bool]]] = {
+        "sign": ("1 or -1", lambda n: abs(n) == 1.0),
+        "gear_ratio": ("a number that is not 0", lambda n: n != 0.0),
+        "torque_constant": ("> 0", lambda n: n > 0.0),
+    }
+    for key, (what, right) in valid.items():
+        value = getattr(section, key, None)
+        numbers = value.values() if isinstance(value, dict) else [] if value is None else [value]
+        wrong = [number for number in numbers if not right(number)]
+        if wrong:
+            raise mapping.error((name, key), f"not a valid {key.replace('_', ' ')}", what, wrong[0])
 
 
 def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
@@ -316,38 +303,22 @@ def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
         MappingError: they do; the hint says how to write a mapping.
     """
     table, robot = read(path, rows=1), system.robot
-    names = set(table.names)
-    if (
-        all(f"{symbol}.{joint}" in names for symbol in ("q", "tau") for joint in robot.joint_names)
-        and "t" in names
-    ):
-        return parse_mapping(_data_set(table, system).encode(), "columns named as in a data set")
-    joint_states = all(
-        f"position.{joint}" in names and f"effort.{joint}" in names for joint in robot.joint_names
-    )
-    if joint_states and "header" in names:
+    names, joints = set(table.names), robot.joint_names
+    symbols = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
+    logged = {n: s for n, s in symbols.items() if names >= {f"{s}.{joint}" for joint in joints}}
+    if {"position", "torque"} <= set(logged) and "t" in names:
+        draft = Draft(str(path), "t", segment="segment" if "segment" in names else None)
+        for name, symbol in logged.items():
+            draft.families[name] = Family(f"{symbol}.{{joint}}", {}, unit=units.SI[name])
+        for name in {f"contact.{contact}" for contact in system.contact_names} & names:
+            column = f"column = {json.dumps(name)}"
+            draft.contacts[name.removeprefix("contact.")] = ['source = "column"', column]
+        return parse_mapping(draft.toml().encode(), "columns named as in a data set")
+    if "header" in names and names >= {f"{n}.{joint}" for n in ("position", "effort") for joint in joints}:
         return load_mapping("ros_joint_states")
-    listing = ", ".join(table.names[:12]) + (", …" if len(table.names) > 12 else "")
     raise MappingError(
         f"{path}: the names of the columns do not say what they are",
-        expected=f"t, q.{robot.joint_names[0]}, tau.{robot.joint_names[0]}, …, or a mapping",
-        got=listing,
+        expected=f"t, q.{joints[0]}, tau.{joints[0]}, …, or a mapping",
+        got=", ".join(table.names[:12]) + (", …" if len(table.names) > 12 else ""),
         hint="write a mapping by --guess mapping.toml, check it, and pass it by --mapping",
     )
-
-
-def _data_set(table: LogTable, system: ConstrainedSystem) -> str:
-    names = set(table.names)
-    lines = ["[time]", 'column = "t"', *(['segment = "segment"'] if "segment" in names else [])]
-    units = {"position": ("q", "rad"), "velocity": ("qd", "rad/s"), "acceleration": ("qdd", "rad/s2")}
-    for quantity, (symbol, unit) in (units | {"torque": ("tau", "Nm")}).items():
-        if all(f"{symbol}.{joint}" in names for joint in system.robot.joint_names):
-            lines += [f"[{quantity}]", f'column = "{symbol}.{{joint}}"', f'unit = "{unit}"']
-    for name in system.contact_names:
-        if f"contact.{name}" in names:
-            lines += [
-                f"[contact.{json.dumps(name)}]",
-                'source = "column"',
-                f"column = {json.dumps('contact.' + name)}",
-            ]
-    return "\n".join(lines) + "\n"

@@ -6,7 +6,6 @@ Quantities are in SI units and in the robot's joint order, on one clock.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,18 +38,21 @@ class Signals:
         """Number of rows."""
         return len(self.t)
 
-    def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Keep only some rows, one column after another, so that memory holds one copy."""
+    def keep(self, mask: NDArray[np.bool_], split: bool = False) -> None:
+        """Keep only some rows, one column after another, so that memory holds one copy.
+
+        Args:
+            mask: `(n,)` the rows to keep.
+            split: what lies on two sides of dropped rows is not one trajectory.
+        """
         if mask.all():
             return
+        if split:
+            self.segment = self.segment + np.cumsum(np.concatenate([[False], mask[1:] & ~mask[:-1]]))
         self.t, self.row, self.segment = self.t[mask], self.row[mask], self.segment[mask]
-        self.change(lambda value: value[mask])
-        self.contact = {name: value[mask] for name, value in self.contact.items()}
-
-    def change(self, function: Callable[[Array], Array]) -> None:
-        """Replace each vector in turn."""
         for name in list(self.vectors):
-            self.vectors[name] = function(self.vectors.pop(name))
+            self.vectors[name] = self.vectors.pop(name)[mask]
+        self.contact = {name: value[mask] for name, value in self.contact.items()}
 
     def runs(self, *keys: NDArray[np.generic]) -> list[slice]:
         """Stretches of rows within one segment on which further keys do not change."""
@@ -97,7 +99,6 @@ class ImportReport:
     """What was found and done, in order.
 
     Attributes:
-        source, format: the log.
         rows_read: rows of the stream that sets the clock.
         findings: what is unusual in the log.
         steps: what was done to it, as lines of provenance.

@@ -11,6 +11,7 @@ Striebel 1965; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 8 and 12).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from math import factorial
 
 import numpy as np
@@ -20,7 +21,6 @@ from scipy.optimize import minimize_scalar
 
 from forcegp.data.derivative import SavitzkyGolay, differentiate
 from forcegp.errors import DataError
-from forcegp.logs.clock import make_even, unevenness
 from forcegp.logs.mapping import DerivativesSection
 from forcegp.logs.signals import Array, ImportReport, Signals, runs
 
@@ -38,12 +38,8 @@ SETTLED = 1e-10
 """Relative change of the covariance from row to row below which it counts as stationary."""
 
 A = np.array([[1.0 / factorial(j - i) if j >= i else 0.0 for j in range(STATES)] for i in range(STATES)])
-W = np.array(
-    [
-        [1.0 / (factorial(3 - i) * factorial(3 - j) * (7 - i - j)) for j in range(STATES)]
-        for i in range(STATES)
-    ]
-)
+TAYLOR = np.array([1.0 / factorial(3 - i) for i in range(STATES)])
+W = np.outer(TAYLOR, TAYLOR) / (7.0 - np.add.outer(np.arange(STATES), np.arange(STATES)))
 
 
 @dataclass(frozen=True)
@@ -66,23 +62,6 @@ class Smoothed:
     noise_std: float
 
 
-@dataclass(frozen=True)
-class SmootherGains:
-    """What does not depend on the data: filter gains and covariances of n rows, in units of σ².
-
-    Attributes:
-        gain: `(n, 4)` Kalman gain of each row.
-        innovation: `(n,)` variance of each innovation.
-        back: `(n, 4, 4)` smoother gain from the next row to each row.
-        covariance: `(n, 4, 4)` smoothed covariance of each row.
-    """
-
-    gain: Array
-    innovation: Array
-    back: Array
-    covariance: Array
-
-
 def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = None) -> Smoothed:
     """Smooth the positions of one joint, piece by piece, with one ρ and σ for all pieces.
 
@@ -103,29 +82,21 @@ def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = No
     n = len(q)
     mean, variance = np.empty((n, STATES)), np.empty((n, STATES))
     second = None if also is None else np.empty(n)
-    tables: dict[int, SmootherGains] = {}
+    gains_of = cache(lambda count: _gains(count, rho))
     for rows in stretches:
         count = rows.stop - rows.start
-        gains = tables.setdefault(count, _gains(count, rho))
+        gain, back, covariance = gains_of(count)
         scale = ((t[rows.stop - 1] - t[rows.start]) / (count - 1)) ** -np.arange(float(STATES))
-        mean[rows] = _run(q[rows], gains) * scale
-        variance[rows] = np.diagonal(gains.covariance, axis1=1, axis2=2) * (sigma * scale) ** 2
+        mean[rows] = _run(q[rows], gain, back) * scale
+        variance[rows] = np.diagonal(covariance, axis1=1, axis2=2) * (sigma * scale) ** 2
         if also is not None and second is not None:
-            second[rows] = _run(also[rows], gains)[:, 0]
+            second[rows] = _run(also[rows], gain, back)[:, 0]
     std = np.sqrt(variance)
     return Smoothed(mean[:, 0], mean[:, 1], mean[:, 2], std[:, 1], std[:, 2], second, sigma)
 
 
 def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
-    """ρ and σ of greatest evidence on the longest pieces.
-
-    Args:
-        q: `(n,)` measured positions.
-        stretches: the pieces.
-
-    Returns:
-        ρ, and σ in the unit of q.
-    """
+    """ρ and σ, in the unit of q, of greatest evidence on the longest pieces of measured positions `(n,)`."""
     chosen, remaining = [], LEARNED_ROWS
     for rows in sorted(stretches, key=lambda s: s.start - s.stop):
         chosen.append(q[rows][:remaining])
@@ -135,18 +106,11 @@ def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
     longest = max(map(len, chosen))
 
     def cost(log_rho: float) -> tuple[float, float]:
-        gains = _forward(longest, float(np.exp(log_rho)))[0:2]
-        total, log_det, count = 0.0, 0.0, 0
-        for values in chosen:
-            e = _innovations(values, gains[0])[STATES:]
-            S = gains[1][STATES : len(values)]
-            total, log_det, count = (
-                total + float(np.sum(e**2 / S)),
-                log_det + float(np.log(S).sum()),
-                count + len(e),
-            )
-        variance = max(total / count, np.finfo(float).tiny)
-        return count * np.log(variance) + log_det, variance
+        gain, innovation, *_ = _forward(longest, float(np.exp(log_rho)))
+        e = np.concatenate([_ahead(values, gain)[0][STATES:] for values in chosen])
+        S = np.concatenate([innovation[STATES : len(values)] for values in chosen])
+        variance = max(float(np.mean(e**2 / S)), np.finfo(float).tiny)
+        return len(e) * np.log(variance) + float(np.log(S).sum()), variance
 
     best = minimize_scalar(lambda x: cost(x)[0], bounds=LOG_RHO, method="bounded", options={"xatol": 0.05})
     return float(np.exp(best.x)), float(np.sqrt(cost(best.x)[1]))
@@ -172,75 +136,44 @@ def _forward(n: int, rho: float) -> tuple[Array, Array, Array, Array]:
     return gain, innovation, predicted, filtered
 
 
-def _gains(n: int, rho: float) -> SmootherGains:
-    gain, innovation, predicted, filtered = _forward(n, rho)
-    back, covariance = np.empty((n, STATES, STATES)), np.empty((n, STATES, STATES))
-    covariance[-1], back[-1] = filtered[-1], 0.0
+def _gains(n: int, rho: float) -> tuple[Array, Array, Array]:
+    """Filter gains `(n, 4)`, smoother gains from the next row and covariances over σ², `(n, 4, 4)` each."""
+    gain, _, predicted, filtered = _forward(n, rho)
+    back, covariance = np.zeros((n, STATES, STATES)), filtered.copy()
     settled = False
     for k in range(n - 2, -1, -1):
-        same = settled and (filtered[k] == filtered[k + 1]).all()
-        if same:
+        if settled and (filtered[k] == filtered[k + 1]).all():
             back[k], covariance[k] = back[k + 1], covariance[k + 1]
             continue
         G = cho_solve(cho_factor(predicted[k + 1]), A @ filtered[k]).T
         back[k] = G
         covariance[k] = filtered[k] + G @ (covariance[k + 1] - predicted[k + 1]) @ G.T
-        settled = bool(
-            np.abs(covariance[k] - covariance[k + 1]).max() <= SETTLED * np.abs(covariance[k]).max()
-        )
-    return SmootherGains(gain, innovation, back, covariance)
+        change = np.abs(covariance[k] - covariance[k + 1]).max()
+        settled = bool(change <= SETTLED * np.abs(covariance[k]).max())
+    return gain, back, covariance
 
 
-def _innovations(y: Array, gain: Array) -> Array:
-    """What each row adds to what the rows before it predict."""
-    z, e = np.zeros(STATES), np.empty(len(y))
-    z[0] = y[0]
+def _ahead(y: Array, gain: Array) -> tuple[Array, Array]:
+    """Innovations `(n,)`, what each row adds to the prediction, and predicted scaled states `(n, 4)`."""
+    e, ahead = np.empty(len(y)), np.empty((len(y), STATES))
+    z = np.array([y[0], *[0.0] * (STATES - 1)])
     for k in range(len(y)):
-        e[k] = y[k] - z[0]
+        e[k], ahead[k] = y[k] - z[0], z
         z = A @ (z + gain[k] * e[k])
-    return e
+    return e, ahead
 
 
-def _run(y: Array, gains: SmootherGains) -> Array:
+def _run(y: Array, gain: Array, back: Array) -> Array:
     """Smoothed scaled states `(n, 4)`."""
-    n = len(y)
-    ahead, now = np.empty((n, STATES)), np.empty((n, STATES))
-    z = np.zeros(STATES)
-    z[0] = y[0]
-    for k in range(n):
-        ahead[k] = z
-        now[k] = z + gains.gain[k] * (y[k] - z[0])
-        z = A @ now[k]
-    for k in range(n - 2, -1, -1):
-        now[k] += gains.back[k] @ (now[k + 1] - ahead[k + 1])
+    e, ahead = _ahead(y, gain)
+    now = ahead + gain[: len(y)] * e[:, None]
+    for k in range(len(y) - 2, -1, -1):
+        now[k] += back[k] @ (now[k + 1] - ahead[k + 1])
     return now
-
-
-UNEVEN = 0.02
-"""Largest departure of a time step from the usual one, as a fraction, that passes for even."""
-
-
-def even_clock(signals: Signals, period: float | None, report: ImportReport) -> None:
-    """Make the clock even where it is not, or bring it to a period.
-
-    Args:
-        signals: the log.
-        period: time step asked for [s].
-        report: gets how uneven the clock was.
-    """
-    worst = unevenness(signals.t, signals.segment)
-    if period is None and worst <= UNEVEN:
-        return
-    if worst > UNEVEN:
-        report.find("uneven", f"time steps depart by up to {100.0 * worst:.3g} % from the usual step")
-    make_even(signals, period, report)
 
 
 def add_derivatives(signals: Signals, settings: DerivativesSection, report: ImportReport) -> Array | None:
     """Compute `qd` and `qdd` where the log has none, and pass the torque through the same filter.
-
-    With the Savitzky–Golay filter each quantity is the derivative of the polynomial fitted to a window. The
-    smoother's estimates are the means of a state-space model of each joint's position (`kalman.smooth`).
 
     Args:
         signals: the log, on an even clock; contact switches cut it into pieces.
@@ -256,37 +189,22 @@ def add_derivatives(signals: Signals, settings: DerivativesSection, report: Impo
     logged = [name for name in ("qd", "qdd") if name in signals.vectors]
     if len(logged) == 2:
         return None
-    least = settings.window if settings.method == "savitzky_golay" else SHORTEST
-    piece = _pieces(signals, least, report)
-    std = np.empty_like(signals.vectors["q"])
-    for name in ("qd", "qdd"):
-        if name not in logged:
-            signals.vectors[name] = np.empty_like(std)
-    for joint in range(len(signals.joint_names)):
-        if settings.method == "savitzky_golay":
-            _filter(signals, piece, joint, settings, std, logged)
-        else:
-            _smooth(signals, piece, joint, settings, std, logged)
-    if "qdd" in logged:
-        report.did(f"computed qd by {_named(settings)}")
-        return None
-    report.did(f"computed {'qdd' if logged else 'qd and qdd'} by {_named(settings)}")
-    if settings.filter_torque:
+    golay = settings.method == "savitzky_golay"
+    piece = _pieces(signals, settings.window if golay else SHORTEST, report)
+    std = (_filter if golay else _smooth)(signals, piece, settings)
+    how = "a Kalman (RTS) smoother with white snap"
+    if golay:
+        how = f"a Savitzky-Golay filter of window {settings.window} and order {settings.order}"
+    report.did(f"computed {' and '.join(name for name in ('qd', 'qdd') if name not in logged)} by {how}")
+    if "qdd" not in logged and settings.filter_torque:
         report.did("passed the torque through the same filter")
     return std
 
 
-def _named(settings: DerivativesSection) -> str:
-    if settings.method == "smoother":
-        return "a Kalman (RTS) smoother with white snap"
-    return f"a Savitzky-Golay filter of window {settings.window} and order {settings.order}"
-
-
 def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.int64]:
     """Number of the piece of each row; pieces too short for the filter are dropped."""
-    flags = list(signals.contact.values())
     keep = np.ones(len(signals), dtype=bool)
-    for rows in signals.runs(*flags):
+    for rows in signals.runs(*signals.contact.values()):
         keep[rows] = rows.stop - rows.start >= least
     if not keep.any():
         raise DataError(
@@ -297,64 +215,45 @@ def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.in
     if not keep.all():
         message = f"{(~keep).sum()} rows in stretches shorter than {least} rows were dropped"
         report.find("short", message, signals.row[~keep])
-        # What lies on two sides of dropped rows is not one trajectory.
-        signals.segment = signals.segment + np.cumsum(np.concatenate([[False], keep[1:] & ~keep[:-1]]))
-        signals.keep(keep)
-    piece = np.zeros(len(signals), dtype=np.int64)
-    for number, rows in enumerate(signals.runs(*signals.contact.values())):
-        piece[rows] = number
-    return piece
+        signals.keep(keep, split=True)
+    lengths = [rows.stop - rows.start for rows in signals.runs(*signals.contact.values())]
+    return np.repeat(np.arange(len(lengths)), lengths)
 
 
-def _filter(
-    signals: Signals,
-    piece: NDArray[np.int64],
-    joint: int,
-    settings: DerivativesSection,
-    std: Array,
-    logged: list[str],
-) -> None:
-    """One joint by Savitzky–Golay."""
-    method = SavitzkyGolay(settings.window, settings.order)
-    vectors, one = signals.vectors, slice(joint, joint + 1)
-    from_velocity = "qd" in logged and settings.source != "position"
-    if "qd" not in logged:
-        vectors["qd"][:, one], _ = differentiate(signals.t, vectors["q"][:, one], piece, method, 1)
-    if "qdd" not in logged:
-        of, degree = ("qd", 1) if from_velocity else ("q", 2)
-        vectors["qdd"][:, one], std[:, one] = differentiate(
-            signals.t, vectors[of][:, one], piece, method, degree
-        )
-        if settings.filter_torque:
-            filtered(vectors["tau"][:, joint], piece, method)
-
-
-def filtered(values: Array, piece: NDArray[np.int64], method: SavitzkyGolay) -> None:
-    """Replace a column by its Savitzky–Golay fit, piece by piece."""
+def _filter(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSection) -> Array | None:
+    """Derivatives of the polynomials fitted to a moving window (Savitzky and Golay)."""
     from scipy.signal import savgol_filter
 
-    for rows in runs(piece):
-        values[rows] = savgol_filter(values[rows], method.window, method.order, mode="interp")
+    method, vectors = SavitzkyGolay(settings.window, settings.order), signals.vectors
+    of, degree = ("qd", 1) if "qd" in vectors and settings.source != "position" else ("q", 2)
+    if "qd" not in vectors:
+        vectors["qd"], _ = differentiate(signals.t, vectors["q"], piece, method, 1)
+    if "qdd" in vectors:
+        return None
+    vectors["qdd"], std = differentiate(signals.t, vectors[of], piece, method, degree)
+    if settings.filter_torque:
+        for rows in runs(piece):
+            tau = vectors["tau"][rows]
+            vectors["tau"][rows] = savgol_filter(tau, settings.window, settings.order, axis=0, mode="interp")
+    return std
 
 
-def _smooth(
-    signals: Signals,
-    piece: NDArray[np.int64],
-    joint: int,
-    settings: DerivativesSection,
-    std: Array,
-    logged: list[str],
-) -> None:
-    """One joint by the Kalman smoother, the torque by the same one."""
-    vectors = signals.vectors
-    also = vectors["tau"][:, joint] if settings.filter_torque and "qdd" not in logged else None
-    result = smooth(signals.t, vectors["q"][:, joint], piece, also)
-    if "qd" not in logged:
-        vectors["qd"][:, joint] = result.velocity
-    if "qdd" not in logged:
-        vectors["qdd"][:, joint], std[:, joint] = result.acceleration, result.acceleration_std
+def _smooth(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSection) -> Array | None:
+    """Means and error bars by the Kalman smoother, joint by joint; the torque passes through the same one."""
+    vectors, missing = signals.vectors, {"qd", "qdd"} - set(signals.vectors)
+    filtered, std = "qdd" in missing and settings.filter_torque, np.empty_like(vectors["q"])
+    for name in missing:
+        vectors[name] = np.empty_like(std)
+    for joint in range(len(signals.joint_names)):
+        tau = vectors["tau"][:, joint] if filtered else None
+        result = smooth(signals.t, vectors["q"][:, joint], piece, tau)
+        std[:, joint] = result.acceleration_std
+        for name, value in (("qd", result.velocity), ("qdd", result.acceleration)):
+            if name in missing:
+                vectors[name][:, joint] = value
         if result.also is not None:
             vectors["tau"][:, joint] = result.also
+    return std if "qdd" in missing else None
 
 
 def impact_mask(signals: Signals, margin: float) -> dict[str, NDArray[np.bool_]]:
@@ -363,9 +262,6 @@ def impact_mask(signals: Signals, margin: float) -> dict[str, NDArray[np.bool_]]
     Args:
         signals: the log.
         margin: time on either side of a switch [s].
-
-    Returns:
-        name → `(n,)` bool.
     """
     masks = {}
     for name, closed in signals.contact.items():

@@ -38,12 +38,7 @@ class Solution:
 
 
 def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> Solution:
-    """A robust fit tells the outliers from the rest; least squares of the rest gives the error bars.
-
-    Args:
-        residual: of the parameters, `(n,)`.
-        start: parameters `(k,)`.
-    """
+    """Least squares of the residuals `(n,)` of parameters `(k,)`, without those that a robust fit rejects."""
     robust = start
     for _ in range(2):
         scale = max(float(robust_std(residual(robust))), ROUNDING)
@@ -92,11 +87,6 @@ class Tip:
     axes: Array
     radius: float | None
 
-    @classmethod
-    def sharp(cls, points: Array) -> Tip:
-        """No ball."""
-        return cls(np.zeros_like(points), 0.0)
-
     def start(self, x: list[float]) -> Array:
         """Initial parameters, with those of a surface first."""
         return np.array([*x, 0.0] if self.radius is None else x)
@@ -125,10 +115,7 @@ class Tip:
 
 
 def tip_of(
-    system: ConstrainedSystem,
-    contact: SurfaceContact,
-    q: torch.Tensor,
-    radius: float | Literal["fit"] | None,
+    system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor, radius: float | Literal["fit"] | None
 ) -> Tip:
     """The tip that touched at positions `(n, nq)`: that of the scene, or a ball that ends at its point.
 
@@ -146,8 +133,7 @@ def tip_of(
             hint="leave out the radius of the tip",
         )
     rotation, _ = kinematics.frame_pose(system.robot, q, contact.frame)
-    axes = (rotation @ (point / point.norm())).numpy()
-    return Tip(axes, None if radius == "fit" else radius)
+    return Tip((rotation @ (point / point.norm())).numpy(), None if radius == "fit" else radius)
 
 
 MOST_POINTS = 20_000
@@ -207,9 +193,8 @@ def fit_surface(
 ) -> SurfaceFit:
     """Fit a surface to the path of the touching point while a contact is closed.
 
-    Least squares of the signed distances; a rounded tip touches its radius below its centre. Rows that a
-    robust fit finds off the surface, such as those of bouncing, are left out and counted. The error bars
-    count residuals that are correlated in time as fewer independent ones.
+    Least squares of the signed distances, without the rows that a robust fit finds off the surface. The error
+    bars count residuals that are correlated in time as fewer independent ones.
 
     Args:
         data: a log with the contact's state.
@@ -242,12 +227,11 @@ def fit_surface(
     return fit(contact, points.numpy(), normal.mean(0).numpy(), tip_of(system, touching, q, tip_radius))
 
 
-def _plane(contact: str, points: Array, towards: Array, tip: Tip | None = None) -> SurfaceFit:
+def _plane(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
     """n = n₀ + a u + b v, scaled to one, through the middle of the path moved by e along n.
 
     The ball's centre p − r a is at n·(p − r a) − r = offset.
     """
-    tip = tip or Tip.sharp(points)
     middle = points.mean(axis=0)
     centered = points - middle
     u, v, n0 = np.linalg.svd(centered, full_matrices=False)[2]
@@ -277,9 +261,8 @@ def _plane(contact: str, points: Array, towards: Array, tip: Tip | None = None) 
     return _result(contact, plane, std, solution, len(points), tip.of(x))
 
 
-def _sphere(contact: str, points: Array, towards: Array, tip: Tip | None = None) -> SurfaceFit:
+def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
     """|p − r a − center| = radius + r; starts from the linear fit |p|² = 2 p·center + const."""
-    tip = tip or Tip.sharp(points)
     middle = points.mean(axis=0)
     centered = points - middle
     design = np.column_stack([2.0 * centered, np.ones(len(points))])

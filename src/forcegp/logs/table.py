@@ -22,13 +22,7 @@ COPIES = 2
 
 
 def check_count(source: str, what: str, count: int, most: int) -> None:
-    """Raise `DataError` where a log claims more than `most` of something.
-
-    Args:
-        source: name of the file, for the message.
-        what: what is counted, in the plural.
-        count: the claim.
-        most: the bound.
+    """Raise `DataError` if a log claims more than `most` of something, named in the plural.
 
     >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
     """
@@ -42,13 +36,7 @@ def check_count(source: str, what: str, count: int, most: int) -> None:
 
 
 def check_expansion(source: str, size: int, file: int) -> None:
-    """Raise `DataError` where a small file claims to hold far more than it is long.
-
-    Args:
-        source: name of the file, for the message.
-        size: of what it claims to hold [bytes].
-        file: length of the file [bytes].
-    """
+    """Raise `DataError` if a small file, of `file` bytes, claims to hold far more, `size` bytes."""
     allowed = max(limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
     if size > allowed:
         raise DataError(
@@ -75,12 +63,9 @@ Wanted = Callable[[str], bool]
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Columns with a common clock: a table, a topic of a bag, arrays of one length.
+    """Columns `(n,)` with a common clock: a table, a topic of a bag, arrays of one length.
 
-    Args:
-        name: name of the topic or group; empty for the only table of a file.
-        columns: name → `(n,)` float64; a missing value is NaN.
-        units: name → unit, where the file declares one.
+    A missing value is NaN. The name is empty for the only table of a file; units are those it declares.
     """
 
     name: str
@@ -94,14 +79,7 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
-    """A log as it was read, before anything is known about the meaning of its columns.
-
-    Args:
-        source: name of the file or folder.
-        format: name of the format.
-        streams: the columns by clock.
-        remarks: what was left out or assumed by the reader, one sentence each.
-    """
+    """A log as it was read, with remarks on what the reader left out or assumed, one sentence each."""
 
     source: str
     format: str
@@ -134,32 +112,15 @@ class LogTable:
         return holding[0]
 
 
-class Growing:
-    """A column that is read piece by piece, in one place, so that memory holds it once.
+def joined(chunks: dict[str, list[Column]], rows: int | None) -> dict[str, Column]:
+    """Columns that were read piece by piece, cut to `rows`; memory holds one of them twice at a time."""
+    return {name: np.concatenate(chunks.pop(name))[:rows] for name in list(chunks)}
 
-    Args:
-        expected: how many numbers are expected; more are possible.
-    """
 
-    def __init__(self, expected: int) -> None:
-        self._values = np.empty(max(1024, min(expected, limits.LOG_VALUES)))
-        self._count = 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    def append(self, values: Column) -> None:
-        """Add numbers at the end."""
-        end = self._count + len(values)
-        if end > len(self._values):
-            self._values.resize(end + end // 4, refcheck=False)
-        self._values[self._count : end] = values
-        self._count = end
-
-    def array(self, most: int | None = None) -> Column:
-        """The column, cut to `most` numbers; nothing can be added afterwards."""
-        self._values.resize(self._count if most is None else min(most, self._count), refcheck=False)
-        return self._values
+def streams_by_length(groups: Mapping[int, Mapping[str, Column]], common: int) -> tuple[Stream, ...]:
+    """A stream for each number of rows, that with the common one first and without a name."""
+    ordered = sorted(groups, key=lambda rows: rows != common)
+    return tuple(Stream("" if rows == common else f"{rows} rows", groups[rows]) for rows in ordered)
 
 
 def missing(source: str, kind: str, name: str, names: list[str]) -> DataError:
@@ -220,20 +181,11 @@ def arrays_to_streams(
         if array.ndim == 2 and array.shape[0] != rows:
             array = array.T
             remarks.append(f"{name!r} was transposed: its rows are samples")
-        check_values(source, rows, 1 if array.ndim == 1 else array.shape[1])
-        groups.setdefault(rows, {}).update(_columns(name, array))
+        check_values(source, rows, array.size // rows)
+        parts = {name: array} if array.ndim == 1 else {f"{name}[{i}]": x for i, x in enumerate(array.T)}
+        columns = {part: np.ascontiguousarray(x, dtype=np.float64) for part, x in parts.items()}
+        groups.setdefault(rows, {}).update(columns)
     check_count(source, "arrays of different length", len(groups), limits.LOG_STREAMS)
     for rows, columns in groups.items():
         check_values(source, rows, len(columns))
-    return tuple(
-        Stream("" if rows == common else f"{rows} rows", columns)
-        for rows, columns in sorted(groups.items(), key=lambda item: item[0] != common)
-    )
-
-
-def _columns(name: str, array: NDArray[np.generic]) -> dict[str, Column]:
-    if array.ndim == 1:
-        return {name: np.ascontiguousarray(array, dtype=np.float64)}
-    return {
-        f"{name}[{i}]": np.ascontiguousarray(array[:, i], dtype=np.float64) for i in range(array.shape[1])
-    }
+    return streams_by_length(groups, common)

@@ -31,6 +31,9 @@ QUANTITY: Mapping[str, Mapping[str, float]] = {
 }
 """Units of each quantity of a mapping → factor to SI; currents are in ampere."""
 
+SI = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s2", "torque": "Nm"}
+"""Unit of each joint vector of a rotating joint that is assumed before any is known."""
+
 _SPELLINGS = {
     "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "millis": "ms",
     "milliseconds": "ms", "usec": "us", "micros": "us", "microseconds": "us", "nsec": "ns",

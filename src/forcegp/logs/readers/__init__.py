@@ -17,8 +17,8 @@ _READERS = {
     "numpy": ("NumPy .npz or .npy", "arrays.read_numpy"),
     "matlab": ("MATLAB .mat", "arrays.read_matlab"),
     "hdf5": ("HDF5", "arrays.read_hdf5"),
-    "rosbag1": ("ROS 1 bag", "bags.read_rosbag1"),
-    "rosbag2": ("ROS 2 bag", "bags.read_rosbag2"),
+    "rosbag1": ("ROS 1 bag", "bags.read_rosbag"),
+    "rosbag2": ("ROS 2 bag", "bags.read_rosbag"),
     "mcap": ("MCAP", "bags.read_mcap"),
     "lerobot": ("LeRobot data set", "parquet.read_lerobot"),
 }
@@ -80,9 +80,8 @@ def format_of(path: Path) -> str:
     if path.is_dir():
         return _format_of_folder(path)
     if not path.is_file():
-        raise DataError(
-            f"{path}: no such log", hint=None if path.parent.is_dir() else f"{path.parent} is not a folder"
-        )
+        hint = None if path.parent.is_dir() else f"{path.parent} is not a folder"
+        raise DataError(f"{path}: no such log", hint=hint)
     suffix = path.suffix.lower()
     with path.open("rb") as file:
         head = file.read(32)
@@ -106,10 +105,8 @@ def _format_of_folder(path: Path) -> str:
         return "rosbag2"
     endings = {child.suffix.lower() for child in path.iterdir() if child.is_file()}
     if endings & {".db3", ".mcap"}:
-        raise DataError(
-            f"{path}: a folder with bag files and no metadata.yaml",
-            hint="name the .db3 or .mcap file itself",
-        )
+        text = f"{path}: a folder with bag files and no metadata.yaml"
+        raise DataError(text, hint="name the .db3 or .mcap file itself")
     if endings & set(_TEXT):
         return "text folder"
     raise _unknown(path, "a folder with files ending in " + (", ".join(sorted(endings)) or "nothing"))

@@ -28,6 +28,7 @@ from forcegp.logs.table import (
     foreign,
 )
 
+Arrays = dict[str, NDArray[np.generic]]
 MAX_ARRAYS = 4096
 """Arrays of one archive."""
 
@@ -39,7 +40,7 @@ def read_numpy(path: Path, *, wanted: Wanted, rows: int | None, progress: Progre
         DataError: an array holds Python objects, the file is damaged, or it is too large.
     """
     del wanted, rows, progress
-    arrays: dict[str, NDArray[np.generic]] = {}
+    arrays: Arrays = {}
     remarks: list[str] = []
     with foreign(str(path), "a NumPy file"):
         if zipfile.is_zipfile(path):
@@ -60,13 +61,11 @@ def read_numpy(path: Path, *, wanted: Wanted, rows: int | None, progress: Progre
     return LogTable(str(path), "numpy", streams, tuple(remarks))
 
 
-def _array(source: str, name: str, file: Any, size: int) -> dict[str, NDArray[np.generic]]:
+def _array(source: str, name: str, file: Any, size: int) -> Arrays:
     """An array by name, the fields of a structured one each; what its header claims is checked first."""
-    version = np.lib.format.read_magic(file)  # pyright: ignore[reportArgumentType]
-    read_header = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }.get(version)
+    form = np.lib.format
+    version = form.read_magic(file)  # pyright: ignore[reportArgumentType]
+    read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)
     if read_header is None:
         raise DataError(f"{source}: version {version} of the NumPy format is not read")
     shape, fortran, dtype = read_header(file)  # pyright: ignore[reportArgumentType]
@@ -87,9 +86,6 @@ def _array(source: str, name: str, file: Any, size: int) -> dict[str, NDArray[np
     return {name: array}
 
 
-Arrays = dict[str, NDArray[np.generic]]
-
-
 def read_hdf5(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
     """Read the numeric data sets of an HDF5 file; one in a group is `group/name`.
 
@@ -98,34 +94,21 @@ def read_hdf5(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
         MissingDependencyError: `h5py` is not installed.
     """
     del wanted, rows, progress
-    return _read_hdf5(path, "hdf5", "/")
-
-
-def read_matlab73(path: Path) -> LogTable:
-    """Read a MATLAB file of version 7.3: names as in MATLAB, and axes in its order."""
-    return _read_hdf5(path, "matlab", ".")
-
-
-def _read_hdf5(path: Path, format_: str, separator: str) -> LogTable:
-    h5py = optional_module("h5py", "Reading HDF5 files", "import")
     remarks: list[str] = []
+    streams = arrays_to_streams(str(path), _hdf5_arrays(path, "/", remarks), remarks)
+    return LogTable(str(path), "hdf5", streams, tuple(remarks))
+
+
+def _hdf5_arrays(path: Path, separator: str, remarks: list[str]) -> Arrays:
+    h5py = optional_module("h5py", "Reading HDF5 files", "import")
     arrays: Arrays = {}
     with foreign(str(path), "HDF5"), h5py.File(path, "r") as file:
-        addresses: set[Any] = {h5py.h5o.get_info(file.id).addr}
-        _walk(h5py, file, "", separator, arrays, remarks, addresses)
-    if format_ == "matlab":
-        arrays = {name: array.T for name, array in arrays.items()}
-    return LogTable(str(path), format_, arrays_to_streams(str(path), arrays, remarks), tuple(remarks))
+        _walk(h5py, file, "", separator, arrays, remarks, {h5py.h5o.get_info(file.id).addr})
+    return arrays
 
 
 def _walk(
-    h5py: Any,
-    group: Any,
-    prefix: str,
-    separator: str,
-    arrays: Arrays,
-    remarks: list[str],
-    addresses: set[Any],
+    h5py: Any, group: Any, prefix: str, separator: str, arrays: Arrays, remarks: list[str], seen: set[Any]
 ) -> None:
     """Collect the data sets below a group, each once, though links may lead to it several times."""
     if prefix.count(separator) > limits.GROUP_DEPTH:
@@ -139,12 +122,12 @@ def _walk(
             continue
         item = group[key]
         mark = h5py.h5o.get_info(item.id).addr
-        if mark in addresses:
+        if mark in seen:
             continue
-        addresses.add(mark)
-        check_count(group.file.filename, "objects", len(addresses), limits.COLUMNS)
+        seen.add(mark)
+        check_count(group.file.filename, "objects", len(seen), limits.COLUMNS)
         if isinstance(item, h5py.Group):
-            _walk(h5py, item, f"{name}{separator}", separator, arrays, remarks, addresses)
+            _walk(h5py, item, f"{name}{separator}", separator, arrays, remarks, seen)
         elif isinstance(item, h5py.Dataset):
             _take(item, name, arrays, remarks)
 
@@ -175,15 +158,17 @@ def read_matlab(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
         DataError: the file is damaged or too large.
         MissingDependencyError: a file of version 7.3, and `h5py` is not installed.
     """
+    del wanted, rows, progress
     with path.open("rb") as file:
         head = file.read(520)
-    if head.startswith(HDF5_MAGIC) or head[512:520] == HDF5_MAGIC:
-        return read_matlab73(path)
     remarks: list[str] = []
-    arrays: dict[str, NDArray[np.generic]] = {}
-    with foreign(str(path), "a MATLAB file"):
-        for variable in _version4(path) if 0 in head[:4] else variables(path.read_bytes(), str(path)):
-            _collect(variable, arrays, remarks)
+    arrays: Arrays = {}
+    if HDF5_MAGIC in (head[:8], head[512:520]):  # version 7.3: names as in MATLAB, and axes in its order
+        arrays = {name: array.T for name, array in _hdf5_arrays(path, ".", remarks).items()}
+    else:
+        with foreign(str(path), "a MATLAB file"):
+            for variable in _version4(path) if 0 in head[:4] else variables(path.read_bytes(), str(path)):
+                _collect(variable, arrays, remarks)
     check_count(str(path), "arrays", len(arrays), limits.COLUMNS)
     return LogTable(str(path), "matlab", arrays_to_streams(str(path), arrays, remarks), tuple(remarks))
 
@@ -201,7 +186,7 @@ def _version4(path: Path) -> Iterator[Variable]:
             yield Variable(name, value if isinstance(value, np.ndarray) else "is sparse")
 
 
-def _collect(variable: Variable, arrays: dict[str, NDArray[np.generic]], remarks: list[str]) -> None:
+def _collect(variable: Variable, arrays: Arrays, remarks: list[str]) -> None:
     """Numeric arrays of a variable, going into structs."""
     name, value = variable
     if isinstance(value, tuple):

@@ -10,6 +10,7 @@ The layouts are those of the ROS distributions; definitions that a bag carries a
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +26,11 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 KINDS = (JOINT_STATE, WRENCH)
 """Message types that are read."""
-QUANTITIES = ("position", "velocity", "effort")
+QUANTITIES = {"position": "rad", "velocity": "rad/s", "effort": "Nm"}
+"""Quantities of a joint state, with their units by REP 103."""
+WRENCH_COLUMNS = {
+    f"{part}.{axis}": unit for part, unit in (("force", "N"), ("torque", "Nm")) for axis in "xyz"
+}
 CLOCKS = ("header", "receive")
 """Columns of time that every topic has."""
 
@@ -43,21 +48,45 @@ def canonical(kind: str) -> str:
 
 
 def decoder(kind: str, encoding: str) -> Decode:
-    """Decodes messages of a type.
-
-    Args:
-        kind: one of `KINDS`.
-        encoding: `ros1` or `cdr`.
+    """Decodes messages of a type in `KINDS`, in the encoding `ros1` or `cdr`.
 
     Raises:
         MissingDependencyError: `rosbags` is not installed.
     """
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
-    if encoding == "ros1":
-        store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
-        return lambda raw: store.deserialize_ros1(raw, kind)
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    return lambda raw: store.deserialize_cdr(raw, kind)
+    stores = typesys.Stores
+    store = typesys.get_typestore(stores.ROS1_NOETIC if encoding == "ros1" else stores.ROS2_HUMBLE)
+    deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
+    return lambda raw: deserialize(raw, kind)
+
+
+@dataclass
+class Messages:
+    """Messages of one topic about one set of joints, in the order of the first message.
+
+    Attributes:
+        names: the joints; none for a wrench.
+        rows: the numbers of each message.
+        stamps: stamp of the header and time of recording [ns].
+    """
+
+    topic: str
+    kind: str
+    names: tuple[str, ...]
+    rows: list[list[float]] = field(default_factory=list)
+    stamps: list[tuple[int, int]] = field(default_factory=list)
+
+    def stream(self, name: str, origin: np.ndarray, wanted: Wanted) -> Stream:
+        """The columns that are wanted and hold numbers, with times from `origin` [ns]."""
+        stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
+        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps.T), strict=True))
+        units: dict[str, str] = dict.fromkeys(CLOCKS, "s")
+        parts = {f"{quantity}.{n}": unit for quantity, unit in QUANTITIES.items() for n in self.names}
+        values = np.ascontiguousarray(np.array(self.rows, dtype=np.float64).T)
+        for (part, unit), column in zip((parts or WRENCH_COLUMNS).items(), values, strict=True):
+            if not np.isnan(column).all() and wanted(part):
+                columns[part], units[part] = column, unit
+        return Stream(name, columns, units)
 
 
 @dataclass
@@ -69,11 +98,8 @@ class Collector:
     """
 
     source: str
-    _rows: dict[tuple[str, str, tuple[str, ...]], list[list[float]]] = field(default_factory=dict)
-    _stamps: dict[tuple[str, str, tuple[str, ...]], list[tuple[int, int]]] = field(default_factory=dict)
-    _orders: dict[tuple[str, tuple[str, ...]], tuple[str, ...]] = field(default_factory=dict)
+    _streams: dict[tuple[str, tuple[str, ...]], Messages] = field(default_factory=dict)
     _numbers: int = 0
-    _messages: int = 0
 
     def add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
         """Take one message.
@@ -84,82 +110,49 @@ class Collector:
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
         names, values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
-        # One stream for a set of joints, in the order of its first message, whatever the order of the others.
-        self._orders.setdefault((topic, tuple(sorted(names))), names)
-        order = self._orders[topic, tuple(sorted(names))]
-        if order != names:
-            values = _reordered(values, names, order)
-        key = (topic, kind, order)
+        stream = self._streams.setdefault((topic, tuple(sorted(names))), Messages(topic, kind, names))
+        if stream.names != names:
+            order = [names.index(name) for name in stream.names]
+            blocks = range(0, len(values), len(names))
+            values = [values[start + i] for start in blocks for i in order]
         stamp = message.header.stamp
-        self._rows.setdefault(key, []).append(values)
-        self._stamps.setdefault(key, []).append((stamp.sec * 10**9 + stamp.nanosec, receive_ns))
+        stream.rows.append(values)
+        stream.stamps.append((stamp.sec * 10**9 + stamp.nanosec, receive_ns))
         self._numbers += len(values)
-        self._messages += 1
         check_count(self.source, "numbers", self._numbers, limits.LOG_VALUES)
-        check_count(self.source, "streams", len(self._rows), limits.LOG_STREAMS)
+        check_count(self.source, "streams", len(self._streams), limits.LOG_STREAMS)
 
     @property
     def rows(self) -> int:
         """Rows of the longest stream so far."""
-        return max(map(len, self._rows.values()), default=0)
+        return max((len(stream.rows) for stream in self._streams.values()), default=0)
 
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
-        """The log.
-
-        Args:
-            format_: name of the format.
-            topics: topic → message type, of all topics in the bag.
-            wanted: which columns to keep.
+        """The log, with the columns that are wanted; `topics` are all topics of the bag with their types.
 
         Raises:
             DataError: no topic has a message type that is read.
         """
-        if not self._rows:
+        if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             raise DataError(
                 f"{self.source}: no message of a type that is read",
                 expected=" or ".join(KINDS),
                 got=listing[:600] or "no topics",
             )
-        origin = np.min([np.min(np.array(stamps), axis=0) for stamps in self._stamps.values()], axis=0)
-        taken: dict[str, int] = {}
+        found = sorted(self._streams.values(), key=lambda s: (s.topic, -len(s.rows)))
+        origin = np.min([np.min(np.array(stream.stamps), axis=0) for stream in found], axis=0)
+        taken: Counter[str] = Counter()
         streams = []
-        for key in sorted(self._rows, key=lambda k: (k[0], -len(self._rows[k]))):
-            topic = key[0]
-            taken[topic] = taken.get(topic, 0) + 1
-            name = topic if taken[topic] == 1 else f"{topic}#{taken[topic]}"
-            streams.append(self._stream(name, key, origin, wanted))
+        for stream in found:
+            taken[stream.topic] += 1
+            number = f"#{taken[stream.topic]}" if taken[stream.topic] > 1 else ""
+            streams.append(stream.stream(f"{stream.topic}{number}", origin, wanted))
+            stream.rows.clear()
         unread = [f"{t} ({k})" for t, k in topics.items() if canonical(k) not in KINDS]
         remarks = [f"topics of other types were not read: {', '.join(unread)[:600]}"] if unread else []
         remarks.append(f"time 0 is {origin[0] * 1e-9:.9f} s on the clock of the headers")
         return LogTable(self.source, format_, tuple(streams), tuple(remarks))
-
-    def _stream(
-        self, name: str, key: tuple[str, str, tuple[str, ...]], origin: np.ndarray, wanted: Wanted
-    ) -> Stream:
-        values = np.array(self._rows.pop(key), dtype=np.float64)
-        stamps = (np.array(self._stamps[key], dtype=np.int64) - origin) * 1e-9
-        _, kind, names = key
-        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps.T), strict=True))
-        parts = (
-            [f"{q}.{n}" for q in QUANTITIES for n in names] if kind == JOINT_STATE else list(WRENCH_COLUMNS)
-        )
-        for i, part in enumerate(parts):
-            column = np.ascontiguousarray(values[:, i])
-            if not np.isnan(column).all() and wanted(part):
-                columns[part] = column
-        units = {p: u for p, u in zip(parts, _units(kind, len(names)), strict=True) if p in columns}
-        return Stream(name, columns, units | dict.fromkeys(CLOCKS, "s"))
-
-
-WRENCH_COLUMNS = tuple(f"{part}.{axis}" for part in ("force", "torque") for axis in "xyz")
-
-
-def _units(kind: str, count: int) -> list[str]:
-    """Units by REP 103."""
-    if kind == WRENCH:
-        return ["N"] * 3 + ["Nm"] * 3
-    return ["rad"] * count + ["rad/s"] * count + ["Nm"] * count
 
 
 def _joint_state(source: str, topic: str, message: Any) -> tuple[tuple[str, ...], list[float]]:
@@ -179,40 +172,28 @@ def _joint_state(source: str, topic: str, message: Any) -> tuple[tuple[str, ...]
     return names, values
 
 
-def _reordered(values: list[float], names: tuple[str, ...], order: tuple[str, ...]) -> list[float]:
-    """Values of a joint state whose message names the joints in another order."""
-    index = [names.index(name) for name in order]
-    return [values[block * len(names) + i] for block in range(len(QUANTITIES)) for i in index]
-
-
 def _wrench(message: Any) -> tuple[tuple[str, ...], list[float]]:
     force, torque = message.wrench.force, message.wrench.torque
     return (), [force.x, force.y, force.z, torque.x, torque.y, torque.z]
 
 
-def read_rosbag1(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag.
+def read_rosbag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2.
 
     Raises:
-        DataError: the bag is damaged or too large, or has no message of these types.
+        DataError: the bag is damaged, compressed or too large, or has no message of these types.
         MissingDependencyError: `rosbags` is not installed.
     """
-    package = optional_module("rosbags.rosbag1", "Reading ROS 1 bags", "import")
-    return read_bag(path, package.Reader, "rosbag1", wanted, rows, progress)
-
-
-def read_bag(
-    path: Path,
-    open_bag: Callable[[Path], Any],
-    format_: str,
-    wanted: Wanted,
-    rows: int | None,
-    progress: Progress | None,
-) -> LogTable:
-    """Read what a reader of the package `rosbags`, made by `open_bag`, finds in a bag."""
-    encoding = "ros1" if format_ == "rosbag1" else "cdr"
+    with (path if path.is_file() else path / "metadata.yaml").open("rb") as file:
+        first = file.read(12) == b"#ROSBAG V2.0"
+    number, encoding = (1, "ros1") if first else (2, "cdr")
+    package = optional_module(f"rosbags.rosbag{number}", f"Reading ROS {number} bags", "import")
+    if path.is_dir():
+        _check_metadata(path)
+    elif not first and path.suffix != ".db3":
+        raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
     collector = Collector(str(path))
-    with foreign(str(path), "a bag"), open_bag(path) as bag:
+    with foreign(str(path), "a bag"), package.Reader(path) as bag:
         check_count(str(path), "topics", len(bag.connections), limits.LOG_STREAMS)
         check_count(str(path), "messages", bag.message_count, limits.LOG_MESSAGES)
         topics = {c.topic: c.msgtype for c in bag.connections}
@@ -226,22 +207,7 @@ def read_bag(
                 progress(done, total)
             if rows is not None and collector.rows >= rows:
                 break
-        return collector.table(format_, topics, wanted)
-
-
-def read_rosbag2(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag.
-
-    Raises:
-        DataError: the bag is damaged, compressed or too large, or has no message of these types.
-        MissingDependencyError: `rosbags` is not installed.
-    """
-    package = optional_module("rosbags.rosbag2", "Reading ROS 2 bags", "import")
-    if path.is_dir():
-        _check_metadata(path)
-    elif path.suffix != ".db3":
-        raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
-    return read_bag(path, package.Reader, "rosbag2", wanted, rows, progress)
+        return collector.table(f"rosbag{number}", topics, wanted)
 
 
 def _check_metadata(path: Path) -> None:

@@ -6,6 +6,7 @@ The layout is that of "MAT-File Format" (MathWorks), chapter 1.
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -123,7 +124,7 @@ class _Reader:
             return Variable(name, "is complex")
         if kind in NUMERIC:
             return Variable(name, self.array(self.next(parts), shape))
-        if kind == STRUCT and _count(shape) == 1:
+        if kind == STRUCT and math.prod(shape) == 1:
             return Variable(name, self.fields(parts, depth))
         return Variable(name, f"is of class {OTHER_CLASSES.get(kind, 'struct')}")
 
@@ -144,7 +145,7 @@ class _Reader:
 
     def array(self, element: _Element, shape: tuple[int, ...]) -> NDArray[np.generic]:
         values = self.numbers(element)
-        if min(shape, default=-1) < 0 or _count(shape) != len(values):
+        if min(shape, default=-1) < 0 or math.prod(shape) != len(values):
             raise self.damaged(f"an array of shape {shape}", f"{len(values)} numbers")
         return values.reshape(shape, order="F")
 
@@ -163,11 +164,3 @@ class _Reader:
 
     def damaged(self, expected: str, got: str) -> DataError:
         return DataError(f"{self.source}: the MATLAB file is damaged", expected=expected, got=got)
-
-
-def _count(shape: tuple[int, ...]) -> int:
-    """Product of a shape, in integers of any length."""
-    count = 1
-    for length in shape:
-        count *= length
-    return count

@@ -23,6 +23,7 @@ from forcegp.logs.table import (
     check_expansion,
     check_values,
     foreign,
+    joined,
 )
 
 if TYPE_CHECKING:
@@ -48,14 +49,9 @@ def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 def read_columns(
     paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
 ) -> dict[str, Column]:
-    """The columns of one or more files one after another.
+    """The columns of one or more files one after another; `remarks` gets a sentence for each one left out.
 
-    Args:
-        paths: the files, in order.
-        wanted: which columns to read, by their name, or by `name[i]` for a list column.
-        rows: stop after so many rows.
-        remarks: gets a sentence for each column that is left out.
-        progress: called with the rows read and their total.
+    A list column is wanted by its name, or by `name[i]`.
     """
     import pyarrow.parquet as pq
 
@@ -82,15 +78,10 @@ def read_columns(
                     progress(done, total)
                 if rows is not None and done >= rows:
                     break
-    return _joined(str(paths[0]), chunks, done, rows)
-
-
-def _joined(source: str, chunks: dict[str, list[Column]], done: int, rows: int | None) -> dict[str, Column]:
-    columns: dict[str, Column] = {}
-    for name in list(chunks):
-        columns[name] = np.concatenate(chunks.pop(name))[:rows]
-        if len(columns[name]) != min(done, rows or done):
-            raise DataError(f"{source}: column {name!r} is missing in some of the files")
+    columns = joined(chunks, rows)
+    for name, values in columns.items():
+        if len(values) != min(done, rows or done):
+            raise DataError(f"{paths[0]}: column {name!r} is missing in some of the files")
     return columns
 
 
@@ -109,9 +100,8 @@ def _readable(file: object, wanted: Wanted, remarks: list[str]) -> list[str]:
 
     names = []
     for field in file.schema_arrow:  # pyright: ignore[reportAttributeAccessIssue]
-        kind, listed = field.type, False
-        if kinds.is_list(kind) or kinds.is_fixed_size_list(kind) or kinds.is_large_list(kind):
-            kind, listed = kind.value_type, True
+        listed = _is_list(field.type)
+        kind = field.type.value_type if listed else field.type
         numeric = kinds.is_floating(kind) or kinds.is_integer(kind) or kinds.is_boolean(kind)
         selected = wanted(field.name) or (listed and any(wanted(f"{field.name}[{i}]") for i in range(64)))
         if selected and (numeric or (kinds.is_timestamp(kind) and not listed)):
@@ -122,6 +112,12 @@ def _readable(file: object, wanted: Wanted, remarks: list[str]) -> list[str]:
     return names
 
 
+def _is_list(kind: pa.DataType) -> bool:
+    import pyarrow.types as kinds
+
+    return kinds.is_list(kind) or kinds.is_fixed_size_list(kind) or kinds.is_large_list(kind)
+
+
 def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -130,11 +126,7 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
     if kinds.is_timestamp(values.type):
         nanoseconds = pc.cast(pc.cast(values, pa.timestamp("ns")), pa.int64())
         return {name: nanoseconds.to_numpy(zero_copy_only=False) * 1e-9}
-    if not (
-        kinds.is_list(values.type)
-        or kinds.is_large_list(values.type)
-        or kinds.is_fixed_size_list(values.type)
-    ):
+    if not _is_list(values.type):
         return {name: pc.cast(values, pa.float64(), safe=False).to_numpy(zero_copy_only=False)}
     lengths = pc.call_function("list_value_length", [values]).to_numpy(zero_copy_only=False)
     width = int(lengths[0]) if len(lengths) and lengths[0] == lengths[0] else 0
@@ -169,16 +161,15 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
     check_count(str(path), "files", len(files), limits.LOG_FILES)
     if not files:
         raise DataError(f"{path}: no episodes", expected=f"Parquet files below {path / 'data'}")
-    names: dict[str, str] = {}
-    for feature, description in features.items():
-        for i, motor in enumerate(_motors(description)):
-            names[f"{feature}[{i}]"] = f"{feature}.{motor}"[: limits.LOG_NAME]
+    names = {
+        f"{feature}[{i}]": f"{feature}.{motor}"[: limits.LOG_NAME]
+        for feature, description in features.items()
+        for i, motor in enumerate(_motors(description))
+    }
     remarks: list[str] = []
     with foreign(str(path), "a LeRobot data set"):
         columns = read_columns(files, lambda n: wanted(names.get(n, n)), rows, remarks, progress)
-    renamed: dict[str, Column] = {}
-    for name, values in columns.items():
-        renamed[names.get(name, name)] = values
+    renamed = {names.get(name, name): values for name, values in columns.items()}
     return LogTable(str(path), "lerobot", (Stream("", renamed),), tuple(remarks))
 
 

@@ -6,6 +6,7 @@ of numbers. In a folder each file holds one quantity: `q.txt`, `tau.txt`, …
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +19,6 @@ from forcegp import limits
 from forcegp.errors import DataError
 from forcegp.logs.table import (
     Column,
-    Growing,
     LogTable,
     Progress,
     Stream,
@@ -26,6 +26,8 @@ from forcegp.logs.table import (
     check_count,
     check_values,
     foreign,
+    joined,
+    streams_by_length,
 )
 
 if TYPE_CHECKING:
@@ -52,13 +54,9 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 class Dialect:
     """How a text table is written.
 
-    Args:
-        encoding: of the text.
-        separator: one of `SEPARATORS`.
-        decimal: decimal mark, a point or a comma.
+    Attributes:
         first_line: number of lines before the first line of numbers.
-        names: name of each column.
-        kinds: `number`, `bool`, `date` or `text`, one per column.
+        kinds: `number`, `bool`, `date`, `text` or `empty`, one per column.
         units: name → unit, where a line below the heading declares units.
     """
 
@@ -135,11 +133,10 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, st
     first = rows[0][0]
     after = [fields for i, fields in kept if i >= first][:SAMPLE_LINES]
     width = len(after[0])
-    same = sum(len(fields) == width for fields in after) / len(after)
     values = sum(_is_value(f, decimal) for fields in after for f in fields) / len(after)
     # A comma inside numbers, taken for a separator, leaves fields such as "5;2" that are not values.
-    preferred = 0.01 if decimal == "." else 0.0
-    return (values**2 / width + preferred if same == 1.0 else 0.0), separator, decimal, first
+    score = values**2 / width + (0.01 if decimal == "." else 0.0)
+    return (score if all(len(fields) == width for fields in after) else 0.0), separator, decimal, first
 
 
 def _is_value(field: str, decimal: str) -> bool:
@@ -163,9 +160,8 @@ def _dialect(
     width = len(rows[0])
     check_count(str(path), "columns", width, limits.COLUMNS)
     above = [split(line.lstrip("#%/ \t"), separator) for line in lines[:first] if line.strip()]
-    above = [
-        fields for fields in above if len(fields) == width or (len(fields) == width - 1 and not rows[0][-1])
-    ]
+    widths = (width, width if rows[0][-1] else width - 1)
+    above = [fields for fields in above if len(fields) in widths]
     units: dict[str, str] = {}
     names = [str(i) for i in range(width)]
     if above:
@@ -178,9 +174,8 @@ def _dialect(
         units = {name: unit.strip("[]() ") for name, unit in pairs if unit.strip("[]() ")}
     for name in names:
         if names.count(name) > 1:
-            raise DataError(
-                f"{path}: column {name!r} occurs more than once", hint="rename one of the columns"
-            )
+            text = f"{path}: column {name!r} occurs more than once"
+            raise DataError(text, hint="rename one of the columns")
     kinds = tuple(_kind([row[i] for row in rows if i < len(row)], decimal) for i in range(width))
     return Dialect(encoding, separator, decimal, first, tuple(names), kinds, units)
 
@@ -210,51 +205,35 @@ def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
         DataError: not a table, a line with another number of fields, or a field that is not a number.
     """
     dialect = sniff(path)
-    chosen = [name for name, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(name)]
-    kinds = dict(zip(dialect.names, dialect.kinds, strict=True))
-    remarks = [
-        f"column {name!r} holds {kinds[name]} and was left out" for name in chosen if kinds[name] == "text"
-    ]
-    chosen = [name for name in chosen if kinds[name] not in ("text", "empty")]
-    columns = {name: Growing(_rows_expected(path)) for name in chosen}
+    kinds = {n: kind for n, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(n)}
+    remarks = [f"column {n!r} holds text and was left out" for n, kind in kinds.items() if kind == "text"]
+    kinds = {name: kind for name, kind in kinds.items() if kind not in ("text", "empty")}
+    chunks: dict[str, list[Column]] = {name: [] for name in kinds}
+    done = 0
     with foreign(str(path), "a table of text"), path.open("rb") as file:
-        for batch in _batches(path, file, dialect, chosen, kinds, progress) if chosen else ():
-            read_rows = len(columns[chosen[0]]) + len(batch)
-            check_values(str(path), read_rows, len(chosen))
-            for name in chosen:
-                columns[name].append(_numbers(batch.column(name), kinds[name]))
-            if rows is not None and read_rows >= rows:
+        source = _Blocks(file, dialect, path.stat().st_size, progress)
+        for batch in _batches(source, dialect, kinds) if kinds else ():
+            done += len(batch)
+            check_values(str(path), done, len(kinds))
+            for name, kind in kinds.items():
+                chunks[name].append(_numbers(batch.column(name), kind))
+            if rows is not None and done >= rows:
                 break
-    values = {name: columns.pop(name).array(rows) for name in chosen}
+        values = joined(chunks, rows)
     if dialect.encoding == "cp1252":
         remarks.append("the file is not UTF-8 and was read as Windows-1252")
     units = {name: unit for name, unit in dialect.units.items() if name in values}
     return LogTable(str(path), "text", (Stream("", values, units),), tuple(remarks))
 
 
-def _rows_expected(path: Path) -> int:
-    """A guess from the length of the first lines."""
-    with path.open("rb") as file:
-        head = file.read(1 << 16)
-    return int(path.stat().st_size / max(len(head), 1) * (head.count(b"\n") + 1) * 1.05)
-
-
-def _batches(
-    path: Path,
-    file: IO[bytes],
-    dialect: Dialect,
-    chosen: list[str],
-    kinds: dict[str, str],
-    progress: Progress | None,
-) -> Iterator[pa.RecordBatch]:
+def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterator[pa.RecordBatch]:
     """Batches of rows of the chosen columns."""
     import pyarrow as pa
     from pyarrow import csv
 
     types = {"number": pa.float64(), "bool": pa.bool_(), "date": pa.timestamp("ns")}
-    source = _Blocks(file, dialect, path.stat().st_size, progress)
     options: dict[str, Any] = {"decimal_point": dialect.decimal, "null_values": list(MISSING)}
-    reader = csv.open_csv(
+    yield from csv.open_csv(
         pa.PythonFile(source, mode="r"),
         read_options=csv.ReadOptions(
             use_threads=True,
@@ -265,10 +244,9 @@ def _batches(
         ),
         parse_options=csv.ParseOptions(delimiter=dialect.separator, ignore_empty_lines=True),
         convert_options=csv.ConvertOptions(
-            include_columns=chosen, column_types={name: types[kinds[name]] for name in chosen}, **options
+            include_columns=list(kinds), column_types={n: types[kind] for n, kind in kinds.items()}, **options
         ),
     )
-    yield from reader
 
 
 def _numbers(values: pa.Array, kind: str) -> Column:
@@ -287,18 +265,19 @@ DATE_ORIGIN_NS = 1_577_836_800_000_000_000
 """2020-01-01 in nanoseconds of the epoch: the origin of times that are given as dates."""
 
 
-class _Blocks:
+class _Blocks(io.RawIOBase):
     """A binary file for the parser: counts what was read, and makes one blank of a run of blanks."""
 
     def __init__(self, file: IO[bytes], dialect: Dialect, size: int, progress: Progress | None) -> None:
         self._file, self._size, self._progress = file, size, progress
         self._collapse = dialect.separator == " "
-        self._rest = b""
-        self._done = 0
-        self.closed = False
+        self._rest, self._done = b"", 0
 
-    def read(self, count: int = -1) -> bytes:
-        block = self._file.read(count if count and count > 0 else BLOCK_BYTES)
+    def readable(self) -> bool:
+        return True
+
+    def read(self, size: int = -1, /) -> bytes:
+        block = self._file.read(size if size > 0 else BLOCK_BYTES)
         self._done += len(block)
         if self._progress is not None:
             self._progress(self._done, self._size)
@@ -310,22 +289,7 @@ class _Blocks:
         self._rest, text = text[end:], text[:end]
         check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)
         result = _EDGES.sub(b"", _BLANKS.sub(b" ", text))
-        return result if result or not block else self.read(count)
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return False
-
-    def writable(self) -> bool:
-        return False
-
-    def tell(self) -> int:
-        return self._done
-
-    def close(self) -> None:
-        self.closed = True
+        return result if result or not block else self.read(size)
 
 
 ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".asc")
@@ -340,34 +304,28 @@ def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
     Raises:
         DataError: a file is not a table of numbers, or the folder is too large.
     """
+
+    def in_file(file: Path, column: str) -> str:
+        return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"
+
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
     check_count(str(path), "files", len(files), limits.LOG_FILES)
     groups: dict[int, dict[str, Column]] = {}
     remarks: list[str] = []
     for number, file in enumerate(files):
         try:
-            table = read_text(file, wanted=_within(file.stem, wanted), rows=rows, progress=None)
+            table = read_text(file, wanted=lambda n, f=file: wanted(in_file(f, n)), rows=rows, progress=None)
         except DataError as error:
             if "no table of numbers" not in error.message:
                 raise
             remarks.append(f"{file.name} holds no table of numbers and was left out")
             continue
         remarks += [f"{file.name}: {remark}" for remark in table.remarks]
-        columns = {_in_file(file.stem, name): values for name, values in table.streams[0].columns.items()}
+        columns = {in_file(file, name): values for name, values in table.streams[0].columns.items()}
         if columns:
             groups.setdefault(len(next(iter(columns.values()))), {}).update(columns)
             check_values(str(path), 1, sum(map(len, groups.values())))
         if progress is not None:
             progress(number + 1, len(files))
     most = max(groups, key=lambda length: (len(groups[length]), length), default=0)
-    ordered = sorted(groups.items(), key=lambda item: item[0] != most)
-    streams = tuple(Stream("" if n == most else f"{n} rows", columns) for n, columns in ordered)
-    return LogTable(str(path), "text folder", streams, tuple(remarks))
-
-
-def _in_file(stem: str, column: str) -> str:
-    return f"{stem}[{column}]" if column.isdigit() else f"{stem}.{column}"
-
-
-def _within(stem: str, wanted: Wanted) -> Wanted:
-    return lambda column: wanted(_in_file(stem, column))
+    return LogTable(str(path), "text folder", streams_by_length(groups, most), tuple(remarks))
