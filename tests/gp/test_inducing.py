@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.basis import latent_basis
+from forcegp.gp.features import Block
 from forcegp.gp.inducing import candidates, select_inducing
 from forcegp.gp.kernels import Linear, Matern32, SquaredExponential, sub
-from forcegp.gp.structured_covariance import Block
 from forcegp.gp.sums import accumulate
 from gp.sparse_cases import COMPONENTS, PROCESSES, Named, parameters, rows
 

@@ -12,10 +12,10 @@ from extended import posterior as dense
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.bound import bound_of
+from forcegp.gp.features import Block, rows_of
 from forcegp.gp.kernels import sub
-from forcegp.gp.likelihood import condition
+from forcegp.gp.likelihood import condition, cross_gram
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.structured_covariance import Block, cross_gram, rows_of
 from forcegp.gp.sums import accumulate
 from gp.sparse_cases import (
     COMPONENTS,

@@ -16,11 +16,10 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombFriction, coupled, with_coulomb
 from forcegp.forces.priors.base import CONTACT, ForceMean, ForcePrior, prior_rows
 from forcegp.forces.quantities import AffineMap, States
+from forcegp.gp.draws import FunctionSamples
 from forcegp.gp.exact import ExactPosterior
-from forcegp.gp.features import Features, Standardization
-from forcegp.gp.pathwise import FunctionSamples
+from forcegp.gp.features import Block, Features, Standardization
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.structured_covariance import Block
 
 LatentPosterior = ExactPosterior | SparsePosterior
 """Latent processes conditioned on rows, exactly or through inducing points."""

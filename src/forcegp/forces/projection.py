@@ -26,8 +26,7 @@ from forcegp.forces.coulomb import CoulombFriction, coupled
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import ForceMean, ForcePrior, prior_rows
 from forcegp.forces.quantities import States, affine_map
-from forcegp.gp.features import Features, Standardization
-from forcegp.gp.structured_covariance import Block
+from forcegp.gp.features import Block, Features, Standardization
 
 ForceNoise = Callable[[States], Tensor]
 """Variance of the white noise on the joint force at states, `(n, nq)`."""

@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.gp.decomposition import TRUNCATION, KernelPart, split
-from forcegp.gp.features import Features
-from forcegp.gp.kernels import Parameters, sub
-from forcegp.gp.structured_covariance import Block, Process, points, rows_of
+from forcegp.gp.basis import TRUNCATION, KernelPart, split
+from forcegp.gp.features import Block, Features, points, rows_of
+from forcegp.gp.kernels import Parameters, Process, sub
 
 CANDIDATES = 4000
 """Samples among which points are chosen."""

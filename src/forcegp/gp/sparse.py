@@ -24,11 +24,9 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.factor import cholesky, extended
-from forcegp.gp.features import Features
-from forcegp.gp.pathwise import MISSED_FEATURES, FunctionSamples, draw_functions
-from forcegp.gp.rounding import require_resolved_noise, require_resolved_variance
-from forcegp.gp.structured_covariance import Block, chunked, rows_mean
+from forcegp.gp.draws import MISSED_FEATURES, FunctionSamples, draw_functions
+from forcegp.gp.factor import cholesky, extended, require_resolved_noise, require_resolved_variance
+from forcegp.gp.features import Block, Features, chunked, rows_mean
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 
 

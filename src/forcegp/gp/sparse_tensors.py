@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.gp.basis import LatentBasis, ProcessBasis
-from forcegp.gp.decomposition import Spectrum, split
-from forcegp.gp.kernels import Parameters, sub
+from forcegp.gp.basis import LatentBasis, ProcessBasis, Spectrum, split
+from forcegp.gp.kernels import Parameters, Process, sub
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.structured_covariance import Process
 from forcegp.gp.sums import Moments
 
 INCOMPLETE = "a saved sparse posterior is not complete"

@@ -26,10 +26,9 @@ from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import FlatStates
 from forcegp.forces.start import box_around, doubts_at_bounds, initial_hyperparameters, negative_log_prior
 from forcegp.gp.exact import ExactPosterior
-from forcegp.gp.features import Standardization
+from forcegp.gp.features import Block, Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
-from forcegp.gp.structured_covariance import Block
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory

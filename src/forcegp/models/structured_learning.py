@@ -40,7 +40,7 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.slopes import with_learned_slopes, without_slopes
 from forcegp.forces.start import Search, initial
 from forcegp.forces.student_t import left_out, weighted
-from forcegp.gp.likelihood import require_exact_fits
+from forcegp.gp.exact import require_exact_fits
 from forcegp.gp.optimise import Learned, LearningOptions, Progress
 from forcegp.models.base import FitProgress
 from forcegp.models.structured_spec import Specification

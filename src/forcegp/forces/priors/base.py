@@ -17,9 +17,8 @@ from torch.linalg import vecdot
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.quantities import AffineMap, States
-from forcegp.gp.features import Standardization
+from forcegp.gp.features import Block, Standardization
 from forcegp.gp.kernels import Kernel, SquaredExponential
-from forcegp.gp.structured_covariance import Block
 from forcegp.robot.model import RobotModel
 
 JOINT, CONTACT, CONSTRAINT = "joint", "contact", "constraint"
