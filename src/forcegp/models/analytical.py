@@ -26,7 +26,8 @@ from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, Loss, train
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
-from forcegp.storage.model_file import ModelHeader, Settings, settings_of
+from forcegp.storage.model_file import ModelHeader, settings_of
+from forcegp.storage.options import Settings
 from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
 
 KIND = "analytical"
@@ -224,6 +225,26 @@ class AnalyticalFit(FittedModel):
         """Q_C + Q_G + Q_D + Q_u at states."""
         return AnalyticalMean()
 
+    @classmethod
+    def restored(
+        cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+    ) -> AnalyticalFit:
+        settings = settings_of(header, AnalyticalSettings, source)
+        original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
+        window = Window(settings.relative, settings.length, settings.angle)
+        try:
+            model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
+        except ForceGPError as cause:
+            raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
+        state = {
+            name: take(tensors, name, tuple(old.shape), old.dtype, source)
+            for name, old in model.parameters.state_dict().items()
+        }
+        theta = AnalyticalParameters(original.robot, settings.analytical_parameters)
+        theta.load_state_dict(state)
+        result = FitResult(True, 0, 0.0, 0.0, message="loaded")
+        return cls(system, theta, window, settings.seed, result)
+
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         theta, width = self.parameters, self.window
         settings = AnalyticalSettings(
@@ -235,27 +256,6 @@ class AnalyticalFit(FittedModel):
         )
         start = {f"start.{name}": getattr(theta.start, name) for name in robot_tensors(theta.start)}
         return settings, dict(theta.state_dict()) | start
-
-
-def load_analytical(
-    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> AnalyticalFit:
-    """The model that `AnalyticalFit.save` wrote."""
-    settings = settings_of(header, AnalyticalSettings, source)
-    original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
-    window = Window(settings.relative, settings.length, settings.angle)
-    try:
-        model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
-    except ForceGPError as cause:
-        raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
-    state = {
-        name: take(tensors, name, tuple(old.shape), old.dtype, source)
-        for name, old in model.parameters.state_dict().items()
-    }
-    theta = AnalyticalParameters(original.robot, settings.analytical_parameters)
-    theta.load_state_dict(state)
-    result = FitResult(True, 0, 0.0, 0.0, message="loaded")
-    return AnalyticalFit(system, theta, window, settings.seed, result)
 
 
 def _minimise(

@@ -23,7 +23,8 @@ from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Torque
 from forcegp.rollout.law import ForceField
 from forcegp.rollout.trajectory import Rollout
-from forcegp.storage.model_file import Settings, write_model
+from forcegp.storage.model_file import ModelHeader, write_model
+from forcegp.storage.options import Settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -219,6 +220,23 @@ class FittedModel(HasResult, Predictor):
     def described(self) -> list[tuple[str, object]]:
         """What was learned, by name, for tables."""
         return []
+
+    @classmethod
+    @abstractmethod
+    def restored(
+        cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+    ) -> FittedModel:
+        """The model that `save` wrote.
+
+        Args:
+            header: of the file, with the settings that `record` gave.
+            tensors: as `record` gave them.
+            system: robot and contacts.
+            source: name of the file, for messages.
+
+        Raises:
+            ModelError: a tensor or setting is missing or not valid; names file and field.
+        """
 
     @abstractmethod
     def record(self) -> tuple[Settings, dict[str, Tensor]]:

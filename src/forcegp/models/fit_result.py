@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
@@ -44,7 +45,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class FitResult:
-    """How a fit went.
+    """How a fit went; all but the history is kept in saved files.
 
     Attributes:
         converged: whether the optimiser reached its tolerance.
@@ -73,20 +74,20 @@ class FitResult:
     """
 
     converged: bool
-    evaluations: int
-    seconds: float
+    evaluations: NonNegativeInt
+    seconds: NonNegativeFloat
     objective: float
     log_marginal_likelihood: float | None = None
-    jitter: float = 0.0
+    jitter: NonNegativeFloat = 0.0
     constant_inputs: tuple[str, ...] = ()
     message: str = ""
     history: tuple[float, ...] = field(default=(), repr=False)
     force_correlation: float | None = None
     warnings: tuple[str, ...] = ()
     inference: str = ""
-    samples: int | None = None
-    learned_on: int | None = None
-    basis_functions: int | None = None
+    samples: NonNegativeInt | None = None
+    learned_on: NonNegativeInt | None = None
+    basis_functions: NonNegativeInt | None = None
     determined: float | None = None
     missed: float | None = None
     more_points_would_help: bool | None = None

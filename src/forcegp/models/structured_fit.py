@@ -35,9 +35,11 @@ from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel, ForceField, Prediction
 from forcegp.models.fit_result import FitResult
+from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import prepared, training_for
-from forcegp.models.structured_spec import Specification, pack
-from forcegp.storage.model_file import Settings
+from forcegp.models.structured_spec import Specification
+from forcegp.storage.model_file import ModelHeader
+from forcegp.storage.options import Settings
 
 KIND = "structured_gp"
 
@@ -180,7 +182,7 @@ class StructuredFit(FittedModel):
                 hint='call model.fit(data, learn=["noise"], after=fit), which learns the noise alone',
             )
         values = self.hyperparameters if hyperparameters is None else hyperparameters
-        if not is_sparse(spec.inference, self.problem.priors, training.all_samples):
+        if not is_sparse(spec.options.inference, self.problem.priors, training.all_samples):
             training = self._with_slopes(training)
         problem = prepared(spec, dataclasses.replace(self.problem, training=training), values)
         return conditioned(spec, problem, values, warnings=doubts)
@@ -271,6 +273,12 @@ class StructuredFit(FittedModel):
         latent = _sparse(self.posterior).drifting(factor, own)
         posterior = dataclasses.replace(self.posterior, latent=latent)
         return dataclasses.replace(self, posterior=posterior)
+
+    @classmethod
+    def restored(
+        cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+    ) -> StructuredFit:
+        return cls(*unpack(header, tensors, system, source))
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         settings, tensors = pack(

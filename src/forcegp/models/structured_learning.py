@@ -157,7 +157,9 @@ def training_for(
     if before is not None and learned is not None:
         scales = zip(spec.priors, before.training.scales, strict=True)
         kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
-    training = training_of(data, spec.system, spec.priors, spec.noise.acceleration, kept, spec.standardize)
+    training = training_of(
+        data, spec.system, spec.priors, spec.noise.acceleration, kept, spec.options.standardize
+    )
     return in_motion(spec.system, training) if spec.noise.learns_torque else (training, ())
 
 
@@ -217,7 +219,7 @@ def in_motion(system: ConstrainedSystem, training: Training) -> tuple[Training, 
 def subset(spec: Specification, problem: Problem) -> Problem:
     """The problem on the samples that hyperparameters are learned on."""
     training = problem.training
-    if not is_sparse(spec.inference, problem.priors, training.all_samples):
+    if not is_sparse(spec.options.inference, problem.priors, training.all_samples):
         return problem
     finite = is_finite(problem.priors)
     most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
@@ -278,13 +280,7 @@ def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[s
     named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
     scales = [x for scale in training.scales for side in (scale.mean, scale.std) for x in side.values()]
     noise = [*training.noise_std, *(x for x in (problem.state_std, problem.torque_std) if x is not None)]
-    options = (
-        spec.inference,
-        spec.inducing_points,
-        spec.noise.degrees_of_freedom,
-        spec.standardize,
-        search.options,
-    )
+    options = (spec.options, spec.noise.degrees_of_freedom, search.options)
     return Checkpoint.key_of(
         problem.mean, priors, *problem.pinned, *problem.pinned.values(), options, training.quantities,
         training.part_of, *data, *noise, *scales, record, *robot.values(),
@@ -321,7 +317,7 @@ def solve(
     warnings: list[str] = []
     values = {**search.held, **learned.tensors}
     if part.state_std is not None and not is_sparse(
-        spec.inference, part.priors, problem.training.all_samples
+        spec.options.inference, part.priors, problem.training.all_samples
     ):
         part, learned, doubts = with_learned_slopes(part, search, learned, progress)
         warnings += doubts
@@ -364,12 +360,12 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """The problem with the inference that its samples ask for, and their weights under heavy-tailed noise."""
-    if is_sparse(spec.inference, problem.priors, problem.training.all_samples):
+    if is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
         problem = without_slopes(problem)
         if is_finite(problem.priors):
             problem = without_inducing(problem)
         else:
-            problem = with_inducing(problem, values, spec.inducing_points)
+            problem = with_inducing(problem, values, spec.options.inducing_points)
     if spec.noise.degrees_of_freedom is None:
         return problem
     return weighted(problem, values, spec.noise.degrees_of_freedom)

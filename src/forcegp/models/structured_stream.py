@@ -122,7 +122,7 @@ def _check_inference(spec: Specification, count: int, held: int) -> None:
             hint="select rows, or leave degrees_of_freedom out",
         )
     coupled = any(prior.in_time for prior in spec.priors)
-    if (spec.inference == "exact" or coupled) and count > held:
+    if (spec.options.inference == "exact" or coupled) and count > held:
         raise ModelError(
             f"exact inference on a log of {count:,} samples that is read piece by piece",
             expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",

@@ -26,6 +26,7 @@ from pydantic import (
 
 from forcegp.constraints import Baumgarte, SurfaceSchema
 from forcegp.simulate.config import SimulationConfig
+from forcegp.storage.options import StructuredOptions
 
 
 class Section(BaseModel):
@@ -81,16 +82,12 @@ class NoiseSection(Section):
     degrees_of_freedom: PositiveFloat | None = None
 
 
-class ModelSection(Section):
-    """`[model]`: see `forcegp.models.configured`."""
+class ModelSection(Section, StructuredOptions):
+    """`[model]`: the options of models, and what `forcegp.models.configured` reads."""
 
     name: str | None = None
     noise: NoiseSection = NoiseSection()
     sensor_noise_std: PositiveFloat | None = None
-    inference: Literal["auto", "exact", "sparse"] = "auto"
-    inertia: Literal["file", "auto"] | None = None
-    inducing_points: PositiveInt = 100
-    standardize: bool = True
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: str | tuple[dict[str, Any], ...] = ()
     analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = {}

@@ -14,12 +14,12 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import safetensors
 import safetensors.torch
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
@@ -28,6 +28,7 @@ from forcegp.errors import ModelError
 from forcegp.files import Header, atomic_file
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
 from forcegp.resources import announce_memory
+from forcegp.storage.options import Settings, SettingsT
 from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
 
 TYPES = (torch.float64, torch.float32, torch.int64, torch.bool)
@@ -93,15 +94,6 @@ class ModelHeader(Header):
     kind: str
     settings: dict[str, Any]
     system: dict[str, Any]
-
-
-class Settings(BaseModel):
-    """Base of what a kind of models keeps in `ModelHeader.settings`: frozen, no unknown field."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-SettingsT = TypeVar("SettingsT", bound=Settings)
 
 
 def model_path(path: str | Path) -> Path:
