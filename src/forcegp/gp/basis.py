@@ -16,6 +16,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from forcegp.gp.factor import Spectrum
 from forcegp.gp.features import FeatureMap, Features, points
 from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sub
 
@@ -99,62 +100,6 @@ def _join(kind: type[Sum], left: KernelPart, right: KernelPart) -> KernelPart:
 
 def _sum(terms: list[KernelPart]) -> KernelPart | None:
     return reduce(lambda a, b: _join(Sum, a, b), terms) if terms else None
-
-
-TRUNCATION = 1e-12
-"""Eigenvalues of the inducing points' covariance below this fraction of the largest are dropped.
-
-Kernels are accurate to about 10⁻¹⁵ of their scale, so an eigenvalue at the threshold is to 10⁻³. Where the
-prior is a million times as strong as the noise, a threshold of 10⁻¹⁰ loses what the data could tell.
-"""
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Eigendecomposition of one component's K_zz, U Λ Uᵀ.
-
-    Attributes:
-        values: all eigenvalues, in ascending order `(m,)`.
-        vectors: U `(m, m)`.
-        dropped: how many of the smallest are dropped.
-    """
-
-    values: Tensor
-    vectors: Tensor
-    dropped: int
-
-    @classmethod
-    def of(cls, K: Tensor) -> Spectrum:
-        """Of a symmetric matrix `(m, m)`."""
-        values, vectors = torch.linalg.eigh(K)
-        kept = values > TRUNCATION * values[-1] if len(values) else values > 0.0
-        return cls(values, vectors, int((~kept).sum()))
-
-    @property
-    def root(self) -> Tensor:
-        """R = U Λ^{−1/2} of the kept eigenvalues `(m, kept)`; R Rᵀ is the pseudo-inverse of K_zz."""
-        return self.vectors[:, self.dropped :] * self.values[self.dropped :].rsqrt()
-
-    def pull_back(self, dR: Tensor) -> Tensor:
-        """Derivative for K_zz from that for R, of any function of the truncated pseudo-inverse R Rᵀ.
-
-        Exact where no eigenvalue crosses the truncation: with E = UᵀdK U, dR = U X with
-        X_jk = −½ E_jk λ_j⁻¹ λ_k^{−½} among kept ones and X_dk = E_dk λ_k^{−½} / (λ_k − λ_d) for dropped d.
-
-        Args:
-            dR: `(m, kept)`, or wider, filled up with columns that are not read.
-        """
-        # B = Uᵀ ∂F/∂R
-        values, first = self.values, self.dropped
-        kept = values[first:]
-        B = self.vectors.mT @ dR[:, : len(kept)]
-        # G_jk = −½ B_jk λ_j⁻¹ λ_k^{−½} among kept ones, G_dk = B_dk λ_k^{−½} / (λ_k − λ_d) for dropped d
-        G = torch.zeros_like(self.vectors)
-        G[first:, first:] = -0.5 * B[first:] * kept.rsqrt() / kept[:, None]
-        G[:first, first:] = B[:first] * kept.rsqrt() / (kept - values[:first, None])
-        # ∂F/∂K_zz = U G Uᵀ, made symmetric
-        dK = self.vectors @ G @ self.vectors.mT
-        return 0.5 * (dK + dK.mT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,6 +298,41 @@ class LatentBasis:
         """The component of each basis function `(size,)`, of the components of all processes in order."""
         pairs = zip(self.parts, self.components, strict=True)
         return torch.cat([part.owner + among.start for part, among in pairs])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Inducing points and eigenvectors, by name.
+
+        The eigenvectors are kept with sums: computed anew they may differ in sign or rotation, and the sums
+        belong to one choice.
+        """
+        tensors: dict[str, Tensor] = {}
+        for p, part in enumerate(self.parts):
+            tensors[f"{p}.components"] = torch.tensor(part.components)
+            tensors |= {f"{p}.inducing.{name}": x for name, x in part.inducing.items()}
+            for k, spectrum in enumerate(part.spectra):
+                tensors[f"{p}.{k}.values"], tensors[f"{p}.{k}.vectors"] = spectrum.values, spectrum.vectors
+                tensors[f"{p}.{k}.dropped"] = torch.tensor(spectrum.dropped)
+        return tensors
+
+    @classmethod
+    def of_tensors(
+        cls, processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
+    ) -> LatentBasis:
+        """The basis that `tensors` belong to.
+
+        Raises:
+            KeyError: a tensor is missing.
+        """
+        parts = []
+        for p, process in enumerate(processes):
+            inducing, components = sub(tensors, f"{p}.inducing"), int(tensors[f"{p}.components"])
+            if not inducing:
+                raise KeyError(f"{p}.inducing")
+            saved = [sub(tensors, f"{p}.{k}") for k in range(components if f"{p}.0.values" in tensors else 0)]
+            spectra = tuple(Spectrum(s["values"], s["vectors"], int(s["dropped"])) for s in saved)
+            own = sub(params, process.prefix)
+            parts.append(ProcessBasis(split(process.kernel), own, components, inducing, spectra))
+        return cls(tuple(processes), dict(params), tuple(parts))
 
     def of_process(self, p: int) -> slice:
         """The basis functions of process p."""

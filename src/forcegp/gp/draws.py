@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.basis import LatentBasis, ProcessBasis, split
-from forcegp.gp.features import Basis, Block, FeatureMap, Features, stacked
+from forcegp.gp.features import Basis, Block, Features, stacked
 from forcegp.gp.kernels import Kernel, Linear, Parameters, Process, Product, Stationary, Sum, sub
 
 FEATURES = 1024
@@ -87,21 +87,6 @@ class FunctionSamples:
         return sum(parts[1:], start=parts[0]).flatten(0, 1)
 
 
-@dataclass(frozen=True, eq=False)
-class PriorDraws:
-    """Functions drawn from the prior.
-
-    Attributes:
-        draws: random features of each process.
-        weights: of each process, `(components, features, samples)`.
-        at_rows: W f(X) at the rows `(rows, samples)`.
-    """
-
-    draws: tuple[FeatureMap, ...]
-    weights: tuple[Tensor, ...]
-    at_rows: Tensor
-
-
 def draw_priors(
     processes: Sequence[Process],
     params: Parameters,
@@ -110,7 +95,7 @@ def draw_priors(
     count: int,
     generator: torch.Generator,
     features: int = FEATURES,
-) -> PriorDraws:
+) -> tuple[list[list[tuple[Basis, Tensor]]], Tensor]:
     """Draw functions from the priors and evaluate them at the rows.
 
     Args:
@@ -119,9 +104,11 @@ def draw_priors(
         count: number of functions.
         generator: source of randomness, on the CPU.
         features: random features per component.
+
+    Returns:
+        Of each process, the functions with their weights, and W f(X) at the rows `(rows, samples)`.
     """
-    like = blocks[0].target
-    draws, weights = [], []
+    like, terms = blocks[0].target, []
     at_rows = like.new_zeros(sum(block.rows for block in blocks), count)
     for p, process in enumerate(processes):
         feature_count = features if measured[p] else max(1, features // UNMEASURED)
@@ -136,9 +123,8 @@ def draw_priors(
         at_rows += torch.cat(
             [torch.einsum("nak,kns->nas", block.operators[p], f).flatten(0, 1) for block, f in pairs]
         )
-        draws.append(draw)
-        weights.append(w)
-    return PriorDraws(tuple(draws), tuple(weights), at_rows)
+        terms.append(draw.weighted(w))
+    return terms, at_rows
 
 
 def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> list[tuple[Basis, Tensor]]:
@@ -167,26 +153,19 @@ def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> 
     common = _common(kernel, params, X)
     if common is None:
         return [(kernel.towards(params, X), w)]
-    return [(lambda x: torch.cat(common.functions(x), dim=-1), common.weights(w))]
+    functions, sizes = common
+    weights = torch.cat([size[:, None, None] * w for size in sizes], dim=1)
+    return [(lambda x: torch.cat(functions(x), dim=-1), weights)]
 
 
-@dataclass(frozen=True)
-class _Common:
-    """A kernel as Σ_t a_t g_t, with common functions g_t(x, X) `(1, ·, n)` and sizes a_t `(k,)`."""
-
-    functions: Callable[[Features], list[Tensor]]
-    sizes: list[Tensor]
-
-    def weights(self, w: Tensor) -> Tensor:
-        """a_t w of all terms, `(k, terms · n, samples)`."""
-        return torch.cat([size[:, None, None] * w for size in self.sizes], dim=1)
-
-
-def _common(kernel: Kernel, params: Parameters, X: Features) -> _Common | None:
-    """The functions that all components have in common; `None` where they differ by more than factors."""
+def _common(
+    kernel: Kernel, params: Parameters, X: Features
+) -> tuple[Callable[[Features], list[Tensor]], list[Tensor]] | None:
+    """A kernel as Σ_t a_t g_t: functions g_t(x, X) `(1, ·, n)` that all components have in common, and sizes
+    a_t `(k,)`; `None` where components differ by more than factors."""
     if isinstance(kernel, Stationary) and len(params["log_lengthscale"]) == 1:
         g = kernel.towards({**params, "log_std": torch.zeros_like(params["log_std"][:1])}, X)
-        return _Common(lambda x: [g(x)], [torch.exp(2.0 * params["log_std"])])
+        return lambda x: [g(x)], [torch.exp(2.0 * params["log_std"])]
     if isinstance(kernel, Linear) and len(params["log_slope_std"]) == 1:
         slope, bias = torch.exp(2.0 * params["log_slope_std"]), kernel.bias_std(params).square()
         to = (stacked(X, kernel.inputs) * slope).mT
@@ -198,13 +177,14 @@ def _common(kernel: Kernel, params: Parameters, X: Features) -> _Common | None:
             lines = line if line.ndim == 3 else line[None]
             return [lines, lines.new_ones(1, 1, 1).expand_as(lines)]
 
-        return _Common(functions, [size, bias])
+        return functions, [size, bias]
     if isinstance(kernel, Product):
         left, right = (_common(getattr(kernel, side), sub(params, side), X) for side in ("left", "right"))
         if left is not None and right is not None:
-            return _Common(
-                lambda x: [a * b for a, b in product(left.functions(x), right.functions(x))],
-                [a * b for a, b in product(left.sizes, right.sizes)],
+            functions_of = (left[0], right[0])
+            return (
+                lambda x: [a * b for a, b in product(*(functions(x) for functions in functions_of))],
+                [a * b for a, b in product(left[1], right[1])],
             )
     return None
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.gp.draws import FEATURES, FunctionSamples, PriorDraws, draw_priors, kernel_terms
+from forcegp.gp.draws import FEATURES, FunctionSamples, draw_priors, kernel_terms
 from forcegp.gp.factor import bordered, require_resolved_noise, require_resolved_variance
 from forcegp.gp.features import Block, Features, chunked, rows_mean
 from forcegp.gp.kernels import Parameters, Process, sub
@@ -207,16 +207,15 @@ class ExactPosterior:
             generator: source of randomness, on the CPU.
             features: random features per component.
         """
-        draws: PriorDraws = draw_priors(
+        terms, at_rows = draw_priors(
             self.processes, self.params, self.blocks, self.measured, count, generator, features
         )
         # ε ~ N(0, I), β = Wᵀ Σ⁻¹ (y − W f(X) − ε)
         like = self.alpha
         noise = torch.randn(len(like), count, dtype=torch.float64, generator=generator).to(like)
-        residual = target_of(self.blocks)[:, None] - draws.at_rows - noise
+        residual = target_of(self.blocks)[:, None] - at_rows - noise
         weights = self.weights_of(torch.cholesky_solve(residual, self.conditioned.L))
         # f(x) = φ(x)ᵀ w + k(x, X) β
-        terms = [draw.weighted(weight) for draw, weight in zip(draws.draws, draws.weights, strict=True)]
         for p, process in enumerate(self.processes):
             for block, w in zip(self.blocks, weights[p], strict=True) if self.measured[p] else ():
                 terms[p] += kernel_terms(process.kernel, self._process_params[p], block.features[p], w)

@@ -1,4 +1,4 @@
-"""Cholesky factors, with counted jitter and after added rows, and what double precision resolves.
+"""Cholesky factors, with counted jitter and after added rows, spectra, and what double precision resolves.
 
 The covariance K of whitened rows has entries that are off by about ε K_ii with ε = 2.2e-16, where the noise
 has unit variance. So standard deviations are off by some ε K_ii, and where data leave a fraction r of a prior
@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
@@ -32,6 +33,12 @@ PRIOR_TO_NOISE = 1e6
 """Largest standard deviation of the prior of a row, in units of its noise."""
 SMALLEST_FRACTION = 1e-13
 """Smallest fraction of a prior variance that a posterior variance is resolved to."""
+TRUNCATION = 1e-12
+"""Eigenvalues of the inducing points' covariance below this fraction of the largest are dropped.
+
+Kernels are accurate to about 10⁻¹⁵ of their scale, so an eigenvalue at the threshold is to 10⁻³. Where the
+prior is a million times as strong as the noise, a threshold of 10⁻¹⁰ loses what the data could tell.
+"""
 NEGATIVE = 0.01
 """An eigenvalue below minus this fraction of the variances is no rounding of zero."""
 ROUNDING = 1e-12
@@ -138,6 +145,54 @@ def bordered(L: Tensor, cross: Tensor, corner: Tensor) -> tuple[Tensor, float]:
     whole = L.new_zeros(n + r, n + r)
     whole[:n, :n], whole[n:, :n], whole[n:, n:] = L, below, corner_factor
     return whole, jitter
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Eigendecomposition of one component's K_zz, U Λ Uᵀ.
+
+    Attributes:
+        values: all eigenvalues, in ascending order `(m,)`.
+        vectors: U `(m, m)`.
+        dropped: how many of the smallest are dropped.
+    """
+
+    values: Tensor
+    vectors: Tensor
+    dropped: int
+
+    @classmethod
+    def of(cls, K: Tensor) -> Spectrum:
+        """Of a symmetric matrix `(m, m)`."""
+        values, vectors = torch.linalg.eigh(K)
+        kept = values > TRUNCATION * values[-1] if len(values) else values > 0.0
+        return cls(values, vectors, int((~kept).sum()))
+
+    @property
+    def root(self) -> Tensor:
+        """R = U Λ^{−1/2} of the kept eigenvalues `(m, kept)`; R Rᵀ is the pseudo-inverse of K_zz."""
+        return self.vectors[:, self.dropped :] * self.values[self.dropped :].rsqrt()
+
+    def pull_back(self, dR: Tensor) -> Tensor:
+        """Derivative for K_zz from that for R, of any function of the truncated pseudo-inverse R Rᵀ.
+
+        Exact where no eigenvalue crosses the truncation: with E = UᵀdK U, dR = U X with
+        X_jk = −½ E_jk λ_j⁻¹ λ_k^{−½} among kept ones and X_dk = E_dk λ_k^{−½} / (λ_k − λ_d) for dropped d.
+
+        Args:
+            dR: `(m, kept)`, or wider, filled up with columns that are not read.
+        """
+        # B = Uᵀ ∂F/∂R
+        values, first = self.values, self.dropped
+        kept = values[first:]
+        B = self.vectors.mT @ dR[:, : len(kept)]
+        # G_jk = −½ B_jk λ_j⁻¹ λ_k^{−½} among kept ones, G_dk = B_dk λ_k^{−½} / (λ_k − λ_d) for dropped d
+        G = torch.zeros_like(self.vectors)
+        G[first:, first:] = -0.5 * B[first:] * kept.rsqrt() / kept[:, None]
+        G[:first, first:] = B[:first] * kept.rsqrt() / (kept - values[:first, None])
+        # ∂F/∂K_zz = U G Uᵀ, made symmetric
+        dK = self.vectors @ G @ self.vectors.mT
+        return 0.5 * (dK + dK.mT)
 
 
 def require_resolved_noise(prior: Tensor) -> None:

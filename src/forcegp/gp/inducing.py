@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forcegp.gp.basis import TRUNCATION, KernelPart, split
+from forcegp.gp.basis import KernelPart, split
+from forcegp.gp.factor import TRUNCATION
 from forcegp.gp.features import Block, Features, points, rows_of
 from forcegp.gp.kernels import Parameters, Process, sub
 
@@ -43,11 +44,6 @@ class Selection:
 
     points: dict[str, Tensor]
     missed: Tensor
-
-    @property
-    def relative(self) -> float:
-        """What is missed at the end as a fraction of the prior variance; 0 where there is none."""
-        return float(self.missed[-1] / self.missed[0]) if float(self.missed[0]) > 0.0 else 0.0
 
 
 def candidates(blocks: Iterable[Block], samples: int, count: int = CANDIDATES) -> list[Block]:

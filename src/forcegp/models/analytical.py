@@ -140,14 +140,15 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             robot = torch.func.functional_call(theta, dict(tensors), ())
             return _mean_squared_error(self.system.with_robot(robot), measured, rows)
 
-        saved = None if checkpoint is None else Path(checkpoint)
-        key = "" if saved is None else _key(self.system, measured, options, start, self.seed)
+        record, robot = pack_system(self.system)
+        begin = (part for pair in start.items() for part in pair)
+        key = (options, self.seed, record, *robot.values(), *measured.tensors, *begin)
         if isinstance(options, BatchOptions):
-            kept = None if saved is None else Checkpoint(saved, key)
-            learned = train(loss, start, len(measured.q), options, generator, progress, kept)
+            saved = None if checkpoint is None else Checkpoint(Path(checkpoint), Checkpoint.key_of(*key))
+            learned = train(loss, start, len(measured.q), options, generator, progress, saved)
         else:
-            kept = None if saved is None else Evaluations(Checkpoint(saved, key))
-            learned = _minimise(loss, start, len(measured.q), options, progress, kept)
+            evaluations = Evaluations.resumed(checkpoint, start, *key)
+            learned = _minimise(loss, start, len(measured.q), options, progress, evaluations)
         theta.load_state_dict(learned.tensors)
         with torch.no_grad():
             system = self.system.with_robot(theta())
@@ -264,7 +265,7 @@ def _minimise(
     samples: int,
     options: LearningOptions,
     progress: FitProgress | None,
-    saved: Evaluations | None,
+    saved: Evaluations,
 ) -> Learned:
     """Minimise over all samples at once."""
     rows = torch.arange(samples, device=next(iter(start.values())).device)
@@ -276,25 +277,9 @@ def _minimise(
     def objective(tensors: Tensors) -> Tensor:
         return loss(tensors, rows)
 
-    if saved is None:
-        return minimise(objective, start, options, progress=report)
-    saved.read(start)
     learned = minimise(saved.recorded(objective), start, options, progress=report)
     saved.write()
     return learned
-
-
-def _key(
-    system: ConstrainedSystem,
-    measured: Measurement,
-    options: BatchOptions | LearningOptions,
-    start: Mapping[str, Tensor],
-    seed: int,
-) -> str:
-    """Identifies learning from these measurements of this system, with these options."""
-    record, robot = pack_system(system)
-    begin = (part for pair in start.items() for part in pair)
-    return Checkpoint.key_of(options, seed, record, *robot.values(), *measured.tensors, *begin)
 
 
 def _mean_squared_error(system: ConstrainedSystem, measured: Measurement, rows: Tensor) -> Tensor:

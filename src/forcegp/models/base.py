@@ -319,17 +319,10 @@ class AccelerationFit(FittedModel):
         covariance: bool = True,
         system: ConstrainedSystem | None = None,
     ) -> Prediction:
-        """Mean and covariance of the accelerations; the covariance is diagonal.
+        """Mean `(*batch, nq)` and covariance `(*batch, nq, nq)` of the accelerations, without measurement noise.
 
-        Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: `qdd`, the only one that this model knows.
-            active: ignored, since the model knows no contacts.
-            covariance: whether to compute the covariance, where the model has one.
-            system: must be the model's own, since the model knows no forces.
-
-        Returns:
-            Mean `(*batch, nq)` and covariance `(*batch, nq, nq)`, without measurement noise.
+        The arguments are those of `Predictor.predict`. The covariance, where the model has one, is diagonal;
+        the only quantity is `qdd`, and `active` has no effect, since the model knows neither forces nor contacts.
 
         Raises:
             ModelError: another quantity, or another system, is asked for.

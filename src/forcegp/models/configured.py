@@ -111,15 +111,16 @@ def keys_of(kind: type[Model[Any]]) -> tuple[str, ...]:
 
 def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[str, Any]:
     """Arguments of the model's class from the keys in the file."""
-    made, arguments, at = MODELS[name].made, {}, table.document.at
-    for key, value in table.section.given().items():
+    made, at = MODELS[name].made, table.document.at
+    given, arguments = table.section.given(), dict[str, Any]()
+    for key, value in given.items():
         _check_key(table, ("model", key), keys_of(made), f"the model {name!r}")
         if key == "mean" and not isinstance(value, str):
             value = at(("model", "mean"), AnalyticalMean, value)
         elif key == "priors" and not isinstance(value, str):
-            value = _priors(table)
+            value = _priors(table, value)
         elif key == "window":
-            value = Window(**value.given())
+            value = Window(**table.section.window.given())
         elif key == "analytical_parameters":
             theta = at(("model", key), AnalyticalParameters, system.robot, value)
             value = theta if made is StructuredGP else value
@@ -138,10 +139,10 @@ def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | N
     )
 
 
-def _priors(table: ModelTable) -> tuple[ForcePrior, ...]:
+def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[ForcePrior, ...]:
     """The priors of `[[model.priors]]`."""
     priors = []
-    for i, described in enumerate(table.section.priors):
+    for i, described in enumerate(written):
         key = ("model", "priors", i)
         prior = table.document.at(key, decode, described, CLASSES, "prior", whole=False)
         if not isinstance(prior, ForcePrior):

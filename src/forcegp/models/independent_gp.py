@@ -30,7 +30,7 @@ from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
+from forcegp.storage.checkpoint import Evaluations
 from forcegp.storage.model_file import ModelHeader, settings_of
 from forcegp.storage.options import KernelOptions, Settings
 from forcegp.storage.system import take
@@ -146,7 +146,9 @@ class IndependentGP(Model["IndependentFit"]):
         training = self.training(features, measured.values, noise_std)
         priors = joint_processes(self.system.robot.nq)
         announce(training, LEARNING)
-        saved = None if checkpoint is None else _record(Path(checkpoint), training, priors, options)
+        first = initial_hyperparameters(priors[:1], [training.block(0)])
+        known = (*features.values(), training.qdd, noise_std)
+        saved = Evaluations.resumed(checkpoint, first, KIND, options, len(priors), *known)
         parts: list[Learned] = []
         for joint, prior in enumerate(priors):
             before = sum(part.evaluations for part in parts)
@@ -156,8 +158,7 @@ class IndependentGP(Model["IndependentFit"]):
                     progress(before + evaluations, options.max_evaluations * len(priors), value)
 
             parts.append(_learn(training, prior, joint, options, report, saved))
-        if saved is not None:
-            saved.write()
+        saved.write()
         hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
         return fitted(self, training, hyperparameters, parts)
 
@@ -178,7 +179,7 @@ def _learn(
     joint: int,
     options: LearningOptions,
     report: Progress,
-    saved: Evaluations | None,
+    saved: Evaluations,
 ) -> Learned:
     """Learn the process of one joint; the record of one joint follows that of the one before."""
     blocks = [training.block(joint)]
@@ -189,20 +190,9 @@ def _learn(
         value = negative_log_likelihood([prior], tensors, blocks)
         return value + constant + (negative_log_prior(tensors, start) if options.hyperpriors else 0.0)
 
-    recorded = objective if saved is None else saved.recorded(objective)
     box = box_around(start)
-    learned = minimise(recorded, start, options, bounds=box, progress=report)
+    learned = minimise(saved.recorded(objective), start, options, bounds=box, progress=report)
     return dataclasses.replace(learned, doubts=doubts_at_bounds(learned.tensors, box))
-
-
-def _record(
-    path: Path, training: IndependentTraining, priors: Sequence[JointForcePrior], options: LearningOptions
-) -> Evaluations:
-    """The record of an interrupted fit, or an empty one."""
-    data = (*training.features.values(), training.qdd, training.noise_std)
-    saved = Evaluations(Checkpoint(path, Checkpoint.key_of(KIND, options, len(priors), *data)))
-    saved.read(initial_hyperparameters(priors[:1], [training.block(0)]))
-    return saved
 
 
 def announce(training: IndependentTraining, copies: int) -> None:

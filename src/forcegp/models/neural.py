@@ -25,8 +25,6 @@ from forcegp.storage.options import Settings
 from forcegp.storage.system import take
 
 KIND = "neural_network"
-PAPER_ARCHITECTURES: tuple[tuple[int, ...], ...] = ((80,), (30, 20), (200, 200, 200, 200))
-"""Widths of the hidden layers of the three networks of the paper."""
 SHALLOW = BatchOptions(epochs=3000, batch=1024, learning_rate=0.03, patience=300)
 DEEP = BatchOptions(epochs=300, batch=256, learning_rate=0.003)
 """For networks of more than two hidden layers, whose epochs take longer and whose steps must be smaller."""

@@ -91,17 +91,14 @@ def with_priors(
     learn: Sequence[str] | None = None,
     progress: FitProgress | None = None,
 ) -> tuple[Specification, tuple[Compared, ...]]:
-    """The specification with the noise and the priors that were left to the data, and the comparison.
+    """The specification with the priors that were left to the data, and the comparison.
 
     Args:
-        spec: the model.
+        spec: the model, with the noise for these data.
         data: the log, or the rows of it that are held in memory.
         learn: what is learned, if not all.
         progress: called after each candidate with the number of candidates so far, of all, and NaN.
     """
-    spec = spec.for_data(data)
-    if not spec.automatic:
-        return spec, ()
     if learn is not None:
         return without_comparison(spec, "not everything is learned")
     log, _ = in_motion(spec.system, training_of(data, spec.system, (), spec.noise.acceleration, {}))

@@ -26,7 +26,7 @@ from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import states
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
-from forcegp.gp.sparse_tensors import posterior_of_tensors, tensors_of_posterior
+from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.fit_result import FitResult
 from forcegp.models.structured_spec import CLASSES, Specification
 from forcegp.robot.parameters import AnalyticalParameters
@@ -140,7 +140,7 @@ def _conditioned_on(spec: Specification, training: Training, posterior: ForcePos
     """The data of an exact posterior, or the sums over them of a sparse one."""
     latent = posterior.latent
     if not isinstance(latent, ExactPosterior):
-        return {f"sparse.{name}": value for name, value in tensors_of_posterior(latent).items()}
+        return {f"sparse.{name}": value for name, value in latent.tensors().items()}
     tensors = {"alpha": latent.alpha}
     for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
         tensors |= {f"data.{i}.{name}": getattr(m, name) for name in _columns(spec)}
@@ -332,7 +332,7 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
     priors = problem.priors_at(hyper)
     if "alpha" not in tensors:
         kept = _in_order(problem, _below(tensors, "sparse."))
-        latent = posterior_of_tensors(problem.priors, params, kept)
+        latent = SparsePosterior.of_tensors(problem.priors, params, kept)
         return ForcePosterior(priors, scales, problem.mean, latent, problem.pins(), coulomb)
     blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
     rows = sum(block.rows for block in blocks)

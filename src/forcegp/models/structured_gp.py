@@ -32,7 +32,7 @@ from forcegp.models.structured_learning import (
     task_of,
 )
 from forcegp.models.structured_spec import Specification
-from forcegp.models.structured_stream import Pass, sample_of
+from forcegp.models.structured_stream import Pass, Sample, sample_of
 from forcegp.storage.options import StructuredOptions
 
 FIT_COPIES = 3.0
@@ -159,9 +159,11 @@ class StructuredGP(Model[StructuredFit]):
             NumericalError: the likelihood cannot be computed.
         """
         spec = self.specification if after is None else self._continued(after)
-        sample = sample_of(spec, data)
+        sample = sample_of(spec, data) if isinstance(data, StreamedDataset) else Sample(data)
         chosen = None if learn is None else tuple(learn)
-        spec, comparison = with_priors(spec, sample.data, chosen, progress)
+        spec, comparison = spec.for_data(sample.data), ()
+        if spec.automatic:
+            spec, comparison = with_priors(spec, sample.data, chosen, progress)
         check_learned(spec, chosen or ())
         if chosen == () and after is not None and sample.log is None:
             return dataclasses.replace(after, specification=spec).condition(sample.data)
@@ -173,7 +175,7 @@ class StructuredGP(Model[StructuredFit]):
         begins = chosen is None and after is not None
         begin = {key: before[key] for key in search.start if key in before} if begins else None
         file = None if checkpoint is None else Path(checkpoint)
-        neighbours = sample.neighbours(spec, problem.training)
+        neighbours = None if sample.log is None else sample.neighbours(spec, problem.training)
         lesson = learned(spec, problem, search, file, progress, begin, neighbours)
         values, forces = lesson.hyperparameters, None
         if sample.log is not None and lesson.problem.inducing is not None:

@@ -45,7 +45,7 @@ from forcegp.gp.optimise import Learned, LearningOptions, Progress
 from forcegp.models.base import FitProgress
 from forcegp.models.structured_spec import Specification
 from forcegp.robot.model import RobotModel
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
+from forcegp.storage.checkpoint import Evaluations
 from forcegp.storage.system import pack_system
 
 OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
@@ -257,8 +257,7 @@ def learned(
         return Lesson(prepared(spec, problem, search.held), search.held)
     saved = None
     if file is not None:
-        saved = Evaluations(Checkpoint(file, _key(spec, problem, search, begin)))
-        saved.read(search.start)
+        saved = Evaluations.resumed(file, search.start, *_key(spec, problem, search, begin))
         search = dataclasses.replace(search, recorded=saved.recorded)
 
     def report(evaluations: int, value: float, _: Mapping[str, Tensor]) -> None:
@@ -271,20 +270,25 @@ def learned(
     return lesson
 
 
-def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:
-    """Identifies the learning of some tensors, on these data and this system, with these options."""
-    training = problem.training
-    data = [value for m in training.measurements for value in m.tensors]
+def identity(problem: Problem) -> tuple[object, ...]:
+    """The mean, priors, data, noise and system of a problem, for the keys of checkpoints."""
+    training, (record, robot) = problem.training, pack_system(problem.system)
+    data = (value for m in training.measurements for value in m.tensors)
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
-    record, robot = pack_system(problem.system)
+    return problem.mean, priors, training.part_of, *data, *training.noise_std, record, *robot.values()
+
+
+def _key(
+    spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None
+) -> tuple[object, ...]:
+    """Identifies the learning of some tensors of a problem, with these options."""
     named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
-    scales = [x for scale in training.scales for side in (scale.mean, scale.std) for x in side.values()]
-    noise = [*training.noise_std, *(x for x in (problem.state_std, problem.torque_std) if x is not None)]
-    options = (spec.options, spec.noise.degrees_of_freedom, search.options)
-    return Checkpoint.key_of(
-        problem.mean, priors, *problem.pinned, *problem.pinned.values(), options, training.quantities,
-        training.part_of, *data, *noise, *scales, record, *robot.values(),
-        *(part for pair in named for part in pair),
+    sides = [side for scale in problem.training.scales for side in (scale.mean, scale.std)]
+    noise = [x for x in (problem.state_std, problem.torque_std) if x is not None]
+    return (
+        *identity(problem), *problem.pinned, *problem.pinned.values(), problem.training.quantities,
+        spec.options, spec.noise.degrees_of_freedom, search.options,
+        *noise, *(x for side in sides for x in side.values()), *(part for pair in named for part in pair),
     )  # fmt: skip
 
 
