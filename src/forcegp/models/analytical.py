@@ -194,17 +194,9 @@ class AnalyticalFit(FittedModel):
         covariance: bool = True,
         system: ConstrainedSystem | None = None,
     ) -> Prediction:
-        """A quantity by the equations of motion; there is no covariance.
+        """Values `(*batch, d)` by the equations of motion; there is no covariance.
 
-        Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: a name of `QUANTITIES`, or several.
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            covariance: without effect, since the model has no uncertainty.
-            system: predict on another system.
-
-        Returns:
-            The values `(*batch, d)` as the mean.
+        The arguments are those of `Predictor.predict`; `quantity` may be several names.
 
         Raises:
             UnknownNameError: no such quantity.

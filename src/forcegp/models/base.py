@@ -319,10 +319,10 @@ class AccelerationFit(FittedModel):
         covariance: bool = True,
         system: ConstrainedSystem | None = None,
     ) -> Prediction:
-        """Mean `(*batch, nq)` and covariance `(*batch, nq, nq)` of the accelerations, without measurement noise.
+        """Mean `(*batch, nq)` and covariance `(*batch, nq, nq)` of the accelerations, without noise.
 
-        The arguments are those of `Predictor.predict`. The covariance, where the model has one, is diagonal;
-        the only quantity is `qdd`, and `active` has no effect, since the model knows neither forces nor contacts.
+        The arguments are those of `Predictor.predict`. The covariance, where the model has one, is diagonal.
+        The only quantity is `qdd`, and `active` has no effect: the model knows neither forces nor contacts.
 
         Raises:
             ModelError: another quantity, or another system, is asked for.

@@ -36,8 +36,7 @@ class Settings(BaseModel):
             if first["type"] == "literal_error":
                 names = re.findall(r"'([^']*)'", first["msg"])
                 raise UnknownNameError(name, values[name], names) from cause
-            what = name.replace("_", " ")
-            raise ModelError(f"{what} is not valid", expected=first["msg"], got=values[name]) from cause
+            raise ModelError(f"invalid `{name}`", expected=first["msg"], got=values[name]) from cause
 
 
 class KernelOptions(Settings):
