@@ -17,11 +17,10 @@ import forcegp
 from forcegp.constraints import project_state
 from forcegp.forces.quantities import affine_map, states
 from forcegp.gp.exact import ExactPosterior
-from forcegp.gp.features import Standardization
+from forcegp.gp.features import Block, Standardization
 from forcegp.gp.kernels import SquaredExponential, sub
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import LearningOptions, minimise
-from forcegp.gp.structured_covariance import Block
 
 N, NOISE = 40, 0.1
 torch.manual_seed(0)

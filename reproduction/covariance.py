@@ -16,8 +16,8 @@ from forcegp.data import Dataset
 from forcegp.files import Header
 from forcegp.forces.priors.base import CONSTRAINT
 from forcegp.forces.quantities import states
-from forcegp.gp.structured_covariance import Block as Rows
-from forcegp.gp.structured_covariance import cross_gram
+from forcegp.gp.features import Block as Rows
+from forcegp.gp.likelihood import cross_gram
 from forcegp.models.load import load_model
 from forcegp.models.structured_fit import StructuredFit
 from reproduction.fits import MODEL

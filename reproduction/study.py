@@ -12,7 +12,7 @@ import torch
 from forcegp import report
 from forcegp.destination import check_destination
 from forcegp.files import write_text
-from forcegp.gp.likelihood import MATRICES_TO_LEARN
+from forcegp.gp.exact import MATRICES_TO_LEARN
 from forcegp.models.load import load_model
 from forcegp.resources import announce_memory, free_memory
 from forcegp.scene import load_scene

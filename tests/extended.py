@@ -14,7 +14,7 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.quantities import affine_maps, states_at
-from forcegp.gp.features import Features, stacked
+from forcegp.gp.features import Block, Features, rows_of, stacked
 from forcegp.gp.kernels import (
     Constant,
     Kernel,
@@ -22,13 +22,13 @@ from forcegp.gp.kernels import (
     Matern32,
     Matern52,
     Parameters,
+    Process,
     Product,
     SquaredExponential,
     Stationary,
     Sum,
     sub,
 )
-from forcegp.gp.structured_covariance import Block, Process, rows_of
 from forcegp.models.structured_fit import StructuredFit
 
 Array = NDArray[np.longdouble]

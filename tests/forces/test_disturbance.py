@@ -118,7 +118,7 @@ def test_draws_have_its_covariance() -> None:
         "time": torch.tensor([[0.0], [0.5], [2.0], [0.0]], dtype=torch.float64),
         "segment": torch.tensor([[0.0], [0.0], [0.0], [3.0]], dtype=torch.float64),
     }
-    basis = kernel.draw(params, 200_000, generator).basis(x)[0]
+    basis = kernel.draw(params, x, 200_000, generator).basis(x)[0]
     torch.testing.assert_close(basis @ basis.mT, kernel.covariance(params, x, x)[0], rtol=0, atol=0.015)
 
 

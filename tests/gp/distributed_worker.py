@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.distributed import accumulate_shards, shard, share_basis
-from forcegp.gp.structured_covariance import rows_of
+from forcegp.gp.features import rows_of
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
 
 SAMPLES, POINTS = 61, 12

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.features import Features
-from forcegp.gp.kernels import Kernel, Linear, Matern32, Parameters, SquaredExponential, sub
+from forcegp.gp.features import Block, Features, components_of
+from forcegp.gp.kernels import Kernel, Linear, Matern32, Parameters, Process, SquaredExponential, sub
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.structured_covariance import Block, Process, components_of
 from forcegp.gp.sums import accumulate
 
 WIDTHS = {"q": 2, "qd": 2}

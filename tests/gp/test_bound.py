@@ -10,8 +10,8 @@ from torch import Tensor
 
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.bound import negative_bound
+from forcegp.gp.features import Block
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.gp.structured_covariance import Block
 from gp.sparse_cases import PROCESSES, first, parameters, rows, textbook
 
 DIFFERENCES = 1e-6

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from forcegp.gp.decomposition import split
+from forcegp.gp.basis import split
 from forcegp.gp.kernels import Kernel, Linear, Matern52, SquaredExponential
 from gp.sparse_cases import WIDTHS
 
@@ -43,7 +43,7 @@ def test_the_parts_add_up_to_the_kernel(kernel: Kernel, features: int, has_rest:
     total, diagonal = torch.zeros_like(whole), torch.zeros(OUTPUTS, 5, dtype=torch.float64)
     assert (parts.finite is not None, parts.rest is not None) == (features > 0, has_rest)
     if parts.finite is not None:
-        phi = parts.finite.features(params)
+        phi = parts.finite.features(params, x1)
         assert phi.basis(x1).shape == (OUTPUTS, 5, features)
         total = total + phi.basis(x1) @ phi.basis(x2).mT
         diagonal = diagonal + (phi.basis(x1) ** 2).sum(-1)
@@ -64,7 +64,7 @@ def test_hyperparameters_reach_the_parts_with_their_gradient(
     parts = split(kernel)
     total = torch.zeros(OUTPUTS, 5, 4, dtype=torch.float64)
     if parts.finite is not None:
-        phi = parts.finite.features(leaves)
+        phi = parts.finite.features(leaves, x1)
         total = total + phi.basis(x1) @ phi.basis(x2).mT
     if parts.rest is not None:
         total = total + parts.rest.kernel.covariance(parts.rest.parameters(leaves), x1, x2)

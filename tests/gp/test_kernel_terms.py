@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from forcegp.gp.draws import kernel_terms
 from forcegp.gp.kernels import Constant, Kernel, Linear, Matern32, SquaredExponential
-from forcegp.gp.pathwise import kernel_terms
 
 SAME = 1e-12
 """Of sums of some hundred terms in float64."""
@@ -18,11 +18,12 @@ KERNELS = [
     SPEED * SPEED * SquaredExponential(("q",), shared=True) + Matern32(("qd",), shared=True),
     Linear(("qd",), shared=True, offset=0.3) * SquaredExponential(("q",), shared=True),
     Constant() + SquaredExponential() + Linear(("q",)) * SquaredExponential(("qd",)),
+    Linear(ard=False) + Linear(("q",), ard=False) * SquaredExponential(("qd",)),
 ]
 
 
 kernels = pytest.mark.parametrize(
-    "kernel", KERNELS, ids=["finite and rest", "products", "offset", "no common functions"]
+    "kernel", KERNELS, ids=["finite and rest", "products", "offset", "no common functions", "one slope"]
 )
 
 
@@ -50,23 +51,23 @@ def test_terms_of_a_kernel_add_up_to_its_covariance(kernel: Kernel) -> None:
 @kernels
 def test_terms_of_random_features_are_the_same_functions(kernel: Kernel) -> None:
     params, _, x, generator = _case(kernel)
-    draw = kernel.draw(params, 64, generator)
-    assert draw.basis(x).shape[-1] == draw.size
-    w = torch.randn(K, draw.size, S, dtype=torch.float64, generator=generator)
-    terms = sum(basis(x) @ own for basis, own in draw.terms(w))
+    draw = kernel.draw(params, x, 64, generator)
+    size = draw.basis(x).shape[-1]
+    w = torch.randn(K, size, S, dtype=torch.float64, generator=generator)
+    terms = sum(basis(x) @ own for basis, own in draw.weighted(w))
     torch.testing.assert_close(terms, draw.basis(x) @ w, rtol=SAME, atol=SAME)
     if kernel is KERNELS[1]:
         # Nine products of three features are six different ones.
-        assert sum(own.shape[1] for _, own in draw.terms(w)) < draw.size
+        assert sum(own.shape[1] for _, own in draw.weighted(w)) < size
 
 
 def test_inputs_of_each_component_give_the_same_functions() -> None:
     kernel, generator = Linear(shared=True, offset=0.3), torch.Generator().manual_seed(0)
     params = kernel.initial(K, {"qd": 2})
     x = {"qd": torch.randn(N, K, 2, dtype=torch.float64, generator=generator)}
-    draw = kernel.draw(params, 64, generator)
-    w = torch.randn(K, draw.size, S, dtype=torch.float64, generator=generator)
-    terms = sum(basis(x) @ own for basis, own in draw.terms(w))
+    draw = kernel.draw(params, x, 64, generator)
+    w = torch.randn(K, draw.basis(x).shape[-1], S, dtype=torch.float64, generator=generator)
+    terms = sum(basis(x) @ own for basis, own in draw.weighted(w))
     torch.testing.assert_close(terms, draw.basis(x) @ w, rtol=SAME, atol=SAME)
 
 

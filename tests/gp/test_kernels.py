@@ -182,7 +182,7 @@ def test_far_apart_inputs_give_no_denormal_numbers(kernel: Kernel) -> None:
 @kernels
 def test_random_features_have_the_kernel_as_covariance(kernel: Kernel) -> None:
     params, x = random_parameters(kernel), inputs(4, scale=0.7)
-    basis = kernel.draw(params, DRAWS, torch.Generator().manual_seed(5)).basis(x)
+    basis = kernel.draw(params, x, DRAWS, torch.Generator().manual_seed(5)).basis(x)
     assert basis.shape[:2] == (OUTPUTS, 4)
     K = kernel.covariance(params, x, x)
     scale = kernel.diagonal(params, x).amax(-1)[:, None, None]
@@ -193,7 +193,7 @@ def test_random_features_have_the_kernel_as_covariance(kernel: Kernel) -> None:
 def test_a_draw_is_one_function() -> None:
     for kernel in KERNELS.values():
         params, x = random_parameters(kernel), inputs(5)
-        one, two = (kernel.draw(params, 30, torch.Generator().manual_seed(6)) for _ in range(2))
+        one, two = (kernel.draw(params, x, 30, torch.Generator().manual_seed(6)) for _ in range(2))
         assert torch.equal(one.basis(x), two.basis(x))
         part = {n: v[2:4] for n, v in x.items()}
         assert torch.allclose(one.basis(part), one.basis(x)[:, 2:4], rtol=1e-12, atol=1e-12)

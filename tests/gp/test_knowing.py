@@ -10,9 +10,9 @@ from torch import Tensor
 
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.exact import ExactPosterior
+from forcegp.gp.features import Block
 from forcegp.gp.kernels import Constant, Kernel, SquaredExponential
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.structured_covariance import Block
 from forcegp.gp.sums import accumulate
 
 COMPONENTS = (2, 3)

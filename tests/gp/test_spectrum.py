@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from forcegp.gp.decomposition import TRUNCATION, Spectrum
+from forcegp.gp.factor import TRUNCATION, Spectrum
 
 
 def matrix(values: list[float]) -> Tensor:

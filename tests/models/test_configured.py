@@ -21,11 +21,10 @@ from forcegp.gp import kernels
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
 from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
-from forcegp.models.configured import COMMON, KEYS, Configured, configured
+from forcegp.models.configured import Configured, configured, keys_of
 from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import SHALLOW, NeuralNetwork
-from forcegp.models.registry import MODELS
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.models.structured_spec import CLASSES
@@ -80,7 +79,7 @@ contact = "table"
     assert spec.priors == (JointForcePrior(kernel, ("q", "qd")), ContactForcePrior("table"))
     assert spec.mean == AnalyticalMean(("gravity", "actuation"))
     assert spec.noise == Noise((0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7), True, 0.5, (1e-3, 1e-2))
-    assert spec.inference == "exact"
+    assert spec.options.inference == "exact"
 
 
 def test_robot_parameters_and_learning_of_a_structured_gp(made) -> None:
@@ -113,7 +112,7 @@ causes = 2
 hyperpriors = false
 """)
     spec = found.model.specification
-    assert (spec.noise.degrees_of_freedom, spec.standardize) == (4.0, False)
+    assert (spec.noise.degrees_of_freedom, spec.options.standardize) == (4.0, False)
     assert spec.priors == (DisturbancePrior(OrnsteinUhlenbeck(2.0)), CoregionalPrior(causes=2))
     assert found.options == LearningOptions(hyperpriors=False)
 
@@ -202,18 +201,10 @@ def test_a_model_that_the_caller_misspells_is_not_blamed_on_the_file(made) -> No
     assert "model.toml" not in str(raised.value)
 
 
-def test_every_kind_of_model_has_its_keys() -> None:
-    assert {entry.kind for entry in MODELS.values()} == set(KEYS)
-
-
 @pytest.mark.parametrize("made", [StructuredGP, AnalyticalModel, NeuralNetwork, IndependentGP])
 def test_every_argument_of_a_model_has_a_key(made: type) -> None:
     """What the constructor takes, a table can give; a new argument needs a key."""
-    named = {"force_priors": "priors"}
-    arguments = [name for name in inspect.signature(made).parameters if name != "system"]
-    keys = {*COMMON, *KEYS[made.kind]}
-    assert {named.get(name, name) for name in arguments} <= keys
-    assert keys <= set(ModelSection.model_fields)
+    assert set(keys_of(made)) <= set(ModelSection.model_fields)
 
 
 def test_every_field_of_the_noise_has_a_key() -> None:

@@ -58,7 +58,7 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForceMean
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
-from forcegp.gp.structured_covariance import Block
+from forcegp.gp.features import Block
 from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
 

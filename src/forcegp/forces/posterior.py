@@ -19,11 +19,10 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.coulomb import CoulombFriction, coupled, with_coulomb
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, ForceMean, ForcePrior
 from forcegp.forces.quantities import AffineMap, States
+from forcegp.gp.draws import FunctionSamples
 from forcegp.gp.exact import ExactPosterior
-from forcegp.gp.features import Features, Standardization
-from forcegp.gp.pathwise import FunctionSamples
+from forcegp.gp.features import Block, Features, Standardization
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.structured_covariance import Block
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,7 @@ from forcegp.forces.measurements import Measurement
 from forcegp.forces.noise import SampleNoise
 from forcegp.forces.posterior import ForceProcess
 from forcegp.forces.quantities import affine_map
-from forcegp.gp.features import Features
-from forcegp.gp.structured_covariance import Block
+from forcegp.gp.features import Block, Features
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,9 +24,9 @@ from forcegp.forces.learn import OWN, Problem, Tensors, kernel_parameters, noise
 from forcegp.forces.noise import initial_torque_noise
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, ForcePrior
 from forcegp.forces.projection import WhitenedRows
+from forcegp.gp.features import Block
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.optimise import Bounds, Learned, LearningOptions, Objective, Progress, minimise
-from forcegp.gp.structured_covariance import Block
 
 LIMITS = {
     "log_coefficient": (math.log(1e-3), math.log(2.0)),

@@ -1,25 +1,105 @@
 """Basis functions of latent components: whitened covariances with inducing points, and exact features.
 
-With inducing points Z and K_zz = R⁻ᵀR⁻¹, V(x) = Rᵀk(Z, x) are features with a standard normal prior on
-their weights, and V(x)ᵀV(x′) = k(x, Z) K_zz⁻¹ k(Z, x′). Eigenvalues of K_zz below `TRUNCATION` of the
-largest are dropped. Linear parts of a kernel add their own features, which are exact.
+A sum of linear kernels and of products of linear kernels is k(x, x′) = φ(x)ᵀφ(x′) exactly, with a few
+features φ. The rest, whatever contains a stationary factor, is approximated with inducing points Z: with
+the truncated square root R of the inverse of their covariance, R Rᵀ = K_zz⁺, V(x) = Rᵀk(Z, x) are features
+with a standard normal prior on their weights, and V(x)ᵀV(x′) = k(x, Z) K_zz⁺ k(Z, x′).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import pairwise
 
 import torch
 from torch import Tensor
 
-from forcegp.gp.decomposition import KernelSplit, Spectrum, split
-from forcegp.gp.draws import FunctionDraw
-from forcegp.gp.features import Features
-from forcegp.gp.kernels import Parameters, sub
-from forcegp.gp.structured_covariance import Process, points
+from forcegp.gp.factor import Spectrum
+from forcegp.gp.features import FeatureMap, Features, points
+from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sub
+
+EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
+"""Kernels without factors whose `draw` holds all their features, whatever number it is asked for."""
+
+
+@dataclass(frozen=True)
+class KernelPart:
+    """A kernel made of factors of another one.
+
+    Attributes:
+        kernel: the sum of products of the factors.
+        names: the prefix of each factor's hyperparameters here, and in the whole kernel.
+    """
+
+    kernel: Kernel
+    names: Mapping[str, str]
+
+    def parameters(self, whole: Parameters) -> dict[str, Tensor]:
+        """The part's hyperparameters among those of the whole kernel."""
+        params = {}
+        for here, there in self.names.items():
+            factor = sub(whole, there) if there else whole
+            params |= {f"{here}.{key}" if here else key: value for key, value in factor.items()}
+        return params
+
+    def features(self, whole: Parameters, x: Features) -> FeatureMap:
+        """φ of a finite part: features whose products are the kernel exactly.
+
+        Args:
+            whole: log-hyperparameters of the whole kernel.
+            x: any inputs, whose widths count.
+        """
+        # Such a draw takes no random number, so any generator does.
+        return self.kernel.draw(self.parameters(whole), x, 1, torch.Generator())
+
+
+@dataclass(frozen=True)
+class KernelSplit:
+    """A kernel as the sum of a finite part and the rest.
+
+    Attributes:
+        finite: sums and products of linear kernels.
+        rest: everything else.
+    """
+
+    finite: KernelPart | None
+    rest: KernelPart | None
+
+
+def split(kernel: Kernel) -> KernelSplit:
+    """The finite part of a kernel and the rest; products of sums are multiplied out where needed."""
+    finite, rest = _terms(kernel, "")
+    return KernelSplit(_sum(finite), _sum(rest))
+
+
+def _terms(kernel: Kernel, path: str) -> tuple[list[KernelPart], list[KernelPart]]:
+    """Terms with and without a finite number of features."""
+    if isinstance(kernel, EXACT):
+        return [KernelPart(kernel, {"": path})], []
+    if not isinstance(kernel, Sum):
+        return [], [KernelPart(kernel, {"": path})]
+    sides = [_terms(getattr(kernel, side), f"{path}.{side}".lstrip(".")) for side in ("left", "right")]
+    (finite_left, rest_left), (finite_right, rest_right) = sides
+    if not isinstance(kernel, Product):
+        return finite_left + finite_right, rest_left + rest_right
+    if not finite_left or not finite_right:
+        return [], [KernelPart(kernel, {"": path})]
+    finite = [_join(Product, a, b) for a in finite_left for b in finite_right]
+    rest = [_join(Product, a, b) for a in finite_left for b in rest_right]
+    rest += [_join(Product, a, b) for a in rest_left for b in finite_right + rest_right]
+    return finite, rest
+
+
+def _join(kind: type[Sum], left: KernelPart, right: KernelPart) -> KernelPart:
+    names = {f"left.{key}".rstrip("."): path for key, path in left.names.items()}
+    names |= {f"right.{key}".rstrip("."): path for key, path in right.names.items()}
+    return KernelPart(kind(left.kernel, right.kernel), names)
+
+
+def _sum(terms: list[KernelPart]) -> KernelPart | None:
+    return reduce(lambda a, b: _join(Sum, a, b), terms) if terms else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +136,11 @@ class ProcessBasis:
         return rest.kernel.towards(self._rest_params, self.inducing)
 
     @cached_property
-    def finite(self) -> FunctionDraw | None:
+    def finite(self) -> FeatureMap | None:
         """The exact features of the finite part; `None` without one."""
-        return self.split.finite.features(self.params) if self.split.finite is not None else None
+        return (
+            self.split.finite.features(self.params, self.inducing) if self.split.finite is not None else None
+        )
 
     @cached_property
     def finite_size(self) -> int:
@@ -216,6 +298,41 @@ class LatentBasis:
         """The component of each basis function `(size,)`, of the components of all processes in order."""
         pairs = zip(self.parts, self.components, strict=True)
         return torch.cat([part.owner + among.start for part, among in pairs])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Inducing points and eigenvectors, by name.
+
+        The eigenvectors are kept with sums: computed anew they may differ in sign or rotation, and the sums
+        belong to one choice.
+        """
+        tensors: dict[str, Tensor] = {}
+        for p, part in enumerate(self.parts):
+            tensors[f"{p}.components"] = torch.tensor(part.components)
+            tensors |= {f"{p}.inducing.{name}": x for name, x in part.inducing.items()}
+            for k, spectrum in enumerate(part.spectra):
+                tensors[f"{p}.{k}.values"], tensors[f"{p}.{k}.vectors"] = spectrum.values, spectrum.vectors
+                tensors[f"{p}.{k}.dropped"] = torch.tensor(spectrum.dropped)
+        return tensors
+
+    @classmethod
+    def of_tensors(
+        cls, processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
+    ) -> LatentBasis:
+        """The basis that `tensors` belong to.
+
+        Raises:
+            KeyError: a tensor is missing.
+        """
+        parts = []
+        for p, process in enumerate(processes):
+            inducing, components = sub(tensors, f"{p}.inducing"), int(tensors[f"{p}.components"])
+            if not inducing:
+                raise KeyError(f"{p}.inducing")
+            saved = [sub(tensors, f"{p}.{k}") for k in range(components if f"{p}.0.values" in tensors else 0)]
+            spectra = tuple(Spectrum(s["values"], s["vectors"], int(s["dropped"])) for s in saved)
+            own = sub(params, process.prefix)
+            parts.append(ProcessBasis(split(process.kernel), own, components, inducing, spectra))
+        return cls(tuple(processes), dict(params), tuple(parts))
 
     def of_process(self, p: int) -> slice:
         """The basis functions of process p."""

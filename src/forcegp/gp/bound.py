@@ -14,11 +14,10 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.basis import ProcessBasis, latent_basis
-from forcegp.gp.features import Features
-from forcegp.gp.kernels import Parameters
-from forcegp.gp.likelihood import Valued, with_gradient
+from forcegp.gp.features import Block, Features, components_of, rows_of
+from forcegp.gp.kernels import Parameters, Process
+from forcegp.gp.likelihood import Gradient, Valued, with_gradient
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.structured_covariance import Block, Gradient, Process, components_of, rows_of
 from forcegp.gp.sums import CHUNK_SAMPLES, Moments, accumulate, normal_terms
 
 
@@ -163,7 +162,7 @@ class _BoundGradient:
                     outputs.append(kernel)
                     gradients.append(filled[..., :width] @ part.roots.mT)
             if finite is not None:
-                outputs.append(finite.features(params).basis(x))
+                outputs.append(finite.features(params, part.inducing).basis(x))
                 gradients.append(filled[..., width:])
         return self._add(prefix, params, x if self.deep else {}, outputs, gradients, p)
 

@@ -16,9 +16,8 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.features import Features
+from forcegp.gp.features import Block, Features
 from forcegp.gp.kernels import Parameters
-from forcegp.gp.structured_covariance import Block
 from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
 
 Group = dist.ProcessGroup | None

@@ -1,241 +1,235 @@
-"""Random functions from a kernel's prior, as sums of random features that are evaluated anywhere."""
+"""Functions drawn from a posterior, cheap to evaluate anywhere (pathwise conditioning, Wilson et al. 2020).
+
+A function from the prior, made of random features, is corrected by the data. Each sample is one deterministic
+function, so a trajectory integrated under it obeys Newton's equation and the constraint.
+
+A sparse posterior applies Matheron's rule to the inducing points, at a cost that does not depend on the
+number of samples: f(x) = f_prior(x) + V(x)ᵀ(w − Rᵀf_prior(Z)) with weights w ~ N(A⁻¹v, A⁻¹), and φ(x)ᵀw for
+the part of the kernel that has exact features.
+"""
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TypeGuard
+from functools import cached_property
+from itertools import product
 
 import torch
 from torch import Tensor
 
-from forcegp.gp.features import Features, stacked
+from forcegp.gp.basis import LatentBasis, ProcessBasis, split
+from forcegp.gp.features import Basis, Block, Features, stacked
+from forcegp.gp.kernels import Kernel, Linear, Parameters, Process, Product, Stationary, Sum, sub
+
+FEATURES = 1024
+"""Random features per component; the covariance of prior draws errs by about 1/√FEATURES of its scale."""
+UNMEASURED = 4
+"""A process that no row depends on gets this many times fewer features: no data correct its draws."""
 
 
-class FunctionDraw(ABC):
-    """Random functions drawn from a prior; evaluated anywhere."""
+@dataclass(frozen=True, eq=False)
+class FunctionSamples:
+    """Samples of latent processes, f_s(x) = Σ_t φ_t(x) w_ts.
 
-    @abstractmethod
-    def basis(self, x: Features) -> Tensor:
-        """φ(x) `(k, n, features)` with E[φ φ′ᵀ] = k(x, x′)."""
+    Attributes:
+        bases: of each process, functions of its standardized features.
+        weights: of each process and basis, `(components, terms, samples)`.
+    """
 
-    def common(self) -> tuple[FunctionDraw, Tensor] | None:
-        """One set of features for all components, `(1, n, features)`, and a factor for each component and
-        feature `(k, features)`; `None` where components differ by more than factors."""
-        return None
+    bases: tuple[tuple[Basis, ...], ...]
+    weights: tuple[tuple[Tensor, ...], ...]
+
+    @classmethod
+    def of(cls, terms: Sequence[Sequence[tuple[Basis, Tensor]]]) -> FunctionSamples:
+        """From the terms of each process, functions with their weights."""
+        bases = tuple(tuple(basis for basis, _ in process_terms) for process_terms in terms)
+        return cls(bases, tuple(tuple(w for _, w in process_terms) for process_terms in terms))
 
     @property
-    @abstractmethod
-    def size(self) -> int:
-        """Number of features of each component."""
+    def count(self) -> int:
+        """Number of samples."""
+        return self.weights[0][0].shape[-1]
 
-    def terms(self, weights: Tensor) -> list[tuple[Callable[[Features], Tensor], Tensor]]:
-        """φ(x)ᵀw as a sum that is cheaper to evaluate: features that components have in common only once.
+    def latent(self, p: int, features: Features, sample: Tensor | None = None) -> Tensor:
+        """Values of process p.
 
         Args:
-            weights: `(k, features, samples)`.
+            p: index of the process.
+            features: its standardized inputs at n states.
+            sample: `(n,)` which sample each state belongs to; all samples at all states by default.
 
         Returns:
-            Functions `(k or 1, n, terms)`, each with weights `(k, terms, samples)`.
+            `(samples, n, components)`, or `(n, components)` where `sample` is given.
         """
-        common = self.common()
-        if common is None:
-            return [(self.basis, weights)]
-        return [(common[0].basis, common[1][..., None] * weights)]
+        # f_s(x) = Σ_t φ_t(x) w_ts
+        terms = [(basis(features), w) for basis, w in zip(self.bases[p], self.weights[p], strict=True)]
+        if sample is None:
+            return sum((k @ w for k, w in terms[1:]), start=terms[0][0] @ terms[0][1]).permute(2, 1, 0)
+        rows = torch.stack([torch.einsum("knj,kjn->nk", k, w[..., sample]) for k, w in terms])
+        return rows.sum(0)
+
+    @cached_property
+    def _weights_by_sample(self) -> list[list[Tensor]]:
+        """By process and basis, `(samples, components, terms)`."""
+        return [[w.permute(2, 0, 1).contiguous() for w in weights] for weights in self.weights]
+
+    def by_runs(self, p: int, features: Features, samples: range, runs: int) -> Tensor:
+        """Values of process p from some samples, each at its own runs of states: `(samples · runs,
+        components)`."""
+        parts = []
+        for basis, w in zip(self.bases[p], self._weights_by_sample[p], strict=True):
+            phi, w_runs = basis(features).unflatten(1, (len(samples), runs)), w[samples.start : samples.stop]
+            if len(phi) == 1:
+                parts.append(phi[0] @ w_runs.mT)
+            else:
+                parts.append(torch.einsum("ksrt,skt->srk", phi, w_runs))
+        return sum(parts[1:], start=parts[0]).flatten(0, 1)
 
 
-@dataclass(frozen=True)
-class FourierDraw(FunctionDraw):
-    """σ √(2/F) cos(ωᵀx + φ): random Fourier features of a stationary kernel."""
+def draw_priors(
+    processes: Sequence[Process],
+    params: Parameters,
+    blocks: Sequence[Block],
+    measured: Sequence[bool],
+    count: int,
+    generator: torch.Generator,
+    features: int = FEATURES,
+) -> tuple[list[list[tuple[Basis, Tensor]]], Tensor]:
+    """Draw functions from the priors and evaluate them at the rows.
 
-    inputs: tuple[str, ...] | None
-    omega: Tensor
-    phase: Tensor
-    std: Tensor
+    Args:
+        processes, params, blocks: as given to `gram`.
+        measured: whether any row depends on each process.
+        count: number of functions.
+        generator: source of randomness, on the CPU.
+        features: random features per component.
 
-    @property
-    def size(self) -> int:
-        return self.phase.shape[-1]
-
-    def basis(self, x: Features) -> Tensor:
-        angle = stacked(x, self.inputs) @ self.omega.mT + self.phase[:, None, :]
-        scale = self.std * math.sqrt(2.0 / self.size)
-        return scale[:, None, None] * torch.cos(angle)
-
-    def common(self) -> tuple[FunctionDraw, Tensor] | None:
-        if len(self.phase) > 1:
-            return None
-        unit = FourierDraw(self.inputs, self.omega, self.phase, torch.ones_like(self.std[:1]))
-        return unit, self.std[:, None].expand(-1, self.phase.shape[-1])
-
-
-@dataclass(frozen=True)
-class LinearDraw(FunctionDraw):
-    """Slopes and a bias: features of the linear kernel."""
-
-    inputs: tuple[str, ...] | None
-    slope: Tensor
-    bias: Tensor
-
-    @property
-    def size(self) -> int:
-        return self.slope.shape[-1] + 1
-
-    def basis(self, x: Features) -> Tensor:
-        scaled = stacked(x, self.inputs) * self.slope[:, None, :]
-        bias = self.bias[:, None, None].expand(*scaled.shape[:2], 1)
-        return torch.cat([scaled, bias], dim=-1)
-
-    def common(self) -> tuple[FunctionDraw, Tensor]:
-        unit = LinearDraw(self.inputs, torch.ones_like(self.slope[:1]), torch.ones_like(self.bias[:1]))
-        return unit, torch.cat([self.slope, self.bias[:, None]], dim=-1)
+    Returns:
+        Of each process, the functions with their weights, and W f(X) at the rows `(rows, samples)`.
+    """
+    like, terms = blocks[0].target, []
+    at_rows = like.new_zeros(sum(block.rows for block in blocks), count)
+    for p, process in enumerate(processes):
+        feature_count = features if measured[p] else max(1, features // UNMEASURED)
+        draw = process.kernel.draw(
+            sub(params, process.prefix), blocks[0].features[p], feature_count, generator
+        )
+        size = draw.basis(blocks[0].features[p]).shape
+        # f = φᵀw with w ~ N(0, I); W f(X) at the rows
+        w = torch.randn(size[0], size[2], count, dtype=torch.float64, generator=generator).to(like)
+        latent = (draw.basis(block.features[p]) @ w for block in blocks)
+        pairs = zip(blocks, latent, strict=True)
+        at_rows += torch.cat(
+            [torch.einsum("nak,kns->nas", block.operators[p], f).flatten(0, 1) for block, f in pairs]
+        )
+        terms.append(draw.weighted(w))
+    return terms, at_rows
 
 
-@dataclass(frozen=True)
-class ConstantDraw(FunctionDraw):
-    """A constant per output."""
+def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> list[tuple[Basis, Tensor]]:
+    """k(x, X) w as a sum of functions of x, each with its weights.
 
-    std: Tensor
+    Terms with a finite number of features are folded into weights of these. A stationary term whose
+    length-scales all components share is evaluated once for all of them, and so is a product of such terms.
 
-    @property
-    def size(self) -> int:
-        return 1
+    Args:
+        kernel: the kernel, of k components.
+        params: its log-hyperparameters.
+        X: n points.
+        w: `(k, n, samples)`.
 
-    def basis(self, x: Features) -> Tensor:
-        n = stacked(x, None).shape[-2]
-        return self.std[:, None, None].expand(-1, n, 1)
-
-    def common(self) -> tuple[FunctionDraw, Tensor]:
-        return ConstantDraw(torch.ones_like(self.std[:1])), self.std[:, None]
-
-
-@dataclass(frozen=True)
-class SumDraw(FunctionDraw):
-    """Features of both terms."""
-
-    left: FunctionDraw
-    right: FunctionDraw
-
-    @property
-    def size(self) -> int:
-        return self.left.size + self.right.size
-
-    def terms(self, weights: Tensor) -> list[tuple[Callable[[Features], Tensor], Tensor]]:
-        parts = weights.split([self.left.size, self.right.size], dim=1)
-        return [*self.left.terms(parts[0]), *self.right.terms(parts[1])]
-
-    def basis(self, x: Features) -> Tensor:
-        return torch.cat([self.left.basis(x), self.right.basis(x)], dim=-1)
-
-    def common(self) -> tuple[FunctionDraw, Tensor] | None:
-        left, right = self.left.common(), self.right.common()
-        if left is None or right is None:
-            return None
-        return SumDraw(left[0], right[0]), torch.cat([left[1], right[1]], dim=-1)
+    Returns:
+        Functions `(k or 1, ·, terms)`, each with weights `(k, terms, samples)`.
+    """
+    if isinstance(kernel, Sum) and not isinstance(kernel, Product):
+        sides = ((getattr(kernel, side), sub(params, side)) for side in ("left", "right"))
+        return [term for k, theta in sides for term in kernel_terms(k, theta, X, w)]
+    finite = split(kernel)
+    if finite.rest is None and finite.finite is not None:
+        # k(x, X) w = φ(x)ᵀ (φ(X) w)
+        draw = finite.finite.features(params, X)
+        return [(draw.basis, draw.basis(X).mT @ w)]
+    common = _common(kernel, params, X)
+    if common is None:
+        return [(kernel.towards(params, X), w)]
+    functions, sizes = common
+    weights = torch.cat([size[:, None, None] * w for size in sizes], dim=1)
+    return [(lambda x: torch.cat(functions(x), dim=-1), weights)]
 
 
-@dataclass(frozen=True)
-class OuterDraw(FunctionDraw):
-    """All pairs of the features of two factors."""
+def _common(
+    kernel: Kernel, params: Parameters, X: Features
+) -> tuple[Callable[[Features], list[Tensor]], list[Tensor]] | None:
+    """A kernel as Σ_t a_t g_t: functions g_t(x, X) `(1, ·, n)` that all components have in common, and sizes
+    a_t `(k,)`; `None` where components differ by more than factors."""
+    if isinstance(kernel, Stationary) and len(params["log_lengthscale"]) == 1:
+        g = kernel.towards({**params, "log_std": torch.zeros_like(params["log_std"][:1])}, X)
+        return lambda x: [g(x)], [torch.exp(2.0 * params["log_std"])]
+    if isinstance(kernel, Linear) and len(params["log_slope_std"]) == 1:
+        slope, bias = torch.exp(2.0 * params["log_slope_std"]), kernel.bias_std(params).square()
+        to = (stacked(X, kernel.inputs) * slope).mT
+        size = torch.exp(2.0 * params["log_std"]) if kernel.shared else torch.ones_like(bias)
 
-    left: FunctionDraw
-    right: FunctionDraw
+        def functions(x: Features) -> list[Tensor]:
+            line = stacked(x, kernel.inputs) @ to
+            # Components that have inputs of their own have a line each.
+            lines = line if line.ndim == 3 else line[None]
+            return [lines, lines.new_ones(1, 1, 1).expand_as(lines)]
 
-    @property
-    def size(self) -> int:
-        return self.left.size * self.right.size
-
-    def terms(self, weights: Tensor) -> list[tuple[Callable[[Features], Tensor], Tensor]]:
-        common = self.common()
-        if common is None or not isinstance(common[0], OuterDraw) or not _is_square(common[0].left):
-            return super().terms(weights)
-        # The products ab and ba are the same function, so their weights add.
-        pairs, rest = common[0].left, common[0].right
-        count = pairs.left.size
-        i, j = torch.triu_indices(count, count, device=weights.device)
-        w = (common[1][..., None] * weights).unflatten(1, (count, count, rest.size))
-        folded = (w + w.transpose(1, 2))[:, i, j] * torch.where(i == j, 0.5, 1.0)[:, None, None].to(w)
-        return [(OuterDraw(SquareDraw(pairs.left), rest).basis, folded.flatten(1, 2))]
-
-    def basis(self, x: Features) -> Tensor:
-        return (self.left.basis(x)[..., :, None] * self.right.basis(x)[..., None, :]).flatten(-2)
-
-    def common(self) -> tuple[FunctionDraw, Tensor] | None:
-        left, right = self.left.common(), self.right.common()
-        if left is None or right is None:
-            return None
-        return OuterDraw(left[0], right[0]), (left[1][:, :, None] * right[1][:, None, :]).flatten(-2)
+        return functions, [size, bias]
+    if isinstance(kernel, Product):
+        left, right = (_common(getattr(kernel, side), sub(params, side), X) for side in ("left", "right"))
+        if left is not None and right is not None:
+            functions_of = (left[0], right[0])
+            return (
+                lambda x: [a * b for a, b in product(*(functions(x) for functions in functions_of))],
+                [a * b for a, b in product(left[1], right[1])],
+            )
+    return None
 
 
-@dataclass(frozen=True)
-class ProductDraw(FunctionDraw):
-    """Features of two factors, paired at random so that their number does not multiply."""
-
-    left: FunctionDraw
-    right: FunctionDraw
-    features: int
-    seed: int
-
-    @property
-    def size(self) -> int:
-        return self.features
-
-    def basis(self, x: Features) -> Tensor:
-        return self._paired(self.left.basis(x), self.right.basis(x))
-
-    def common(self) -> tuple[FunctionDraw, Tensor] | None:
-        left, right = self.left.common(), self.right.common()
-        if left is None or right is None:
-            return None
-        i, j = self._pairs(left[1].shape[-1], right[1].shape[-1])
-        factors = left[1][:, i.to(left[1].device)] * right[1][:, j.to(right[1].device)]
-        return ProductDraw(left[0], right[0], self.features, self.seed), factors
-
-    def _paired(self, left: Tensor, right: Tensor) -> Tensor:
-        n_left, n_right = left.shape[-1], right.shape[-1]
-        i, j = (pair.to(left.device) for pair in self._pairs(n_left, n_right))
-        return math.sqrt(n_left * n_right / self.features) * left[..., i] * right[..., j]
-
-    def _pairs(self, n_left: int, n_right: int) -> tuple[Tensor, Tensor]:
-        """Which features are multiplied."""
-        return _random_pairs(n_left, n_right, self.features, self.seed)
+MISSED_FEATURES = 256
+"""Random features per component. Only what the inducing points miss is drawn from them: its covariance errs
+by about 1/√MISSED_FEATURES of its scale, and that of the rest not at all."""
 
 
-@dataclass(frozen=True)
-class SquareDraw(FunctionDraw):
-    """All different products of two features of one factor."""
+def draw_functions(
+    basis: LatentBasis, weights: Tensor, generator: torch.Generator, features: int
+) -> FunctionSamples:
+    """Functions with given weights of the basis functions, and what these miss drawn from the prior.
 
-    factor: FunctionDraw
-
-    @property
-    def size(self) -> int:
-        return self.factor.size * (self.factor.size + 1) // 2
-
-    def basis(self, x: Features) -> Tensor:
-        phi = self.factor.basis(x)
-        i, j = torch.triu_indices(self.factor.size, self.factor.size, device=phi.device)
-        return phi[..., i] * phi[..., j]
-
-
-def _is_square(draw: FunctionDraw) -> TypeGuard[OuterDraw]:
-    """Whether a draw has all products of the features of a linear kernel with themselves."""
-    if not isinstance(draw, OuterDraw):
-        return False
-    left, right = draw.left, draw.right
-    return (
-        isinstance(left, LinearDraw)
-        and isinstance(right, LinearDraw)
-        and left.inputs == right.inputs
-        and torch.equal(left.slope, right.slope)
-        and torch.equal(left.bias, right.bias)
+    Args:
+        basis: basis functions.
+        weights: drawn from their posterior `(size, samples)`.
+        generator: source of randomness, on the CPU.
+        features: random features of each component's prior.
+    """
+    parts = enumerate(basis.parts)
+    return FunctionSamples.of(
+        [_terms(part, weights[basis.of_process(p)], generator, features) for p, part in parts]
     )
 
 
-@lru_cache(maxsize=64)
-def _random_pairs(n_left: int, n_right: int, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    i = torch.randint(n_left, (count,), generator=generator)
-    return i, torch.randint(n_right, (count,), generator=generator)
+def _terms(
+    part: ProcessBasis, weights: Tensor, generator: torch.Generator, features: int
+) -> list[tuple[Basis, Tensor]]:
+    """The functions of one process that are summed, with their weights."""
+    on_kernel, on_features = part.fold(weights)
+    terms: list[tuple[Basis, Tensor]] = []
+    rest = part.split.rest
+    if rest is not None:
+        # f_prior(Z) = φ(Z)ᵀ u with u ~ N(0, I)
+        draw = rest.kernel.draw(rest.parameters(part.params), part.inducing, features, generator)
+        count = draw.basis(part.inducing).shape[-1]
+        shape = (part.components, count, weights.shape[1])
+        u = torch.randn(shape, dtype=torch.float64, generator=generator).to(weights)
+        at_points = draw.basis(part.inducing) @ u
+        terms += draw.weighted(u)
+        if part.to_inducing is not None:
+            # R Rᵀ f_prior(Z) are the weights of k(x, Z) that interpolate the prior function.
+            w = on_kernel - part.roots @ (part.roots.mT @ at_points)
+            terms += kernel_terms(rest.kernel, rest.parameters(part.params), part.inducing, w)
+    if part.finite is not None:
+        terms.append((part.finite.basis, on_features))
+    return terms

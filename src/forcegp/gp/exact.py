@@ -1,4 +1,7 @@
-"""Exact posterior of latent processes given whitened rows (eqs. 11 and 22 to 24)."""
+"""Exact posterior of latent processes given whitened rows (eqs. 11 and 22 to 24).
+
+It takes memory that grows with the square of the rows: what would not fit is refused beforehand.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +12,20 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from forcegp.gp.factor import bordered
-from forcegp.gp.features import Features
-from forcegp.gp.kernels import Parameters, sub
-from forcegp.gp.likelihood import Conditioned, condition, require_exact_fits, target_of
-from forcegp.gp.pathwise import FEATURES, FunctionSamples, PriorDraws, draw_priors, kernel_terms
-from forcegp.gp.rounding import require_resolved_noise, require_resolved_variance
-from forcegp.gp.structured_covariance import (
-    Block,
-    Process,
-    add_rows,
-    chunked,
-    cross_gram,
-    gram,
-    offsets,
-    rows_mean,
-)
+from forcegp.errors import ModelError
+from forcegp.gp.draws import FEATURES, FunctionSamples, draw_priors, kernel_terms
+from forcegp.gp.factor import bordered, require_resolved_noise, require_resolved_variance
+from forcegp.gp.features import Block, Features, chunked, rows_mean
+from forcegp.gp.kernels import Parameters, Process, sub
+from forcegp.gp.likelihood import Conditioned, add_rows, condition, cross_gram, gram, offsets, target_of
+from forcegp.resources import announce_memory, free_memory
 
+MATRICES_TO_LEARN = 3.0
+"""Square matrices of all rows that learning holds at once: the covariance, its factor and a copy."""
+MATRICES_TO_CONDITION = 2.0
+"""Those that conditioning holds: the covariance and its factor."""
+SHARE = 0.8
+"""Fraction of the free memory that exact inference may take."""
 CHUNK_COLUMNS = 700
 """Columns of the triangular solve that are held at a time."""
 
@@ -207,17 +207,57 @@ class ExactPosterior:
             generator: source of randomness, on the CPU.
             features: random features per component.
         """
-        draws: PriorDraws = draw_priors(
+        terms, at_rows = draw_priors(
             self.processes, self.params, self.blocks, self.measured, count, generator, features
         )
         # ε ~ N(0, I), β = Wᵀ Σ⁻¹ (y − W f(X) − ε)
         like = self.alpha
         noise = torch.randn(len(like), count, dtype=torch.float64, generator=generator).to(like)
-        residual = target_of(self.blocks)[:, None] - draws.at_rows - noise
+        residual = target_of(self.blocks)[:, None] - at_rows - noise
         weights = self.weights_of(torch.cholesky_solve(residual, self.conditioned.L))
         # f(x) = φ(x)ᵀ w + k(x, X) β
-        terms = [draw.terms(weight) for draw, weight in zip(draws.draws, draws.weights, strict=True)]
         for p, process in enumerate(self.processes):
             for block, w in zip(self.blocks, weights[p], strict=True) if self.measured[p] else ():
                 terms[p] += kernel_terms(process.kernel, self._process_params[p], block.features[p], w)
         return FunctionSamples.of(terms)
+
+
+def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
+    """Bytes of memory that exact inference on whitened rows takes at its peak.
+
+    Args:
+        blocks: whitened rows.
+        learning: whether hyperparameters are learned, or the rows conditioned on only.
+    """
+    rows = sum(block.target.numel() for block in blocks)
+    components = sum(W.shape[-1] for W in blocks[0].operators) if blocks else 0
+    samples = [len(block.target) for block in blocks]
+    kernels = max((n * n for n in samples), default=0) * components
+    item = blocks[0].target.element_size() if blocks else 8
+    return int(item * ((MATRICES_TO_LEARN if learning else MATRICES_TO_CONDITION) * rows**2 + kernels))
+
+
+def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available: int | None = None) -> None:
+    """Refuse exact inference that would not fit into memory, and announce what takes most of it.
+
+    Args:
+        blocks: whitened rows.
+        learning: whether hyperparameters are learned.
+        available: bytes that may be taken; by default `SHARE` of what is free.
+
+    Raises:
+        ModelError: it takes more.
+    """
+    free = free_memory()
+    allowed = (None if free is None else int(SHARE * free)) if available is None else available
+    needed = exact_bytes(blocks, learning)
+    rows = sum(block.target.numel() for block in blocks)
+    samples = sum(len(block.target) for block in blocks)
+    if allowed is not None and needed > allowed:
+        raise ModelError(
+            f"exact inference on {samples} samples ({rows} rows) does not fit into memory",
+            expected=f"at most {allowed / 2**30:.1f} GiB",
+            got=f"{needed / 2**30:.1f} GiB",
+            hint='use inference="sparse", or fewer samples',
+        )
+    announce_memory(needed, f"exact inference on {samples} samples ({rows} rows)")

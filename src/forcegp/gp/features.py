@@ -1,8 +1,9 @@
-"""Kernel inputs: named features, side by side and standardized."""
+"""Inputs of kernels by name, rows of samples, and feature maps φ(x) of kernels and of random functions."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -86,3 +87,199 @@ class Standardization:
     def apply(self, features: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The standardized features."""
         return {name: (x - self.mean[name]) / self.std[name] for name, x in features.items()}
+
+
+@dataclass(frozen=True)
+class Block:
+    """Samples that share a number of rows.
+
+    Attributes:
+        features: standardized kernel inputs of each prior, `(n, w)` by name.
+        operators: W of each prior, `(n, r, components)`.
+        target: whitened residual `(n, r)`.
+    """
+
+    features: tuple[Features, ...]
+    operators: tuple[Tensor, ...]
+    target: Tensor
+
+    @property
+    def rows(self) -> int:
+        """Number of rows, n r."""
+        return self.target.numel()
+
+
+def points(features: Features) -> int:
+    """Number of inputs in a dictionary of features."""
+    return len(next(iter(features.values())))
+
+
+def components_of(block: Block) -> list[int]:
+    """Number of components of each process."""
+    return [W.shape[-1] for W in block.operators]
+
+
+def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
+    """The samples of blocks in blocks of at most so many."""
+    for block in blocks:
+        for first in range(0, len(block.target), samples):
+            yield rows_of(block, slice(first, first + samples))
+
+
+def rows_of(block: Block, index: slice | Tensor) -> Block:
+    """Some of the samples of a block."""
+    return Block(
+        tuple({name: x[index] for name, x in f.items()} for f in block.features),
+        tuple(W[index] for W in block.operators),
+        block.target[index],
+    )
+
+
+def rows_mean(latent_mean: Callable[[int, Features], Tensor], block: Block) -> Tensor:
+    """Mean Σ_p W_p μ_p of the rows of each sample of a block, `(n, d)` (eq. 23).
+
+    Args:
+        latent_mean: μ_p of process p at kernel inputs, `(n, components)`.
+        block: samples; the targets are not read.
+    """
+    mean = torch.zeros_like(block.target)
+    for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
+        mean = mean + (W @ latent_mean(p, x)[..., None])[..., 0]
+    return mean
+
+
+Basis = Callable[[Features], Tensor]
+"""x ↦ φ(x) `(k, n, f)`, or `(1, n, f)` where all components have the same."""
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureTerm:
+    """Features a_kf φ_f(x) of k components, of which the functions φ are often the same.
+
+    Attributes:
+        values: φ.
+        scale: a `(k, f)`.
+        inputs: names of the inputs, of the features of a linear kernel alone; else empty.
+        factors: two terms of which these features are all pairs.
+    """
+
+    values: Basis
+    scale: Tensor
+    inputs: tuple[str, ...] = ()
+    factors: tuple[FeatureTerm, FeatureTerm] | None = None
+
+    def weighted(self, weights: Tensor) -> tuple[Basis, Tensor]:
+        """Σ_f a_f φ_f w_f as functions with weights `(k, f, samples)`; equal functions only once."""
+        w = self.scale[..., None] * weights
+        pairs, rest = self.factors or (self, self)
+        if pairs.factors is None or not pairs.factors[0].inputs == pairs.factors[1].inputs != ():
+            return self.values, w
+        # The products ab and ba of two features of one linear kernel are the same function: weights add.
+        line, count = pairs.factors[0].values, pairs.factors[0].scale.shape[-1]
+        i, j = torch.triu_indices(count, count, device=w.device)
+        w = w.unflatten(1, (count, count, -1))
+        folded = (w + w.transpose(1, 2))[:, i, j] * torch.where(i == j, 0.5, 1.0)[:, None, None].to(w)
+
+        def squares(x: Features) -> Tensor:
+            phi = line(x)
+            return _all_pairs(phi[..., i] * phi[..., j], rest.values(x))
+
+        return squares, folded.flatten(1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureMap:
+    """φ(x) with E[φ(x)ᵀφ(x′)] = k(x, x′), as terms side by side: f(x) = φ(x)ᵀw with w ~ N(0, I).
+
+    Attributes:
+        terms: groups of features.
+    """
+
+    terms: tuple[FeatureTerm, ...]
+
+    def basis(self, x: Features) -> Tensor:
+        """φ(x) `(k, n, features)`."""
+        parts = [term.scale[:, None] * term.values(x) for term in self.terms]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+
+    def weighted(self, weights: Tensor) -> list[tuple[Basis, Tensor]]:
+        """φ(x)ᵀw as functions with weights, for `w` of shape `(k, features, samples)`."""
+        parts = weights.split([term.scale.shape[-1] for term in self.terms], dim=1)
+        return [term.weighted(w) for term, w in zip(self.terms, parts, strict=True)]
+
+    def joined(self) -> FeatureTerm:
+        """All features as one term."""
+        if len(self.terms) == 1:
+            return self.terms[0]
+
+        def values(x: Features) -> Tensor:
+            parts = [term.values(x) for term in self.terms]
+            most = max(map(len, parts))
+            return torch.cat([part.expand(most, -1, -1) for part in parts], dim=-1)
+
+        return FeatureTerm(values, torch.cat([term.scale for term in self.terms], dim=-1))
+
+    def __add__(self, other: FeatureMap) -> FeatureMap:
+        """The features of both, for the sum of two kernels."""
+        return FeatureMap((*self.terms, *other.terms))
+
+    def __mul__(self, other: FeatureMap) -> FeatureMap:
+        """All pairs of features, for the product of two kernels."""
+        a, b = self.joined(), other.joined()
+        scale = (a.scale[:, :, None] * b.scale[:, None, :]).flatten(-2)
+        pairs = FeatureTerm(lambda x: _all_pairs(a.values(x), b.values(x)), scale, factors=(a, b))
+        return FeatureMap((pairs,))
+
+    def paired(self, other: FeatureMap, count: int, generator: torch.Generator) -> FeatureMap:
+        """`count` random pairs of features, for the product of two kernels with many features each."""
+        a, b = self.joined(), other.joined()
+        sizes = a.scale.shape[-1], b.scale.shape[-1]
+        pairs = torch.Generator().manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
+        i, j = (torch.randint(n, (count,), generator=pairs).to(a.scale.device) for n in sizes)
+        scale = math.sqrt(sizes[0] * sizes[1] / count) * a.scale[:, i] * b.scale[:, j]
+        return FeatureMap((FeatureTerm(lambda x: a.values(x)[..., i] * b.values(x)[..., j], scale),))
+
+
+def fourier_features(inputs: tuple[str, ...] | None, omega: Tensor, phase: Tensor, std: Tensor) -> FeatureMap:
+    """σ √(2/F) cos(ωᵀx + φ): random Fourier features of a stationary kernel.
+
+    Args:
+        inputs: names of the inputs; `None` for all.
+        omega: frequencies `(k, F, w)`, or `(1, F, w)` where all components have the same.
+        phase: `(k, F)` or `(1, F)`.
+        std: σ `(k,)`.
+    """
+    count = phase.shape[-1]
+    scale = (math.sqrt(2.0 / count) * std)[:, None].expand(-1, count)
+    turn, shift = omega.mT, phase[:, None, :]
+    return FeatureMap((FeatureTerm(lambda x: torch.cos(stacked(x, inputs) @ turn + shift), scale),))
+
+
+def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, bias: Tensor) -> FeatureMap:
+    """Slopes and a bias: features of the linear kernel.
+
+    Args:
+        x: kernel inputs, whose widths count.
+        inputs: names of the inputs; `None` for all.
+        slope: standard deviation of each slope `(k, w)`, or of all `(k, 1)`.
+        bias: that of the bias `(k,)`.
+    """
+
+    def values(x: Features) -> Tensor:
+        line = stacked(x, inputs)
+        line = line if line.ndim == 3 else line[None]
+        return torch.cat([line, line.new_ones(*line.shape[:2], 1)], dim=-1)
+
+    width = stacked(x, inputs).shape[-1]
+    scale = torch.cat([slope.expand(-1, width), bias[:, None]], dim=-1)
+    return FeatureMap((FeatureTerm(values, scale, tuple(x) if inputs is None else inputs),))
+
+
+def constant_features(std: Tensor) -> FeatureMap:
+    """A constant per component, of standard deviation `(k,)`."""
+    return FeatureMap((FeatureTerm(lambda x: std.new_ones(1, stacked(x, None).shape[-2], 1), std[:, None]),))
+
+
+def _all_pairs(a: Tensor, b: Tensor) -> Tensor:
+    """a_i b_j of features `(k, n, f)` and `(k, n, g)`, `(k, n, f g)`."""
+    return (a[..., :, None] * b[..., None, :]).flatten(-2)

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forcegp.errors import ModelError
-from forcegp.gp.decomposition import TRUNCATION, KernelPart, split
-from forcegp.gp.features import Features
-from forcegp.gp.kernels import Parameters, sub
-from forcegp.gp.structured_covariance import Block, Process, points, rows_of
+from forcegp.gp.basis import KernelPart, split
+from forcegp.gp.factor import TRUNCATION
+from forcegp.gp.features import Block, Features, points, rows_of
+from forcegp.gp.kernels import Parameters, Process, sub
 
 CANDIDATES = 4000
 """Samples among which points are chosen."""
@@ -45,22 +44,6 @@ class Selection:
 
     points: dict[str, Tensor]
     missed: Tensor
-
-    @property
-    def relative(self) -> float:
-        """What is missed at the end as a fraction of the prior variance; 0 where there is none."""
-        return float(self.missed[-1] / self.missed[0]) if float(self.missed[0]) > 0.0 else 0.0
-
-
-def check_limit(limit: int) -> int:
-    """A maximum number of inducing points.
-
-    Raises:
-        ModelError: it is not a positive integer.
-    """
-    if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
-        raise ModelError("invalid number of inducing points", expected="a positive integer", got=limit)
-    return limit
 
 
 def candidates(blocks: Iterable[Block], samples: int, count: int = CANDIDATES) -> list[Block]:

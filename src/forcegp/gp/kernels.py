@@ -11,15 +11,22 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 from torch.linalg import vecdot
 
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.gp import draws
-from forcegp.gp.draws import FunctionDraw
-from forcegp.gp.features import Features, stacked
+from forcegp.gp.features import (
+    FeatureMap,
+    Features,
+    constant_features,
+    fourier_features,
+    linear_features,
+    points,
+    stacked,
+)
 
 Parameters = Mapping[str, Tensor]
 Initial = dict[str, Tensor]
@@ -68,8 +75,17 @@ class Kernel(ABC):
         return self.variance(params)(x)
 
     @abstractmethod
-    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        """Random functions from the prior, as `features` random features an output."""
+    def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
+        """Random functions from the prior, as `features` random features an output.
+
+        The features of linear kernels and constants are exact, whatever number is asked for.
+
+        Args:
+            params: log-hyperparameters.
+            x: any inputs, whose widths count.
+            features: number of random features.
+            generator: source of randomness, on the CPU.
+        """
 
     def __add__(self, other: Kernel) -> Kernel:
         return Sum(self, other)
@@ -150,8 +166,8 @@ class Linear(Kernel):
         slope, bias = self.slope_std(params)[:, None, :], self.bias_std(params).square()[:, None]
         return lambda x: (stacked(x, self.inputs) * slope).square().sum(-1) + bias
 
-    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return draws.LinearDraw(self.inputs, self.slope_std(params), self.bias_std(params))
+    def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
+        return linear_features(x, self.inputs, self.slope_std(params), self.bias_std(params))
 
 
 @dataclass(frozen=True)
@@ -176,8 +192,8 @@ class Constant(Kernel):
         variance = (self._std(params) ** 2)[:, None]
         return lambda x: variance.expand(-1, stacked(x, None).shape[-2])
 
-    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return draws.ConstantDraw(self._std(params))
+    def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
+        return constant_features(self._std(params))
 
 
 @dataclass(frozen=True)
@@ -219,19 +235,19 @@ class Stationary(Kernel):
 
     def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
         variance = torch.exp(2.0 * params["log_std"])[:, None]
-        return lambda x: variance.expand(-1, len(next(iter(x.values()))))
+        return lambda x: variance.expand(-1, points(x))
 
     @abstractmethod
     def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
         """Draws from the spectral density of g at unit length-scales."""
 
-    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+    def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
         lengthscale = params["log_lengthscale"].exp()
         # ω ~ p(ω)/ℓ, φ ~ U(0, 2π); components that share length-scales share ω, with independent weights.
         k, width = lengthscale.shape
         omega = self.frequencies((k, features, width), generator).to(lengthscale) / lengthscale[:, None, :]
         phase = 2.0 * math.pi * torch.rand(k, features, dtype=torch.float64, generator=generator)
-        return draws.FourierDraw(self.inputs, omega, phase.to(lengthscale), params["log_std"].exp())
+        return fourier_features(self.inputs, omega, phase.to(lengthscale), params["log_std"].exp())
 
 
 @dataclass(frozen=True)
@@ -310,12 +326,9 @@ class Sum(Kernel):
         left, right = self.left.variance(sub(params, "left")), self.right.variance(sub(params, "right"))
         return lambda x: self.combined(left(x), right(x))
 
-    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
-        return draws.SumDraw(*self._drawn(params, features, generator))
-
-    def _drawn(self, params: Parameters, features: int, generator: torch.Generator) -> list[FunctionDraw]:
-        sides = {"left": self.left, "right": self.right}
-        return [kernel.draw(sub(params, side), features, generator) for side, kernel in sides.items()]
+    def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
+        left = self.left.draw(sub(params, "left"), x, features, generator)
+        return left + self.right.draw(sub(params, "right"), x, features, generator)
 
 
 @dataclass(frozen=True)
@@ -329,7 +342,7 @@ class Product(Sum):
     def combined(left: Tensor, right: Tensor) -> Tensor:
         return left * right
 
-    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+    def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
         # A sum is multiplied out: its terms have features of unequal number and size, and those of a term
         # with few would seldom be drawn among those of the other.
         for side, other in (("left", "right"), ("right", "left")):
@@ -337,18 +350,17 @@ class Product(Sum):
             if isinstance(inner, Sum) and not isinstance(inner, Product):
                 terms = (
                     Product(getattr(inner, part), getattr(self, other)).draw(
-                        _sides(sub(params, f"{side}.{part}"), sub(params, other)), features, generator
+                        _sides(sub(params, f"{side}.{part}"), sub(params, other)), x, features, generator
                     )
                     for part in ("left", "right")
                 )
-                return draws.SumDraw(*terms)
+                return next(terms) + next(terms)
         linear = max(_linear_factors(self.left), _linear_factors(self.right))
-        if linear:
-            # A linear factor has few features and all of them matter, so the other one is given fewer.
-            few = max(1, features // (LINEAR_PAIRS * linear))
-            return draws.OuterDraw(*self._drawn(params, few, generator))
-        left, right = self._drawn(params, features, generator)
-        return draws.ProductDraw(left, right, features, int(torch.randint(2**31, (1,), generator=generator)))
+        # A linear factor has few features and all of them matter, so the other one is given fewer.
+        few = max(1, features // (LINEAR_PAIRS * linear)) if linear else features
+        left = self.left.draw(sub(params, "left"), x, few, generator)
+        right = self.right.draw(sub(params, "right"), x, few, generator)
+        return left * right if linear else left.paired(right, features, generator)
 
 
 def _linear_factors(kernel: Kernel) -> int:
@@ -357,3 +369,18 @@ def _linear_factors(kernel: Kernel) -> int:
         left, right = _linear_factors(kernel.left), _linear_factors(kernel.right)
         return left + right if left and right else 0
     return int(isinstance(kernel, Linear))
+
+
+@runtime_checkable
+class Process(Protocol):
+    """A Gaussian process by its kernel and the prefix of its hyperparameters."""
+
+    @property
+    def kernel(self) -> Kernel:
+        """Covariance of each component."""
+        ...
+
+    @property
+    def prefix(self) -> str:
+        """Prefix of the hyperparameters; another process's where they are shared."""
+        ...

@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.gp.draws import FourierDraw, FunctionDraw
-from forcegp.gp.features import Features
+from forcegp.gp.features import FeatureMap, Features, fourier_features, points
 from forcegp.gp.kernels import LARGEST_EXPONENT, Initial, Kernel, Parameters
-from forcegp.gp.structured_covariance import points
 
 TIME, SEGMENT = "time", "segment"
 """Names of its inputs: time [s], and the number of the trajectory, each `(n, 1)`."""
@@ -67,11 +65,12 @@ class OrnsteinUhlenbeck(Kernel):
         variance = torch.exp(2.0 * params["log_std"])[:, None]
         return lambda x: variance.expand(-1, points(x))
 
-    def draw(self, params: Parameters, features: int, generator: torch.Generator) -> FunctionDraw:
+    def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
         # The spectral density is a Cauchy density. Over uniform frequencies u, the mean of cos(u(s − s′)) is
         # zero for whole numbers s ≠ s′, so that trajectories are independent.
         rate = torch.exp(-params["log_time"])
         uniform = torch.rand(len(rate), features, 3, dtype=torch.float64, generator=generator).to(rate)
         in_time = torch.tan(math.pi * (uniform[..., 0] - 0.5)) * rate[:, None]
         omega = torch.stack([in_time, 2.0 * math.pi * uniform[..., 1]], dim=-1)
-        return FourierDraw((TIME, SEGMENT), omega, 2.0 * math.pi * uniform[..., 2], params["log_std"].exp())
+        phase = 2.0 * math.pi * uniform[..., 2]
+        return fourier_features((TIME, SEGMENT), omega, phase, params["log_std"].exp())

@@ -15,7 +15,7 @@ information form, with A = I + G, v, the drifting weights p and the others o,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,11 +24,10 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.factor import cholesky, extended
-from forcegp.gp.features import Features
-from forcegp.gp.pathwise import MISSED_FEATURES, FunctionSamples, draw_functions
-from forcegp.gp.rounding import require_resolved_noise, require_resolved_variance
-from forcegp.gp.structured_covariance import Block, chunked, rows_mean
+from forcegp.gp.draws import MISSED_FEATURES, FunctionSamples, draw_functions
+from forcegp.gp.factor import cholesky, extended, require_resolved_noise, require_resolved_variance
+from forcegp.gp.features import Block, Features, chunked, rows_mean
+from forcegp.gp.kernels import Parameters, Process
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 
 
@@ -65,6 +64,33 @@ def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
     return Sums(v, yy, sums.rows, sums.prior, sums.missed, G)
 
 
+MISSED = 0.1
+"""Missed variance, as a fraction of what the noise leaves, above which more points would help."""
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What a sparse posterior loses by its inducing points.
+
+    Attributes:
+        size: number of basis functions.
+        learned: how many basis functions the rows determine, tr A⁻¹G; in units of the noise variance this is
+            the variance that noise leaves in all rows together.
+        missed: the prior variance that the points miss in all rows together, in the same units.
+    """
+
+    size: int
+    learned: float
+    missed: float
+
+    @property
+    def more_points_would_help(self) -> bool:
+        """Whether the points miss a tenth or more of the variance that the noise leaves."""
+        return self.missed > MISSED * self.learned
+
+
+MOMENTS = ("v", "yy", "rows", "prior", "missed")
+"""Names of the sums in saved posteriors."""
 CHUNK_PREDICTIONS = 256
 """Samples whose covariance is computed at a time."""
 
@@ -101,6 +127,46 @@ class SparsePosterior:
         result = cls(basis, Moments(*sums.moments), L, jitter)
         result.__dict__["sums"] = sums
         return result
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything but processes and hyperparameters, by name, to be saved."""
+        tensors = {f"moments.{name}": getattr(self.moments, name) for name in MOMENTS}
+        tensors |= {"L": self.L, "jitter": torch.tensor(self.jitter, dtype=torch.float64)}
+        tensors |= self.basis.tensors()
+        # A copy of its own for each, as files do not keep views.
+        return {name: x.detach().clone(memory_format=torch.contiguous_format) for name, x in tensors.items()}
+
+    @classmethod
+    def of_tensors(
+        cls, processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
+    ) -> SparsePosterior:
+        """The posterior that `tensors` belong to.
+
+        Args:
+            processes: the processes.
+            params: log-hyperparameters.
+            tensors: as given by `tensors`.
+
+        Raises:
+            ModelError: a tensor is missing, or does not fit the processes.
+        """
+        try:
+            basis = LatentBasis.of_tensors(processes, params, tensors)
+            moments = Moments(*(tensors[f"moments.{name}"] for name in MOMENTS))
+            L, jitter = tensors["L"], float(tensors["jitter"])
+        except KeyError as error:
+            raise ModelError(
+                "a saved sparse posterior is not complete", expected=f"a tensor {error}"
+            ) from None
+        size = (basis.size, basis.size)
+        if L.shape != size or moments.v.shape != size[:1] or moments.prior.shape != (len(processes),):
+            raise ModelError(
+                "a saved sparse posterior does not fit its processes",
+                expected=f"{basis.size} basis functions of {len(processes)} processes",
+                got=f"{len(moments.v)} of {len(moments.prior)}",
+            )
+        # Files are row-major; the factor is kept column-major, as LAPACK returns it.
+        return cls(basis, moments, L.mT.contiguous().mT, jitter)
 
     @cached_property
     def sums(self) -> Sums:
@@ -220,22 +286,11 @@ class SparsePosterior:
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
-        """What the inducing points miss, and how well the samples are fitted."""
-        sums, m = self.sums, self.weights
+        """What the inducing points miss of what the samples determine."""
         # tr A⁻¹G = size − tr A⁻¹ = size − |L⁻ᵀ|²
         inverse = sum((block**2).sum() for block in self._inverse_factor)
-        learned = float(self.basis.size - inverse)
-        # |y − Φ m|² = Σ y² − 2 mᵀv + mᵀ G m
-        residual = sums.yy - 2.0 * (m @ sums.v) + m @ (sums.G @ m)
-        relative = torch.where(sums.prior > 0.0, sums.missed / sums.prior.where(sums.prior > 0.0, 1.0), 0.0)
-        return Diagnostics(
-            size=self.basis.size,
-            rows=float(sums.rows),
-            learned=learned,
-            missed=float(sums.missed.sum()),
-            relative=tuple(relative.tolist()),
-            residual=float(residual / sums.rows) if float(sums.rows) > 0.0 else 0.0,
-        )
+        size = self.basis.size
+        return Diagnostics(size, float(size - inverse), float(self.moments.missed.sum()))
 
     def draw(
         self, count: int, generator: torch.Generator, features: int = MISSED_FEATURES
@@ -292,34 +347,3 @@ class SparsePosterior:
             NumericalError: the samples were not among them.
         """
         return SparsePosterior.of(self.basis, self.sums - accumulate(self.basis, blocks))
-
-
-MISSED = 0.1
-"""Missed variance, as a fraction of what the noise leaves, above which more points would help."""
-
-
-@dataclass(frozen=True)
-class Diagnostics:
-    """What a sparse posterior loses by its inducing points.
-
-    Attributes:
-        size: number of basis functions.
-        rows: number of rows, less what is forgotten.
-        learned: how many basis functions the rows determine, tr A⁻¹G; in units of the noise variance this is
-            the variance that noise leaves in all rows together.
-        missed: the prior variance that the points miss in all rows together, in the same units.
-        relative: missed prior variance of each process as a fraction of all of it.
-        residual: mean square of the rows' residuals, 1 where the model and its noise fit.
-    """
-
-    size: int
-    rows: float
-    learned: float
-    missed: float
-    relative: tuple[float, ...]
-    residual: float
-
-    @property
-    def more_points_would_help(self) -> bool:
-        """Whether the points miss a tenth or more of the variance that the noise leaves."""
-        return self.missed > MISSED * self.learned

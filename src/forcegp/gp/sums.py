@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.structured_covariance import Block, chunked
+from forcegp.gp.features import Block, chunked
 
 CHUNK_SAMPLES = 1024
 """Samples whose basis functions are held at a time."""

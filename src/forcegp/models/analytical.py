@@ -26,7 +26,8 @@ from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, Loss, train
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
-from forcegp.storage.model_file import ModelHeader, Settings, settings_of
+from forcegp.storage.model_file import ModelHeader, settings_of
+from forcegp.storage.options import Settings
 from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
 
 KIND = "analytical"
@@ -139,14 +140,15 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             robot = torch.func.functional_call(theta, dict(tensors), ())
             return _mean_squared_error(self.system.with_robot(robot), measured, rows)
 
-        saved = None if checkpoint is None else Path(checkpoint)
-        key = "" if saved is None else _key(self.system, measured, options, start, self.seed)
+        record, robot = pack_system(self.system)
+        begin = (part for pair in start.items() for part in pair)
+        key = (options, self.seed, record, *robot.values(), *measured.tensors, *begin)
         if isinstance(options, BatchOptions):
-            kept = None if saved is None else Checkpoint(saved, key)
-            learned = train(loss, start, len(measured.q), options, generator, progress, kept)
+            saved = None if checkpoint is None else Checkpoint(Path(checkpoint), Checkpoint.key_of(*key))
+            learned = train(loss, start, len(measured.q), options, generator, progress, saved)
         else:
-            kept = None if saved is None else Evaluations(Checkpoint(saved, key))
-            learned = _minimise(loss, start, len(measured.q), options, progress, kept)
+            evaluations = Evaluations.resumed(checkpoint, start, *key)
+            learned = _minimise(loss, start, len(measured.q), options, progress, evaluations)
         theta.load_state_dict(learned.tensors)
         with torch.no_grad():
             system = self.system.with_robot(theta())
@@ -192,17 +194,9 @@ class AnalyticalFit(FittedModel):
         covariance: bool = True,
         system: ConstrainedSystem | None = None,
     ) -> Prediction:
-        """A quantity by the equations of motion; there is no covariance.
+        """Values `(*batch, d)` by the equations of motion; there is no covariance.
 
-        Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: a name of `QUANTITIES`, or several.
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            covariance: without effect, since the model has no uncertainty.
-            system: predict on another system.
-
-        Returns:
-            The values `(*batch, d)` as the mean.
+        The arguments are those of `Predictor.predict`; `quantity` may be several names.
 
         Raises:
             UnknownNameError: no such quantity.
@@ -224,6 +218,26 @@ class AnalyticalFit(FittedModel):
         """Q_C + Q_G + Q_D + Q_u at states."""
         return AnalyticalMean()
 
+    @classmethod
+    def restored(
+        cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+    ) -> AnalyticalFit:
+        settings = settings_of(header, AnalyticalSettings, source)
+        original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
+        window = Window(settings.relative, settings.length, settings.angle)
+        try:
+            model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
+        except ForceGPError as cause:
+            raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
+        state = {
+            name: take(tensors, name, tuple(old.shape), old.dtype, source)
+            for name, old in model.parameters.state_dict().items()
+        }
+        theta = AnalyticalParameters(original.robot, settings.analytical_parameters)
+        theta.load_state_dict(state)
+        result = FitResult(True, 0, 0.0, 0.0, message="loaded")
+        return cls(system, theta, window, settings.seed, result)
+
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         theta, width = self.parameters, self.window
         settings = AnalyticalSettings(
@@ -237,34 +251,13 @@ class AnalyticalFit(FittedModel):
         return settings, dict(theta.state_dict()) | start
 
 
-def load_analytical(
-    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> AnalyticalFit:
-    """The model that `AnalyticalFit.save` wrote."""
-    settings = settings_of(header, AnalyticalSettings, source)
-    original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
-    window = Window(settings.relative, settings.length, settings.angle)
-    try:
-        model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
-    except ForceGPError as cause:
-        raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
-    state = {
-        name: take(tensors, name, tuple(old.shape), old.dtype, source)
-        for name, old in model.parameters.state_dict().items()
-    }
-    theta = AnalyticalParameters(original.robot, settings.analytical_parameters)
-    theta.load_state_dict(state)
-    result = FitResult(True, 0, 0.0, 0.0, message="loaded")
-    return AnalyticalFit(system, theta, window, settings.seed, result)
-
-
 def _minimise(
     loss: Loss,
     start: dict[str, Tensor],
     samples: int,
     options: LearningOptions,
     progress: FitProgress | None,
-    saved: Evaluations | None,
+    saved: Evaluations,
 ) -> Learned:
     """Minimise over all samples at once."""
     rows = torch.arange(samples, device=next(iter(start.values())).device)
@@ -276,25 +269,9 @@ def _minimise(
     def objective(tensors: Tensors) -> Tensor:
         return loss(tensors, rows)
 
-    if saved is None:
-        return minimise(objective, start, options, progress=report)
-    saved.read(start)
     learned = minimise(saved.recorded(objective), start, options, progress=report)
     saved.write()
     return learned
-
-
-def _key(
-    system: ConstrainedSystem,
-    measured: Measurement,
-    options: BatchOptions | LearningOptions,
-    start: Mapping[str, Tensor],
-    seed: int,
-) -> str:
-    """Identifies learning from these measurements of this system, with these options."""
-    record, robot = pack_system(system)
-    begin = (part for pair in start.items() for part in pair)
-    return Checkpoint.key_of(options, seed, record, *robot.values(), *measured.tensors, *begin)
 
 
 def _mean_squared_error(system: ConstrainedSystem, measured: Measurement, rows: Tensor) -> Tensor:

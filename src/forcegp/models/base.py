@@ -23,7 +23,8 @@ from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Torque
 from forcegp.rollout.law import ForceField
 from forcegp.rollout.trajectory import Rollout
-from forcegp.storage.model_file import Settings, write_model
+from forcegp.storage.model_file import ModelHeader, write_model
+from forcegp.storage.options import Settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -220,6 +221,23 @@ class FittedModel(HasResult, Predictor):
         """What was learned, by name, for tables."""
         return []
 
+    @classmethod
+    @abstractmethod
+    def restored(
+        cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+    ) -> FittedModel:
+        """The model that `save` wrote.
+
+        Args:
+            header: of the file, with the settings that `record` gave.
+            tensors: as `record` gave them.
+            system: robot and contacts.
+            source: name of the file, for messages.
+
+        Raises:
+            ModelError: a tensor or setting is missing or not valid; names file and field.
+        """
+
     @abstractmethod
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         """Settings and tensors that the model can be restored from."""
@@ -301,17 +319,10 @@ class AccelerationFit(FittedModel):
         covariance: bool = True,
         system: ConstrainedSystem | None = None,
     ) -> Prediction:
-        """Mean and covariance of the accelerations; the covariance is diagonal.
+        """Mean `(*batch, nq)` and covariance `(*batch, nq, nq)` of the accelerations, without noise.
 
-        Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: `qdd`, the only one that this model knows.
-            active: ignored, since the model knows no contacts.
-            covariance: whether to compute the covariance, where the model has one.
-            system: must be the model's own, since the model knows no forces.
-
-        Returns:
-            Mean `(*batch, nq)` and covariance `(*batch, nq, nq)`, without measurement noise.
+        The arguments are those of `Predictor.predict`. The covariance, where the model has one, is diagonal.
+        The only quantity is `qdd`, and `active` has no effect: the model knows neither forces nor contacts.
 
         Raises:
             ModelError: another quantity, or another system, is asked for.

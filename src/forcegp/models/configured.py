@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from inspect import signature
 from typing import Any
 
 from forcegp.constraints import ConstrainedSystem
@@ -17,7 +18,6 @@ from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.base import FitProgress, FittedModel, Model
-from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import DEEP, SHALLOW, NeuralNetwork
 from forcegp.models.registry import MODELS, create
@@ -34,30 +34,8 @@ DEFAULT = "sgp"
 """The model where none is named."""
 COMMON = ("name", "noise", "seed", "learning")
 """Keys of `[model]` that every model takes; one without noise or a random start ignores these."""
-KEYS: dict[str, tuple[str, ...]] = {
-    AnalyticalModel.kind: ("analytical_parameters", "window"),
-    NeuralNetwork.kind: ("hidden",),
-    IndependentGP.kind: ("standardize",),
-    StructuredGP.kind: (
-        "mean",
-        "priors",
-        "sensor_noise_std",
-        "inference",
-        "inducing_points",
-        "inertia",
-        "standardize",
-        "analytical_parameters",
-    ),
-}
-"""Further keys by the kind of model."""
-PLAIN = (
-    "inference",
-    "inducing_points",
-    "inertia",
-    "standardize",
-    "hidden",
-)
-"""Keys that are arguments of the model's class as they are."""
+ARGUMENTS = {"priors": "force_priors"}
+"""Keys that have another name than the argument of the model's class."""
 Options = LearningOptions | BatchOptions
 
 
@@ -124,26 +102,30 @@ def configured(
     return Configured(chosen, model, _learning(table, model), section.sensor_noise_std)
 
 
+def keys_of(kind: type[Model[Any]]) -> tuple[str, ...]:
+    """The keys of `[model]` for a class of models: the arguments of its constructor, and those of all."""
+    keys = {argument: key for key, argument in ARGUMENTS.items()}
+    own = [keys.get(name, name) for name in signature(kind).parameters if name not in ("system", *COMMON)]
+    return (*COMMON, *own, *(("sensor_noise_std",) if kind is StructuredGP else ()))
+
+
 def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[str, Any]:
     """Arguments of the model's class from the keys in the file."""
-    kind = MODELS[name].kind
-    given = {key: value for key, value in table.section.given().items() if key not in COMMON}
-    for key in given:
-        _check_key(table, ("model", key), (*COMMON, *KEYS[kind]), f"the model {name!r}")
-    arguments = {key: given[key] for key in PLAIN if key in given}
-    at = table.document.at
-    if isinstance(mean := given.get("mean"), str):
-        arguments["mean"] = mean
-    elif mean is not None:
-        arguments["mean"] = at(("model", "mean"), AnalyticalMean, mean)
-    if "priors" in given:
-        arguments["force_priors"] = _priors(table)
-    if "window" in given:
-        arguments["window"] = Window(**given["window"].given())
-    if "analytical_parameters" in given:
-        joints = given["analytical_parameters"]
-        theta = at(("model", "analytical_parameters"), AnalyticalParameters, system.robot, joints)
-        arguments["analytical_parameters"] = theta if kind == StructuredGP.kind else joints
+    made, at = MODELS[name].made, table.document.at
+    given, arguments = table.section.given(), dict[str, Any]()
+    for key, value in given.items():
+        _check_key(table, ("model", key), keys_of(made), f"the model {name!r}")
+        if key == "mean" and not isinstance(value, str):
+            value = at(("model", "mean"), AnalyticalMean, value)
+        elif key == "priors" and not isinstance(value, str):
+            value = _priors(table, value)
+        elif key == "window":
+            value = Window(**table.section.window.given())
+        elif key == "analytical_parameters":
+            theta = at(("model", key), AnalyticalParameters, system.robot, value)
+            value = theta if made is StructuredGP else value
+        if key not in (*COMMON, "sensor_noise_std"):
+            arguments[ARGUMENTS.get(key, key)] = value
     return arguments
 
 
@@ -157,12 +139,10 @@ def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | N
     )
 
 
-def _priors(table: ModelTable) -> str | tuple[ForcePrior, ...]:
-    """The set of priors that `priors` names, or those of `[[model.priors]]`."""
-    if isinstance(table.section.priors, str):
-        return table.section.priors
+def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[ForcePrior, ...]:
+    """The priors of `[[model.priors]]`."""
     priors = []
-    for i, described in enumerate(table.section.priors):
+    for i, described in enumerate(written):
         key = ("model", "priors", i)
         prior = table.document.at(key, decode, described, CLASSES, "prior", whole=False)
         if not isinstance(prior, ForcePrior):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic, TypeVar
 
+from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
@@ -44,7 +45,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class FitResult:
-    """How a fit went.
+    """How a fit went; all but the history is kept in saved files.
 
     Attributes:
         converged: whether the optimiser reached its tolerance.
@@ -73,20 +74,20 @@ class FitResult:
     """
 
     converged: bool
-    evaluations: int
-    seconds: float
+    evaluations: NonNegativeInt
+    seconds: NonNegativeFloat
     objective: float
     log_marginal_likelihood: float | None = None
-    jitter: float = 0.0
+    jitter: NonNegativeFloat = 0.0
     constant_inputs: tuple[str, ...] = ()
     message: str = ""
     history: tuple[float, ...] = field(default=(), repr=False)
     force_correlation: float | None = None
     warnings: tuple[str, ...] = ()
     inference: str = ""
-    samples: int | None = None
-    learned_on: int | None = None
-    basis_functions: int | None = None
+    samples: NonNegativeInt | None = None
+    learned_on: NonNegativeInt | None = None
+    basis_functions: NonNegativeInt | None = None
     determined: float | None = None
     missed: float | None = None
     more_points_would_help: bool | None = None
@@ -106,60 +107,39 @@ class FitResult:
         )
 
 
+T = TypeVar("T")
+
+
+class _OfResult(Generic[T]):
+    """A field of the result as an attribute of the fit."""
+
+    def __init__(self, doc: str) -> None:
+        self.__doc__ = doc
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, fit: HasResult | None, owner: type) -> T:
+        return self if fit is None else getattr(fit.result, self.name)  # pyright: ignore[reportReturnType]
+
+
 class HasResult:
     """Has the result of a fit and gives access to its fields."""
 
     result: FitResult
 
-    @property
-    def converged(self) -> bool:
-        """Whether the optimiser reached its tolerance."""
-        return self.result.converged
-
-    @property
-    def evaluations(self) -> int:
-        """Number of evaluations of the objective."""
-        return self.result.evaluations
-
-    @property
-    def seconds(self) -> float:
-        """Duration of the fit."""
-        return self.result.seconds
-
-    @property
-    def objective(self) -> float:
-        """Final value of the objective."""
-        return self.result.objective
-
-    @property
-    def log_marginal_likelihood(self) -> float | None:
-        """log p(y | X, θ) of the training data, `None` for models without one."""
-        return self.result.log_marginal_likelihood
-
-    @property
-    def jitter(self) -> float:
-        """Added to the diagonal of the covariance to factorise it, relative to unit noise."""
-        return self.result.jitter
-
-    @property
-    def constant_inputs(self) -> tuple[str, ...]:
-        """Inputs that do not vary in the training data."""
-        return self.result.constant_inputs
-
-    @property
-    def message(self) -> str:
-        """Why the optimiser stopped."""
-        return self.result.message
-
-    @property
-    def history(self) -> tuple[float, ...]:
-        """The objective at each evaluation."""
-        return self.result.history
-
-    @property
-    def force_correlation(self) -> float | None:
-        """Mean posterior correlation of Q and Q_z at training states."""
-        return self.result.force_correlation
+    converged = _OfResult[bool]("Whether the optimiser reached its tolerance.")
+    evaluations = _OfResult[int]("Number of evaluations of the objective.")
+    seconds = _OfResult[float]("Duration of the fit.")
+    objective = _OfResult[float]("Final value of the objective.")
+    log_marginal_likelihood = _OfResult["float | None"](
+        "log p(y | X, θ) of the training data, `None` for models without one."
+    )
+    jitter = _OfResult[float]("Added to the diagonal of the covariance, relative to unit noise.")
+    constant_inputs = _OfResult[tuple[str, ...]]("Inputs that do not vary in the training data.")
+    message = _OfResult[str]("Why the optimiser stopped.")
+    history = _OfResult[tuple[float, ...]]("The objective at each evaluation.")
+    force_correlation = _OfResult["float | None"]("Mean posterior correlation of Q and Q_z.")
 
 
 def model_line(kind: str, system: ConstrainedSystem, result: FitResult | None) -> str:

@@ -1,8 +1,6 @@
 """The Gaussian-process baseline: each joint acceleration has a process of its own, blind to mechanics.
 
 q̈_j ~ GP(0, k_j(x, x′)) with x = (q, q̇, τ) and squared-exponential k_j (section 5.4 of the paper).
-
-Reading independent Gaussian processes.
 """
 
 from __future__ import annotations
@@ -26,15 +24,15 @@ from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import FlatStates
 from forcegp.forces.start import box_around, doubts_at_bounds, initial_hyperparameters, negative_log_prior
 from forcegp.gp.exact import ExactPosterior
-from forcegp.gp.features import Standardization
+from forcegp.gp.features import Block, Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
-from forcegp.gp.structured_covariance import Block
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
-from forcegp.storage.model_file import ModelHeader, Settings, settings_of
+from forcegp.storage.checkpoint import Evaluations
+from forcegp.storage.model_file import ModelHeader, settings_of
+from forcegp.storage.options import KernelOptions, Settings
 from forcegp.storage.system import take
 
 KIND = "independent_gp"
@@ -71,11 +69,10 @@ class IndependentTraining:
         return float(self.noise_std.expand_as(self.qdd)[:, joint].log().sum())
 
 
-class IndependentSettings(Settings):
+class IndependentSettings(KernelOptions):
     """What is kept of independent Gaussian processes besides their tensors."""
 
     noise_std: PositiveFloat | tuple[PositiveFloat, ...] | None
-    standardize: bool = True
 
 
 class IndependentGP(Model["IndependentFit"]):
@@ -120,7 +117,7 @@ class IndependentGP(Model["IndependentFit"]):
                 got=noise,
             )
         self.noise = stated.acceleration
-        self.standardize = standardize
+        self.options = KernelOptions.of(self._params)
 
     def fit(
         self,
@@ -146,11 +143,12 @@ class IndependentGP(Model["IndependentFit"]):
         options = options or LearningOptions()
         measured, noise_std = measurement_of(Observation(data), self.system, self.noise)
         features = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
-        scale = scale_of(features, self.standardize)
-        training = IndependentTraining(features, measured.values, noise_std, scale)
+        training = self.training(features, measured.values, noise_std)
         priors = joint_processes(self.system.robot.nq)
         announce(training, LEARNING)
-        saved = None if checkpoint is None else _record(Path(checkpoint), training, priors, options)
+        first = initial_hyperparameters(priors[:1], [training.block(0)])
+        known = (*features.values(), training.qdd, noise_std)
+        saved = Evaluations.resumed(checkpoint, first, KIND, options, len(priors), *known)
         parts: list[Learned] = []
         for joint, prior in enumerate(priors):
             before = sum(part.evaluations for part in parts)
@@ -160,15 +158,14 @@ class IndependentGP(Model["IndependentFit"]):
                     progress(before + evaluations, options.max_evaluations * len(priors), value)
 
             parts.append(_learn(training, prior, joint, options, report, saved))
-        if saved is not None:
-            saved.write()
+        saved.write()
         hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
-        return fitted(self.system, self.noise, training, hyperparameters, parts, self.standardize)
+        return fitted(self, training, hyperparameters, parts)
 
-
-def scale_of(features: Mapping[str, Tensor], standardize: bool) -> Standardization:
-    """Standardization of inputs, or none."""
-    return Standardization.of(features) if standardize else Standardization.none(features)
+    def training(self, features: dict[str, Tensor], qdd: Tensor, noise_std: Tensor) -> IndependentTraining:
+        """Training data with their standardization."""
+        scaled = Standardization.of if self.options.standardize else Standardization.none
+        return IndependentTraining(features, qdd, noise_std, scaled(features))
 
 
 def joint_processes(nq: int) -> tuple[JointForcePrior, ...]:
@@ -182,7 +179,7 @@ def _learn(
     joint: int,
     options: LearningOptions,
     report: Progress,
-    saved: Evaluations | None,
+    saved: Evaluations,
 ) -> Learned:
     """Learn the process of one joint; the record of one joint follows that of the one before."""
     blocks = [training.block(joint)]
@@ -193,20 +190,9 @@ def _learn(
         value = negative_log_likelihood([prior], tensors, blocks)
         return value + constant + (negative_log_prior(tensors, start) if options.hyperpriors else 0.0)
 
-    recorded = objective if saved is None else saved.recorded(objective)
     box = box_around(start)
-    learned = minimise(recorded, start, options, bounds=box, progress=report)
+    learned = minimise(saved.recorded(objective), start, options, bounds=box, progress=report)
     return dataclasses.replace(learned, doubts=doubts_at_bounds(learned.tensors, box))
-
-
-def _record(
-    path: Path, training: IndependentTraining, priors: Sequence[JointForcePrior], options: LearningOptions
-) -> Evaluations:
-    """The record of an interrupted fit, or an empty one."""
-    data = (*training.features.values(), training.qdd, training.noise_std)
-    saved = Evaluations(Checkpoint(path, Checkpoint.key_of(KIND, options, len(priors), *data)))
-    saved.read(initial_hyperparameters(priors[:1], [training.block(0)]))
-    return saved
 
 
 def announce(training: IndependentTraining, copies: int) -> None:
@@ -216,24 +202,23 @@ def announce(training: IndependentTraining, copies: int) -> None:
 
 
 def fitted(
-    system: ConstrainedSystem,
-    noise_std: NoiseStd | None,
+    model: IndependentGP,
     training: IndependentTraining,
     hyperparameters: dict[str, Tensor],
     parts: Sequence[Learned] = (),
-    standardize: bool = True,
 ) -> IndependentFit:
     """Condition on training data at given hyperparameters.
 
     Raises:
         NumericalError: a covariance is not positive definite.
     """
-    processes = joint_processes(system.robot.nq)
+    robot = model.system.robot
+    processes = joint_processes(robot.nq)
     posteriors = tuple(
         ExactPosterior.of([prior], hyperparameters, [training.block(j)]) for j, prior in enumerate(processes)
     )
     value = sum(float(p.log_likelihood() - training.constant(j)) for j, p in enumerate(posteriors))
-    ended = zip(system.robot.joint_names, parts, strict=False)
+    ended = zip(robot.joint_names, parts, strict=False)
     result = FitResult(
         converged=all(part.converged for part in parts),
         evaluations=sum(part.evaluations for part in parts),
@@ -246,7 +231,7 @@ def fitted(
         history=tuple(value for part in parts for value in part.history),
         warnings=tuple(doubt for part in parts for doubt in part.doubts),
     )
-    return IndependentFit(system, noise_std, training, hyperparameters, posteriors, result, standardize)
+    return IndependentFit(model.system, model, training, hyperparameters, posteriors, result)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -255,21 +240,19 @@ class IndependentFit(AccelerationFit):
 
     Attributes:
         system: robot and contacts.
-        noise_std: as given to the model.
+        specification: what was fitted.
         training: what the processes are conditioned on.
         hyperparameters: by process.
         posteriors: of each joint.
         result: how the fit went.
-        standardize: as given to the model.
     """
 
     system: ConstrainedSystem
-    noise_std: NoiseStd | None
+    specification: IndependentGP
     training: IndependentTraining
     hyperparameters: dict[str, Tensor]
     posteriors: tuple[ExactPosterior, ...]
     result: FitResult
-    standardize: bool = True
 
     kind = KIND
 
@@ -283,8 +266,39 @@ class IndependentFit(AccelerationFit):
                 variances.append(torch.stack([_variance(p, part) for p in self.posteriors], dim=-1))
         return torch.cat(means), torch.cat(variances) if variance else None
 
+    @classmethod
+    def restored(
+        cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+    ) -> IndependentFit:
+        settings = settings_of(header, IndependentSettings, source)
+        model = IndependentGP(system, settings.noise_std, settings.standardize)
+        nq, dtype = system.robot.nq, system.robot.dtype
+        n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
+        features = {
+            name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
+        }
+        noise = take(tensors, "training.noise_std", None, dtype, source)
+        if noise.shape not in ((nq,), (n, nq)) or not bool((noise > 0.0).all()):
+            raise ModelError(
+                f"{source}: tensor 'training.noise_std' is not valid", expected="positive numbers"
+            )
+        training = model.training(features, take(tensors, "training.qdd", (n, nq), dtype, source), noise)
+        hyperparameters = {
+            f"{prior.name}.{name}": take(
+                tensors, f"hyperparameters.{prior.name}.{name}", tuple(value.shape), torch.float64, source
+            )
+            for prior in joint_processes(nq)
+            for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
+        }
+        announce(training, 0)
+        try:
+            return fitted(model, training, hyperparameters)
+        except ForceGPError as cause:
+            raise ModelError.at(f"{source}: the training data", cause) from cause
+
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
-        settings = IndependentSettings(noise_std=plain(self.noise_std), standardize=self.standardize)
+        model = self.specification
+        settings = IndependentSettings(**dict(model.options), noise_std=plain(model.noise))
         tensors = {f"training.{name}": value for name, value in self.training.features.items()}
         tensors |= {"training.qdd": self.training.qdd, "training.noise_std": self.training.noise_std}
         tensors |= {f"hyperparameters.{name}": value for name, value in self.hyperparameters.items()}
@@ -296,32 +310,3 @@ def _variance(posterior: ExactPosterior, features: dict[str, Tensor]) -> Tensor:
     n, like = len(features["q"]), posterior.alpha
     rows = Block((features,), (like.new_ones(n, 1, 1),), like.new_zeros(n, 1))
     return posterior.covariance(rows)[:, 0, 0]
-
-
-def load_independent(
-    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> IndependentFit:
-    """The model that `IndependentFit.save` wrote."""
-    settings = settings_of(header, IndependentSettings, source)
-    nq, dtype = system.robot.nq, system.robot.dtype
-    n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
-    features = {
-        name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
-    }
-    noise = take(tensors, "training.noise_std", None, dtype, source)
-    if noise.shape not in ((nq,), (n, nq)) or not bool((noise > 0.0).all()):
-        raise ModelError(f"{source}: tensor 'training.noise_std' is not valid", expected="positive numbers")
-    qdd = take(tensors, "training.qdd", (n, nq), dtype, source)
-    training = IndependentTraining(features, qdd, noise, scale_of(features, settings.standardize))
-    hyperparameters = {
-        f"{prior.name}.{name}": take(
-            tensors, f"hyperparameters.{prior.name}.{name}", tuple(value.shape), torch.float64, source
-        )
-        for prior in joint_processes(nq)
-        for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
-    }
-    announce(training, 0)
-    try:
-        return fitted(system, settings.noise_std, training, hyperparameters, standardize=settings.standardize)
-    except ForceGPError as cause:
-        raise ModelError.at(f"{source}: the training data", cause) from cause

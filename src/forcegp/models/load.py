@@ -1,14 +1,9 @@
-"""Reading a saved model of any kind.
-
-Fitted models through process pools and `copy.deepcopy`, as the bytes of their saved form.
-
-No attribute of a model travels: what arrives in another process was read and checked as a saved model is.
-"""
+"""Reading a saved model of any kind; process pools and `copy.deepcopy` send the bytes of the same form."""
 
 from __future__ import annotations
 
 import copyreg
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +11,11 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
-from forcegp.models.analytical import AnalyticalFit, AnalyticalModel, load_analytical
+from forcegp.models.analytical import AnalyticalFit
 from forcegp.models.base import FittedModel
-from forcegp.models.independent_gp import IndependentFit, IndependentGP, load_independent
-from forcegp.models.neural import NetworkFit, NeuralNetwork, load_network
+from forcegp.models.independent_gp import IndependentFit
+from forcegp.models.neural import NetworkFit
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.models.structured_gp import StructuredGP
-from forcegp.models.structured_load import load_structured
 from forcegp.storage.model_file import (
     ModelHeader,
     model_bytes,
@@ -33,15 +26,10 @@ from forcegp.storage.model_file import (
 )
 from forcegp.storage.system import unpack_system
 
-Loader = Callable[[ModelHeader, Mapping[str, Tensor], ConstrainedSystem, str], FittedModel]
-
-LOADERS: dict[str, Loader] = {
-    AnalyticalModel.kind: load_analytical,
-    NeuralNetwork.kind: load_network,
-    IndependentGP.kind: load_independent,
-    StructuredGP.kind: load_structured,
+KINDS: dict[str, type[FittedModel]] = {
+    kind.kind: kind for kind in (AnalyticalFit, NetworkFit, IndependentFit, StructuredFit)
 }
-"""What reads each kind of models."""
+"""Fitted models by the name in the file."""
 
 
 def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> FittedModel:
@@ -87,19 +75,15 @@ def _restored(
     header: ModelHeader, tensors: Mapping[str, Tensor], source: str, system: ConstrainedSystem | None = None
 ) -> FittedModel:
     """The model of a header and tensors."""
-    if header.kind not in LOADERS:
-        raise UnknownNameError(f"kind of models in {source}", header.kind, LOADERS)
+    if header.kind not in KINDS:
+        raise UnknownNameError(f"kind of models in {source}", header.kind, KINDS)
     model_system = unpack_system(header.system, tensors, source, system)
-    return LOADERS[header.kind](header, model_tensors(tensors), model_system, source)
-
-
-KINDS = (AnalyticalFit, NetworkFit, IndependentFit, StructuredFit)
-"""Fitted models."""
+    return KINDS[header.kind].restored(header, model_tensors(tensors), model_system, source)
 
 
 def register() -> None:
     """Let the copying and sending of models go through their saved form."""
-    for kind in KINDS:
+    for kind in KINDS.values():
         copyreg.pickle(kind, _sent)  # pyright: ignore[reportArgumentType]
 
 

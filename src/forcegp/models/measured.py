@@ -1,7 +1,4 @@
-"""Predictions at logged states beside what was measured there.
-
-Plots of predictions: mean and band of ±2 standard deviations, beside what was measured.
-"""
+"""Predictions at logged states beside what was measured there: values, scores and plots."""
 
 from __future__ import annotations
 
@@ -113,11 +110,7 @@ def plot_model(
     true, mean, std = measured_if_logged(system, data, quantity), prediction.mean, prediction.std
     of_joints = names == list(system.robot.joint_names)
     panels = [
-        Panel(
-            names[i],
-            axis_label(quantity, kinds[i : i + 1] if of_joints else ()),
-            _curves(None if true is None else true[:, i], mean[:, i], None if std is None else std[:, i]),
-        )
+        _panel(names[i], axis_label(quantity, kinds[i : i + 1] if of_joints else ()), i, true, mean, std)
         for i in chosen(joints, names, f"component of {quantity}")
     ]
     time = Timeline.of(data.t, data.segment, data.header.ordered)
@@ -150,22 +143,15 @@ def plot_prediction(
     ):
         if value is not None and value != expected:
             raise ShapeError(f"{what} does not fit the prediction", expected=expected, got=value)
-    panels = [
-        Panel(
-            names[i],
-            axis_label(quantity),
-            _curves(
-                None if measured is None else measured[:, i], mean[:, i], None if std is None else std[:, i]
-            ),
-        )
-        for i in range(d)
-    ]
+    panels = [_panel(names[i], axis_label(quantity), i, measured, mean, std) for i in range(d)]
     axes = draw_panels(panels, Timeline.of(torch.arange(n) if t is None else t), (), ax)
     if t is None:
         axes[-1].set_xlabel("sample")
     return axes
 
 
-def _curves(true: Tensor | None, mean: Tensor, std: Tensor | None) -> list[Curve]:
-    curves = [] if true is None else [Curve(true, "measured", MEASURED, width=0.7)]
-    return [*curves, Curve(mean, "predicted", PREDICTED, std)]
+def _panel(name: str, label: str, i: int, true: Tensor | None, mean: Tensor, std: Tensor | None) -> Panel:
+    """Column i of a prediction, and of what was measured, if anything was."""
+    curves = [] if true is None else [Curve(true[:, i], "measured", MEASURED, width=0.7)]
+    band = None if std is None else std[:, i]
+    return Panel(name, label, [*curves, Curve(mean[:, i], "predicted", PREDICTED, band)])

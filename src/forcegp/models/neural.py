@@ -20,12 +20,11 @@ from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.model_file import ModelHeader, Settings, settings_of
+from forcegp.storage.model_file import ModelHeader, settings_of
+from forcegp.storage.options import Settings
 from forcegp.storage.system import take
 
 KIND = "neural_network"
-PAPER_ARCHITECTURES: tuple[tuple[int, ...], ...] = ((80,), (30, 20), (200, 200, 200, 200))
-"""Widths of the hidden layers of the three networks of the paper."""
 SHALLOW = BatchOptions(epochs=3000, batch=1024, learning_rate=0.03, patience=300)
 DEEP = BatchOptions(epochs=300, batch=256, learning_rate=0.003)
 """For networks of more than two hidden layers, whose epochs take longer and whose steps must be smaller."""
@@ -149,6 +148,32 @@ class NetworkFit(AccelerationFit):
         x = _stacked(self.inputs, {"q": at.q, "qd": at.qd, "tau": at.tau})
         return self.network(x) * self.outputs.std["qdd"] + self.outputs.mean["qdd"], None
 
+    @classmethod
+    def restored(
+        cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+    ) -> NetworkFit:
+        settings = settings_of(header, NetworkSettings, source)
+        robot = NeuralNetwork(system, settings.hidden, settings.seed).system.robot  # checks the widths
+        widths = [3 * robot.nq, *settings.hidden, robot.nq]
+        state = {}
+        for layer, (before, after) in enumerate(pairwise(widths)):
+            # Shapes are checked before a network of them is made.
+            for name, shape in (("weight", (after, before)), ("bias", (after,))):
+                key = f"{2 * layer}.{name}"
+                state[key] = take(tensors, f"network.{key}", shape, robot.dtype, source)
+        network = _network(system, settings.hidden)
+        network.load_state_dict(state)
+        scales = []
+        for names, constant in ((("q", "qd", "tau"), settings.constant), (("qdd",), ())):
+            mean, std = (
+                {name: take(tensors, f"{part}.{name}", (robot.nq,), robot.dtype, source) for name in names}
+                for part in ("mean", "std")
+            )
+            scales.append(Standardization(mean, std, constant))
+        result = FitResult(True, 0, 0.0, 0.0, constant_inputs=settings.constant, message="loaded")
+        network = network.requires_grad_(False)
+        return cls(system, settings.hidden, settings.seed, network, scales[0], scales[1], result)
+
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         settings = NetworkSettings(hidden=self.hidden, seed=self.seed, constant=self.inputs.constant)
         tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
@@ -156,33 +181,6 @@ class NetworkFit(AccelerationFit):
             for name in part.mean:
                 tensors |= {f"mean.{name}": part.mean[name], f"std.{name}": part.std[name]}
         return settings, tensors
-
-
-def load_network(
-    header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> NetworkFit:
-    """The model that `NetworkFit.save` wrote."""
-    settings = settings_of(header, NetworkSettings, source)
-    robot = NeuralNetwork(system, settings.hidden, settings.seed).system.robot  # checks the widths
-    widths = [3 * robot.nq, *settings.hidden, robot.nq]
-    state = {}
-    for layer, (before, after) in enumerate(pairwise(widths)):
-        # Shapes are checked before a network of them is made.
-        for name, shape in (("weight", (after, before)), ("bias", (after,))):
-            key = f"{2 * layer}.{name}"
-            state[key] = take(tensors, f"network.{key}", shape, robot.dtype, source)
-    network = _network(system, settings.hidden)
-    network.load_state_dict(state)
-    scales = []
-    for names, constant in ((("q", "qd", "tau"), settings.constant), (("qdd",), ())):
-        mean, std = (
-            {name: take(tensors, f"{part}.{name}", (robot.nq,), robot.dtype, source) for name in names}
-            for part in ("mean", "std")
-        )
-        scales.append(Standardization(mean, std, constant))
-    result = FitResult(True, 0, 0.0, 0.0, constant_inputs=settings.constant, message="loaded")
-    network = network.requires_grad_(False)
-    return NetworkFit(system, settings.hidden, settings.seed, network, scales[0], scales[1], result)
 
 
 def _network(system: ConstrainedSystem, hidden: tuple[int, ...]) -> nn.Sequential:

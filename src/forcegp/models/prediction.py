@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.errors import NumericalError
 from forcegp.forces.noise import warnings_beyond
-from forcegp.gp.rounding import require_semidefinite
+from forcegp.gp.factor import require_semidefinite
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from inspect import signature
 from typing import Any
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
 from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd
+from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.sets import PAPER, contact_priors, default_priors
 from forcegp.gp.kernels import Kernel
 from forcegp.models.analytical import AnalyticalModel
@@ -18,7 +20,6 @@ from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.neural import NeuralNetwork
 from forcegp.models.structured_gp import StructuredGP
 
-SGP = StructuredGP.kind
 Stated = NoiseStd | Noise | None
 """The noise of a model, `None` for what the log states."""
 
@@ -28,70 +29,68 @@ class Entry:
     """A named model.
 
     Attributes:
-        kind: of the model, as in saved models.
+        made: class of the model.
         description: one line for help texts and the report.
-        make: builds it from the system, the noise, the seed and options of its own.
+        options: arguments of the class.
+        priors: force priors of a system with a mean and a kernel, if the set is not left to the class.
+        kernel: of these priors, if not their own.
     """
 
-    kind: str
+    made: type[Any]
     description: str
-    make: Callable[..., Model]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    priors: Callable[[ConstrainedSystem, Any, Kernel | None], Sequence[ForcePrior]] | None = None
+    kernel: Kernel | None = None
+
+    @property
+    def kind(self) -> str:
+        """As in saved models."""
+        return self.made.kind
+
+    def make(self, system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model[Any]:
+        """The model, with further arguments of its class; noise and seed where it takes them."""
+        taken = signature(self.made).parameters
+        arguments: dict[str, Any] = {
+            name: x for name, x in (("noise", noise), ("seed", seed)) if name in taken
+        }
+        arguments |= {**self.options, **options}
+        if self.priors is not None and "force_priors" not in options:
+            arguments["force_priors"] = self.priors(system, arguments["mean"], self.kernel)
+        return self.made(system, **arguments)
 
 
-def _analytical(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
-    return AnalyticalModel(system, seed=seed, **options)
+def _contact(system: ConstrainedSystem, mean: Any, kernel: Kernel | None) -> Sequence[ForcePrior]:
+    """Priors on the contact's friction alone, whatever the mean."""
+    return contact_priors(system, kernel)
 
 
-def _network(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
-    return NeuralNetwork(system, seed=seed, **options)
-
-
-def _independent(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
-    return IndependentGP(system, noise=noise, **options)
-
-
-def _chosen(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
-    options = {"mean": "analytical"} | options
-    return StructuredGP(system, noise=noise, **options)
-
-
-def _structured(mean: str, kernel: Kernel | None = None) -> Callable[..., Model]:
-    def make(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
-        options = {"mean": mean} | options
-        options.setdefault("force_priors", default_priors(system, options["mean"], kernel))
-        return StructuredGP(system, noise=noise, **options)
-
-    return make
-
-
-def _contact(kernel: Kernel | None = None) -> Callable[..., Model]:
-    def make(system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model:
-        options = {"mean": "analytical", "force_priors": contact_priors(system, kernel)} | options
-        return StructuredGP(system, noise=noise, **options)
-
-    return make
-
-
+ZERO, ANALYTICAL = {"mean": "zero"}, {"mean": "analytical"}
 MODELS: dict[str, Entry] = {
-    "analytical": Entry(
-        AnalyticalModel.kind, "equations of motion with learned inertia and damping, no friction", _analytical
+    "analytical": Entry(AnalyticalModel, "equations of motion with learned inertia and damping, no friction"),
+    "nn": Entry(NeuralNetwork, "neural network with sigmoid layers on (q, qd, tau)"),
+    "gp": Entry(IndependentGP, "one Gaussian process per joint acceleration on (q, qd, tau)"),
+    "sgp-zero": Entry(StructuredGP, "structured GP, all joint forces unknown", ZERO, default_priors),
+    "sgp": Entry(
+        StructuredGP, "structured GP around the analytical forces, priors chosen by the data", ANALYTICAL
     ),
-    "nn": Entry(NeuralNetwork.kind, "neural network with sigmoid layers on (q, qd, tau)", _network),
-    "gp": Entry(
-        IndependentGP.kind, "one Gaussian process per joint acceleration on (q, qd, tau)", _independent
-    ),
-    "sgp-zero": Entry(SGP, "structured GP, all joint forces unknown", _structured("zero")),
-    "sgp": Entry(SGP, "structured GP around the analytical forces, priors chosen by the data", _chosen),
     "sgp-mean": Entry(
-        SGP, "structured GP around the analytical forces, any joint force", _structured("analytical")
+        StructuredGP,
+        "structured GP around the analytical forces, any joint force",
+        ANALYTICAL,
+        default_priors,
     ),
-    "sgp-zero-se": Entry(SGP, "sgp-zero with the paper's kernel alone", _structured("zero", PAPER)),
-    "sgp-mean-se": Entry(SGP, "sgp-mean with the paper's kernel alone", _structured("analytical", PAPER)),
+    "sgp-zero-se": Entry(StructuredGP, "sgp-zero with the paper's kernel alone", ZERO, default_priors, PAPER),
+    "sgp-mean-se": Entry(
+        StructuredGP, "sgp-mean with the paper's kernel alone", ANALYTICAL, default_priors, PAPER
+    ),
     "sgp-contact": Entry(
-        SGP, "structured GP with mean and a prior on the contact's friction alone", _contact()
+        StructuredGP,
+        "structured GP with mean and a prior on the contact's friction alone",
+        ANALYTICAL,
+        _contact,
     ),
     "sgp-contact-se": Entry(
-        SGP, "the same with any tangential force and the paper's kernel", _contact(PAPER)
+        StructuredGP, "the same with any tangential force and the paper's kernel", ANALYTICAL, _contact, PAPER
     ),
 }
 """The models, simplest first."""

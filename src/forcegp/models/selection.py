@@ -67,8 +67,12 @@ def candidates_of(spec: Specification) -> list[Candidate]:
     """The candidates for a model, simplest first."""
     candidates = []
     for chosen in (each for each in SETS.values() if each.fits(spec.system)):
-        asks = spec.inertia != "file" and chosen.has_joint_friction and spec.analytical_parameters is None
-        if not asks or spec.inertia is None:
+        asks = (
+            spec.options.inertia != "file"
+            and chosen.has_joint_friction
+            and spec.analytical_parameters is None
+        )
+        if not asks or spec.options.inertia is None:
             candidates.append(Candidate(chosen))
         if asks:
             candidates.append(Candidate(chosen, inertia=True))
@@ -77,7 +81,7 @@ def candidates_of(spec: Specification) -> list[Candidate]:
 
 def without_comparison(spec: Specification, note: str) -> tuple[Specification, tuple[Compared, ...]]:
     """The specification with the set for few samples, and a table that says so."""
-    spec = dataclasses.replace(spec, inertia=spec.inertia or "auto")
+    spec = spec.with_options(inertia=spec.options.inertia or "auto")
     return spec.with_set(FEW), (Compared(FEW.name, chosen=True, note=note),)
 
 
@@ -87,17 +91,14 @@ def with_priors(
     learn: Sequence[str] | None = None,
     progress: FitProgress | None = None,
 ) -> tuple[Specification, tuple[Compared, ...]]:
-    """The specification with the noise and the priors that were left to the data, and the comparison.
+    """The specification with the priors that were left to the data, and the comparison.
 
     Args:
-        spec: the model.
+        spec: the model, with the noise for these data.
         data: the log, or the rows of it that are held in memory.
         learn: what is learned, if not all.
         progress: called after each candidate with the number of candidates so far, of all, and NaN.
     """
-    spec = spec.for_data(data)
-    if not spec.automatic:
-        return spec, ()
     if learn is not None:
         return without_comparison(spec, "not everything is learned")
     log, _ = in_motion(spec.system, training_of(data, spec.system, (), spec.noise.acceleration, {}))
@@ -137,7 +138,7 @@ class Comparison:
             if name not in self.notes:
                 robot = Inertia(self.spec.system.robot)
                 if candidate.inertia:
-                    spec = dataclasses.replace(self.spec.with_set(candidate.set), inertia="auto")
+                    spec = self.spec.with_set(candidate.set).with_options(inertia="auto")
                     inertia = inertia or spec.inertia_of(train)
                     robot, same = inertia, inertia.robot is self.spec.system.robot
                     self.inertia_found = self.inertia_found or not same
@@ -188,12 +189,12 @@ class Comparison:
         chosen = next(each for each in shown if each.name in near)
         table = tuple(self._row(each, best, each is chosen) for each in shown)
         identifies = chosen.inertia or not self.inertia_found
-        spec = dataclasses.replace(self.spec, inertia=self.spec.inertia or ("auto" if identifies else "file"))
+        spec = self.spec.with_options(inertia=self.spec.options.inertia or ("auto" if identifies else "file"))
         return spec.with_set(chosen.set), table
 
     def _is_shown(self, candidate: Candidate) -> bool:
         """Whether a candidate differs from those without the question about inertia."""
-        return not candidate.inertia or self.spec.inertia == "auto" or self.inertia_found
+        return not candidate.inertia or self.spec.options.inertia == "auto" or self.inertia_found
 
     def _row(self, candidate: Candidate, best: Tensor, chosen: bool) -> Compared:
         parts = self.scores.get(candidate.name, [])
@@ -231,7 +232,7 @@ def trained(
         begin: hyperparameters to begin with.
     """
     spec, pinned = identified(spec) if inertia.identified else (spec, {})
-    rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.standardize)
+    rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.options.standardize)
     few = problem = Task(spec, rows, inertia.robot, pinned).problem()
     if not is_finite(problem.priors):
         few = dataclasses.replace(problem, training=rows.evenly(LEARN_ROWS))

@@ -29,14 +29,17 @@ from forcegp.forces.observations import Observation
 from forcegp.forces.posterior import ForcePosterior, draw_samples
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.quantities import AffineMap, States, affine_map, affine_maps, states_at
+from forcegp.forces.quantities import AffineMap, affine_map, affine_maps, states_at
+from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel, ForceField, Prediction
 from forcegp.models.fit_result import FitResult
+from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import prepared, training_for
-from forcegp.models.structured_spec import Specification, pack
-from forcegp.storage.model_file import Settings
+from forcegp.models.structured_spec import Specification
+from forcegp.storage.model_file import ModelHeader
+from forcegp.storage.options import Settings
 
 KIND = "structured_gp"
 
@@ -118,7 +121,9 @@ class StructuredFit(FittedModel):
         system = system or self.system
         at, batch = states_at(system, q, qd, tau, active)
         if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
-            at = self._with_acceleration(system, at)
+            # Errors of the inertia are multiplied by the predicted acceleration.
+            qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
+            at = dataclasses.replace(at, qdd=qdd)
         z, parts = affine_maps(system, at, quantity)
         spread = None
         if not covariance:
@@ -143,11 +148,6 @@ class StructuredFit(FittedModel):
         """How far the speed and torque of each joint lie beyond those of the training data, in training
         standard deviations `(*batch, nq)`; `None` where no torque noise was learned."""
         return distance_beyond(self.hyperparameters, qd, tau) if LOW in self.hyperparameters else None
-
-    def _with_acceleration(self, system: ConstrainedSystem, at: States) -> States:
-        """The states with the predicted acceleration, which errors of the inertia are multiplied by."""
-        qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
-        return dataclasses.replace(at, qdd=qdd)
 
     def force_field(self) -> ForceField:
         """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states."""
@@ -179,7 +179,7 @@ class StructuredFit(FittedModel):
                 hint='call model.fit(data, learn=["noise"], after=fit), which learns the noise alone',
             )
         values = self.hyperparameters if hyperparameters is None else hyperparameters
-        if not is_sparse(spec.inference, self.problem.priors, training.all_samples):
+        if not is_sparse(spec.options.inference, self.problem.priors, training.all_samples):
             training = self._with_slopes(training)
         problem = prepared(spec, dataclasses.replace(self.problem, training=training), values)
         return conditioned(spec, problem, values, warnings=doubts)
@@ -207,13 +207,12 @@ class StructuredFit(FittedModel):
         measurements = self._with_slopes(measurements)
         problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
-        latent = self.posterior.latent
-        posterior = dataclasses.replace(self.posterior, latent=latent.updated(rows))
-        if isinstance(latent, SparsePosterior):
-            return dataclasses.replace(self, posterior=posterior)
+        updated = self._with(self.posterior.latent.updated(rows))
+        if isinstance(self.posterior.latent, SparsePosterior):
+            return updated
         noise = [problem.noise_at(self.hyperparameters, i) for i in range(len(measurements.measurements))]
         whole = dataclasses.replace(self.problem, training=self.training.joined(measurements, noise))
-        return dataclasses.replace(self, problem=whole, posterior=posterior)
+        return dataclasses.replace(updated, problem=whole)
 
     def _with_slopes(self, measurements: Training) -> Training:
         """Other measurements, with the slopes of the learned forces where the fit has them."""
@@ -243,33 +242,30 @@ class StructuredFit(FittedModel):
             UnknownNameError: no such prior.
             NumericalError: the samples to remove were not among those of the fit.
         """
+        latent = _sparse(self.posterior)
         if not isinstance(what, int | float):
-            return self._without(training_for(self.specification, self.problem, what, learned=())[0])
+            without, _ = training_for(self.specification, self.problem, what, learned=())
+            return self._with(latent.without(self._problem_of(without).rows(self.hyperparameters).blocks))
         factor = float(what)
         if priors is not None:
-            return self._drifting(factor, priors)
+            names = [prior.name for prior in self.posterior.priors]
+            for name in priors:
+                if name not in names:
+                    raise UnknownNameError("force prior to forget", name, names)
+            return self._with(latent.drifting(factor, [names.index(name) for name in priors]))
         if not 0.0 < factor <= 1.0:
             raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)
-        latent = _sparse(self.posterior).forgetting(factor)
-        posterior = dataclasses.replace(self.posterior, latent=latent)
-        return dataclasses.replace(self, posterior=posterior)
+        return self._with(latent.forgetting(factor))
 
-    def _without(self, measurements: Training) -> StructuredFit:
-        """The fit without samples that it was conditioned on."""
-        problem = self._problem_of(measurements)
-        latent = _sparse(self.posterior).without(problem.rows(self.hyperparameters).blocks)
-        posterior = dataclasses.replace(self.posterior, latent=latent)
-        return dataclasses.replace(self, posterior=posterior)
+    def _with(self, latent: ExactPosterior | SparsePosterior) -> StructuredFit:
+        """The fit with another posterior of the latent processes."""
+        return dataclasses.replace(self, posterior=dataclasses.replace(self.posterior, latent=latent))
 
-    def _drifting(self, factor: float, priors: Sequence[str]) -> StructuredFit:
-        names = [prior.name for prior in self.posterior.priors]
-        for name in priors:
-            if name not in names:
-                raise UnknownNameError("force prior to forget", name, names)
-        own = [names.index(name) for name in priors]
-        latent = _sparse(self.posterior).drifting(factor, own)
-        posterior = dataclasses.replace(self.posterior, latent=latent)
-        return dataclasses.replace(self, posterior=posterior)
+    @classmethod
+    def restored(
+        cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
+    ) -> StructuredFit:
+        return cls(*unpack(header, tensors, system, source))
 
     def record(self) -> tuple[Settings, dict[str, Tensor]]:
         settings, tensors = pack(

@@ -14,13 +14,13 @@ from torch import nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError
-from forcegp.forces.inference import check_method, require_double
+from forcegp.forces.inference import require_double
 from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.observations import NoiseStd, Observation
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.joint import AnalyticalMean, mean_of
 from forcegp.forces.priors.sets import priors_of
-from forcegp.gp.inducing import LIMIT, check_limit
+from forcegp.gp.inducing import LIMIT
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.selection import with_priors
@@ -31,8 +31,9 @@ from forcegp.models.structured_learning import (
     search_of,
     task_of,
 )
-from forcegp.models.structured_spec import Specification, check_inertia
-from forcegp.models.structured_stream import Pass, sample_of
+from forcegp.models.structured_spec import Specification
+from forcegp.models.structured_stream import Pass, Sample, sample_of
+from forcegp.storage.options import StructuredOptions
 
 FIT_COPIES = 3.0
 """Memory of a fit besides the matrices of its inference, in that of the equations of motion."""
@@ -95,7 +96,7 @@ class StructuredGP(Model[StructuredFit]):
     ) -> None:
         self._keep(locals())
         require_double(system)
-        form, stated = mean_of(mean), Noise.of(noise)
+        form, stated, options = mean_of(mean), Noise.of(noise), StructuredOptions.of(self._params)
         automatic = force_priors == "auto" and "actuation" in form.terms
         priors = priors_of(system, form, force_priors)
         check_priors(priors, system)
@@ -107,11 +108,8 @@ class StructuredGP(Model[StructuredFit]):
             priors,
             stated if automatic else stated.for_priors(priors),
             analytical_parameters,
-            check_method(inference),
-            check_limit(inducing_points),
             automatic,
-            check_inertia(inertia),
-            standardize,
+            options,
         )
 
     @property
@@ -161,9 +159,11 @@ class StructuredGP(Model[StructuredFit]):
             NumericalError: the likelihood cannot be computed.
         """
         spec = self.specification if after is None else self._continued(after)
-        sample = sample_of(spec, data)
+        sample = sample_of(spec, data) if isinstance(data, StreamedDataset) else Sample(data)
         chosen = None if learn is None else tuple(learn)
-        spec, comparison = with_priors(spec, sample.data, chosen, progress)
+        spec, comparison = spec.for_data(sample.data), ()
+        if spec.automatic:
+            spec, comparison = with_priors(spec, sample.data, chosen, progress)
         check_learned(spec, chosen or ())
         if chosen == () and after is not None and sample.log is None:
             return dataclasses.replace(after, specification=spec).condition(sample.data)
@@ -175,7 +175,7 @@ class StructuredGP(Model[StructuredFit]):
         begins = chosen is None and after is not None
         begin = {key: before[key] for key in search.start if key in before} if begins else None
         file = None if checkpoint is None else Path(checkpoint)
-        neighbours = sample.neighbours(spec, problem.training)
+        neighbours = None if sample.log is None else sample.neighbours(spec, problem.training)
         lesson = learned(spec, problem, search, file, progress, begin, neighbours)
         values, forces = lesson.hyperparameters, None
         if sample.log is not None and lesson.problem.inducing is not None:

@@ -39,12 +39,12 @@ from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.start import Search, initial
-from forcegp.gp.likelihood import require_exact_fits
+from forcegp.gp.exact import require_exact_fits
 from forcegp.gp.optimise import Learned, LearningOptions, Progress
 from forcegp.models.base import FitProgress
 from forcegp.models.structured_spec import Specification
 from forcegp.robot.model import RobotModel
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
+from forcegp.storage.checkpoint import Evaluations
 from forcegp.storage.system import pack_system
 
 OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
@@ -154,7 +154,9 @@ def training_for(
     if before is not None and learned is not None:
         scales = zip(spec.priors, before.training.scales, strict=True)
         kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
-    training = training_of(data, spec.system, spec.priors, spec.noise.acceleration, kept, spec.standardize)
+    training = training_of(
+        data, spec.system, spec.priors, spec.noise.acceleration, kept, spec.options.standardize
+    )
     return in_motion(spec.system, training) if spec.noise.learns_torque else (training, ())
 
 
@@ -214,7 +216,7 @@ def in_motion(system: ConstrainedSystem, training: Training) -> tuple[Training, 
 def subset(spec: Specification, problem: Problem) -> Problem:
     """The problem on the samples that hyperparameters are learned on."""
     training = problem.training
-    if not is_sparse(spec.inference, problem.priors, training.all_samples):
+    if not is_sparse(spec.options.inference, problem.priors, training.all_samples):
         return problem
     finite = is_finite(problem.priors)
     most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
@@ -252,8 +254,7 @@ def learned(
         return Lesson(prepared(spec, problem, search.held), search.held)
     saved = None
     if file is not None:
-        saved = Evaluations(Checkpoint(file, _key(spec, problem, search, begin)))
-        saved.read(search.start)
+        saved = Evaluations.resumed(file, search.start, *_key(spec, problem, search, begin))
         search = dataclasses.replace(search, recorded=saved.recorded)
 
     def report(evaluations: int, value: float, _: Mapping[str, Tensor]) -> None:
@@ -266,26 +267,25 @@ def learned(
     return lesson
 
 
-def _key(spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None) -> str:
-    """Identifies the learning of some tensors, on these data and this system, with these options."""
-    training = problem.training
-    data = [value for m in training.measurements for value in m.tensors]
+def identity(problem: Problem) -> tuple[object, ...]:
+    """The mean, priors, data, noise and system of a problem, for the keys of checkpoints."""
+    training, (record, robot) = problem.training, pack_system(problem.system)
+    data = (value for m in training.measurements for value in m.tensors)
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
-    record, robot = pack_system(problem.system)
+    return problem.mean, priors, training.part_of, *data, *training.noise_std, record, *robot.values()
+
+
+def _key(
+    spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None
+) -> tuple[object, ...]:
+    """Identifies the learning of some tensors of a problem, with these options."""
     named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
-    scales = [x for scale in training.scales for side in (scale.mean, scale.std) for x in side.values()]
-    noise = [*training.noise_std, *(x for x in (problem.state_std, problem.torque_std) if x is not None)]
-    options = (
-        spec.inference,
-        spec.inducing_points,
-        spec.noise.degrees_of_freedom,
-        spec.standardize,
-        search.options,
-    )
-    return Checkpoint.key_of(
-        problem.mean, priors, *problem.pinned, *problem.pinned.values(), options, training.quantities,
-        training.part_of, *data, *noise, *scales, record, *robot.values(),
-        *(part for pair in named for part in pair),
+    sides = [side for scale in problem.training.scales for side in (scale.mean, scale.std)]
+    noise = [x for x in (problem.state_std, problem.torque_std) if x is not None]
+    return (
+        *identity(problem), *problem.pinned, *problem.pinned.values(), problem.training.quantities,
+        spec.options, spec.noise.degrees_of_freedom, search.options,
+        *noise, *(x for side in sides for x in side.values()), *(part for pair in named for part in pair),
     )  # fmt: skip
 
 
@@ -317,7 +317,7 @@ def solve(
     learned, learned_on = search.solve(part, progress, begin), part.training.samples
     warnings: list[str] = []
     if part.state_std is not None and not is_sparse(
-        spec.inference, part.priors, problem.training.all_samples
+        spec.options.inference, part.priors, problem.training.all_samples
     ):
         part, learned, doubts = with_learned_slopes(part, search, learned, progress)
         warnings += doubts
@@ -356,13 +356,13 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """The problem with the inference that its samples ask for, and their weights under heavy-tailed noise."""
-    if is_sparse(spec.inference, problem.priors, problem.training.all_samples):
+    if is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
         # Sums over samples have the slopes of the robot file.
         problem = dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))
         if is_finite(problem.priors):
             problem = without_inducing(problem)
         else:
-            problem = with_inducing(problem, values, spec.inducing_points)
+            problem = with_inducing(problem, values, spec.options.inducing_points)
     if spec.noise.degrees_of_freedom is None:
         return problem
     return weighted(problem, values, spec.noise.degrees_of_freedom)

@@ -29,13 +29,11 @@ from forcegp.gp.basis import LatentBasis
 from forcegp.gp.distributed import share_basis
 from forcegp.gp.features import Standardization
 from forcegp.gp.kernels import sub
-from forcegp.gp.sparse_tensors import basis_of_tensors, tensors_of_basis
 from forcegp.gp.sums import Sums
 from forcegp.models.base import FitProgress
-from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED
+from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, identity
 from forcegp.models.structured_spec import Specification
 from forcegp.storage.checkpoint import Checkpoint, beside
-from forcegp.storage.system import pack_system
 
 SAMPLE_ROWS = 20_000
 """Rows, evenly spaced over the log, that are learned from; fewer than twice as many are held."""
@@ -76,16 +74,13 @@ class Sample:
 
 
 @torch.no_grad()
-def sample_of(spec: Specification, data: Dataset | Sequence[Observation] | StreamedDataset) -> Sample:
-    """What a model learns from: a log in memory, or evenly spaced samples of one that is read piece by piece,
-    in motion where the model asks for that.
+def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
+    """What a model learns from: evenly spaced samples of a log, in motion where the model asks for that.
 
     Raises:
         DataError: a file is damaged, or holds no samples.
         ModelError: exact inference is asked for on more samples than are read at once.
     """
-    if not isinstance(data, StreamedDataset):
-        return Sample(data)
     moving = spec.automatic or spec.noise.learns_torque
     rows, stretches, count = _rows_of(data, moving_rows if moving else None)
     if moving and count < FEWEST_MOVING:
@@ -122,7 +117,7 @@ def _check_inference(spec: Specification, count: int, held: int) -> None:
             hint="select rows, or leave degrees_of_freedom out",
         )
     coupled = any(prior.in_time for prior in spec.priors)
-    if (spec.inference == "exact" or coupled) and count > held:
+    if (spec.options.inference == "exact" or coupled) and count > held:
         raise ModelError(
             f"exact inference on a log of {count:,} samples that is read piece by piece",
             expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",
@@ -211,22 +206,16 @@ class Pass:
 
     def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
         """Identifies the sums over a log, with a basis, a system and a noise."""
-        training = problem.training
         files = [(path.name, path.stat().st_size) for path in self.log.files]
-        record, robot = pack_system(problem.system)
-        data = [value for m in training.measurements for value in m.tensors]
         points = [x for Z in problem.inducing or () for x in Z.values()]
         named = [part for pair in sorted(hyperparameters.items()) for part in pair]
-        return Checkpoint.key_of(
-            problem.mean, [(type(prior).__name__, prior) for prior in problem.priors], problem.power, files,
-            self.log.differentiate, training.part_of, *data, *training.noise_std, *points, *named,
-            record, *robot.values(),
-        )  # fmt: skip
+        streamed = (problem.power, files, self.log.differentiate)
+        return Checkpoint.key_of(*identity(problem), *streamed, *points, *named)
 
 
 def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
     """What a pass has computed so far, by name."""
-    tensors = {f"basis.{name}": value for name, value in tensors_of_basis(basis).items()}
+    tensors = {f"basis.{name}": value for name, value in basis.tensors().items()}
     tensors |= {f"sums.{i}": value for i, value in enumerate(total.sums.tensors)}
     counts = {"constant": total.constant, "samples": total.samples, "pieces": torch.tensor(total.pieces)}
     return tensors | counts
@@ -234,7 +223,7 @@ def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
 
 def _restored(basis: LatentBasis, tensors: Mapping[str, Tensor]) -> tuple[LatentBasis, Totals]:
     """The basis and totals that `_tensors` was given; kernel inputs are in the order of the prior."""
-    own = basis_of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
+    own = LatentBasis.of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
     sums = Sums(*(tensors[f"sums.{i}"] for i in range(len(fields(Sums)))))
     return own, Totals(
         sums,

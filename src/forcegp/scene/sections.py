@@ -13,6 +13,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from forcegp.constraints import Baumgarte
 from forcegp.files import Record
 from forcegp.simulate.config import SimulationConfig
+from forcegp.storage.options import StructuredOptions
 from forcegp.storage.system import ConnectionFields, ContactFields, Point
 
 
@@ -67,16 +68,12 @@ class NoiseSection(Section):
     degrees_of_freedom: PositiveFloat | None = None
 
 
-class ModelSection(Section):
-    """`[model]`: see `forcegp.models.configured`."""
+class ModelSection(Section, StructuredOptions):
+    """`[model]`: the options of models, and what `forcegp.models.configured` reads."""
 
     name: str | None = None
     noise: NoiseSection = NoiseSection()
     sensor_noise_std: PositiveFloat | None = None
-    inference: Literal["auto", "exact", "sparse"] = "auto"
-    inertia: Literal["file", "auto"] | None = None
-    inducing_points: PositiveInt = 100
-    standardize: bool = True
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "zero"
     priors: str | tuple[dict[str, Any], ...] = ()
     analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = Field(default_factory=dict)

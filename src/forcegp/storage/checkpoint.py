@@ -103,14 +103,36 @@ class Evaluations:
     A resumed fit runs the optimiser again from the start on the recorded values, which takes no time, and so
     ends with the same bits as a fit that was not interrupted. If the optimiser asks for another point (on
     another machine or release of a library), the rest of the record is dropped and evaluated anew.
+
+    Args:
+        checkpoint: where they are kept; `None` to keep nothing.
     """
 
-    checkpoint: Checkpoint
+    checkpoint: Checkpoint | None
     _record: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list, init=False)
     _next: int = field(default=0, init=False)
 
+    @classmethod
+    def resumed(cls, path: str | Path | None, start: Mapping[str, Tensor], *key: object) -> Evaluations:
+        """The evaluations in a file, if there is one.
+
+        Args:
+            path: the file; `None` to keep nothing.
+            start: initial tensors of what is learned.
+            key: settings and tensors that identify what is learned.
+
+        Raises:
+            ModelError: see `read`.
+        """
+        if path is None:
+            return cls(None)
+        result = cls(Checkpoint(Path(path), Checkpoint.key_of(*key)))
+        result.read(start)
+        return result
+
     def read(self, start: Mapping[str, Tensor]) -> int:
         """Take up the evaluations in the file, if there is one; returns how many will not be repeated."""
+        assert self.checkpoint is not None
         size = sum(value.numel() for value in start.values())
         rows = torch.zeros(0, size, dtype=torch.float64)
         record = self.checkpoint.read(dict(zip(NAMES, (rows, rows[:, 0], rows), strict=True)), NAMES)
@@ -130,6 +152,9 @@ class Evaluations:
 
     def recorded(self, objective: Objective) -> Objective:
         """The same objective, with its evaluations read from the record as far as it goes, then recorded."""
+        checkpoint = self.checkpoint
+        if checkpoint is None:
+            return objective
 
         def again(tensors: dict[str, Tensor]) -> Tensor:
             names = sorted(tensors)
@@ -141,7 +166,7 @@ class Evaluations:
                 value, gradient = _evaluated(objective, tensors, names)
                 self._record.append((here, value, gradient))
                 if len(self._finite()):
-                    self.checkpoint.write_now_and_then(self._tensors)
+                    checkpoint.write_now_and_then(self._tensors)
             self._next += 1
             like = tensors[names[0]]
             pair = value.to(like), gradient.to(like)
@@ -151,7 +176,7 @@ class Evaluations:
 
     def write(self) -> None:
         """Write all evaluations so far, up to the first that is not finite."""
-        if self._finite():
+        if self.checkpoint is not None and self._finite():
             self.checkpoint.write(self._tensors())
 
     def _finite(self) -> list[tuple[Tensor, Tensor, Tensor]]:

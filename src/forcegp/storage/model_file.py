@@ -14,7 +14,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import safetensors
 import safetensors.torch
@@ -24,9 +24,10 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.destination import check_destination
 from forcegp.errors import ModelError
-from forcegp.files import Header, Record, atomic_file, validated
+from forcegp.files import Header, atomic_file, validated
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
 from forcegp.resources import announce_memory
+from forcegp.storage.options import Settings, SettingsT
 from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
 
 TYPES = (torch.float64, torch.float32, torch.int64, torch.bool)
@@ -80,13 +81,6 @@ class ModelHeader(Header):
     kind: str
     settings: dict[str, Any]
     system: dict[str, Any]
-
-
-class Settings(Record):
-    """Base of what a kind of models keeps in `ModelHeader.settings`."""
-
-
-SettingsT = TypeVar("SettingsT", bound=Settings)
 
 
 def model_path(path: str | Path) -> Path:

@@ -7,9 +7,9 @@ import torch
 
 from forcegp import resources
 from forcegp.errors import ModelError
-from forcegp.gp import likelihood
-from forcegp.gp.likelihood import exact_bytes, require_exact_fits
-from forcegp.gp.structured_covariance import Block
+from forcegp.gp import exact
+from forcegp.gp.exact import exact_bytes, require_exact_fits
+from forcegp.gp.features import Block
 from forcegp.resources import MemoryNeedWarning
 
 
@@ -29,7 +29,7 @@ def test_size_grows_with_the_square_of_the_rows() -> None:
 
 def test_what_takes_most_of_the_memory_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
     needed = exact_bytes([wide(100)])
-    for module in (resources, likelihood):
+    for module in (resources, exact):
         monkeypatch.setattr(module, "free_memory", lambda: int(1.5 * needed))
     with pytest.warns(MemoryNeedWarning, match=r"exact inference on 100 samples \(700 rows\) needs"):
         require_exact_fits([wide(100)])

@@ -1,41 +1,176 @@
-"""Reading structured Gaussian processes."""
+"""Structured Gaussian processes in saved files.
+
+An exact posterior keeps its data, a sparse one its sums over them. The options are those of
+`StructuredOptions`, and priors are written field by field.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any, Literal
 
 import torch
+from pydantic import Field, NonNegativeFloat, PositiveFloat, field_serializer
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError
-from forcegp.forces.learn import Problem, kernel_parameters
+from forcegp.forces.learn import Problem, analytical_parameters, kernel_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import Noise
+from forcegp.forces.observations import plain
 from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.base import ANALYTICAL
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import states
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
-from forcegp.gp.sparse_tensors import posterior_of_tensors
+from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.fit_result import FitResult
-from forcegp.models.structured_fit import StructuredFit
-from forcegp.models.structured_spec import CLASSES, COLUMNS, IN_TIME, Specification, StructuredSettings
+from forcegp.models.structured_spec import CLASSES, Specification
 from forcegp.robot.parameters import AnalyticalParameters
-from forcegp.storage.descriptions import decode
+from forcegp.storage.descriptions import decode, encode
 from forcegp.storage.model_file import ModelHeader, settings_of
-from forcegp.storage.system import take_robot
+from forcegp.storage.options import Settings, StructuredOptions
+from forcegp.storage.system import robot_tensors, take_robot
+
+Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
+"""A noise that may be zero, as one number or one per joint."""
+COLUMNS = ("q", "qd", "tau", "active", "values")
+"""What is kept of each measurement."""
+IN_TIME = ("segment", "t")
+"""What is kept beside it where a prior is a function of time."""
+Parts = tuple[
+    Specification, Problem, dict[str, Tensor], ForcePosterior, FitResult, ConstrainedSystem, dict[str, Tensor]
+]
+"""The fields of a `StructuredFit`."""
+
+
+class NoiseSettings(Settings):
+    """Fields of `Noise`."""
+
+    acceleration: PositiveFloat | tuple[PositiveFloat, ...] | None
+    learn: bool
+    torque: PositiveFloat | tuple[PositiveFloat, ...] | Literal["learn"] | None
+    state: tuple[Stated, Stated] | None
+    degrees_of_freedom: float | None = Field(gt=2.0)
+
+
+class StructuredSettings(StructuredOptions):
+    """What is kept of a structured Gaussian process besides its tensors."""
+
+    mean: tuple[str, ...]
+    noise: NoiseSettings
+    power: float = Field(gt=0.0, le=1.0)
+    correlation_time: float = Field(default=0.0, ge=0.0)
+    priors: tuple[dict[str, Any], ...]
+    measured: tuple[str, ...]
+    constant: tuple[tuple[str, ...], ...]
+    analytical_parameters: dict[str, tuple[str, ...]] | None
+    result: FitResult
+
+    @field_serializer("result")
+    def _saved(self, result: FitResult) -> dict[str, Any]:
+        """All but the history, which is long, and the constant inputs, which the scales name."""
+        left_out = ("history", "constant_inputs")
+        return {name: x for name, x in dataclasses.asdict(result).items() if name not in left_out}
+
+
+def pack(
+    spec: Specification,
+    problem: Problem,
+    hyperparameters: Mapping[str, Tensor],
+    posterior: ForcePosterior,
+    result: FitResult,
+) -> tuple[StructuredSettings, dict[str, Tensor]]:
+    """A fit as settings and tensors; an exact posterior keeps its data, a sparse one its sums over them.
+
+    Args:
+        spec: what was fitted.
+        problem: what it is conditioned on.
+        hyperparameters: all learned tensors.
+        posterior: over the forces.
+        result: how the fit went.
+
+    Raises:
+        ModelError: a prior or kernel is Python code.
+    """
+    own = spec.analytical_parameters if isinstance(spec.analytical_parameters, AnalyticalParameters) else None
+    tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
+    tensors |= {f"pinned.{name}": value for name, value in problem.pinned.items()}
+    if problem.torque_std is not None:
+        tensors["torque_std"] = problem.torque_std
+    if problem.correlation is not None:
+        tensors["torque_correlation"] = problem.correlation
+    tensors |= _conditioned_on(spec, problem.training, posterior)
+    start = own.start if own is not None else spec.system.robot
+    tensors |= {f"start.{name}": getattr(start, name) for name in robot_tensors(start)}
+    for prior, scale in zip(spec.priors, problem.training.scales, strict=True):
+        tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
+        tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
+    return _settings_of(spec, problem, isinstance(posterior.latent, ExactPosterior), own, result), tensors
+
+
+def _settings_of(
+    spec: Specification, problem: Problem, exact: bool, own: AnalyticalParameters | None, result: FitResult
+) -> StructuredSettings:
+    """What is kept of a fit besides tensors."""
+    noise = spec.noise
+    return StructuredSettings(
+        **dict(spec.options),
+        mean=spec.mean.terms,
+        noise=NoiseSettings(
+            acceleration=plain(noise.acceleration),
+            learn=noise.learn,
+            torque=plain(noise.torque),
+            state=None if noise.state is None else tuple(map(plain, noise.state)),  # pyright: ignore[reportArgumentType]
+            degrees_of_freedom=noise.degrees_of_freedom,
+        ),
+        power=problem.power,
+        priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
+        measured=problem.training.quantities if exact else (),
+        constant=tuple(scale.constant for scale in problem.training.scales),
+        analytical_parameters=None if own is None else own.joints,
+        result=result,
+    )
+
+
+def _conditioned_on(spec: Specification, training: Training, posterior: ForcePosterior) -> dict[str, Tensor]:
+    """The data of an exact posterior, or the sums over them of a sparse one."""
+    latent = posterior.latent
+    if not isinstance(latent, ExactPosterior):
+        return {f"sparse.{name}": value for name, value in latent.tensors().items()}
+    tensors = {"alpha": latent.alpha}
+    for i, (m, std) in enumerate(zip(training.measurements, training.noise_std, strict=True)):
+        tensors |= {f"data.{i}.{name}": getattr(m, name) for name in _columns(spec)}
+        tensors[f"data.{i}.noise_std"] = std
+        if training.weights is not None:
+            tensors[f"data.{i}.weight"] = training.weights[i]
+        if training.slopes is not None and (G := training.slopes[i]) is not None:
+            tensors[f"data.{i}.slope"] = G
+    return tensors
+
+
+def _columns(spec: Specification) -> tuple[str, ...]:
+    """What is kept of each measurement."""
+    return COLUMNS + (IN_TIME if any(prior.in_time for prior in spec.priors) else ())
+
+
+def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:
+    """The hyperparameters without θ_A of a module that cannot be saved, which the robot contains."""
+    left_out = analytical_parameters(hyper) if own is None else {}
+    return {k: v for k, v in hyper.items() if k.removeprefix(f"{ANALYTICAL}.") not in left_out}
 
 
 def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
-def load_structured(
+def unpack(
     header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
-) -> StructuredFit:
-    """The model that `StructuredFit.save` wrote.
+) -> Parts:
+    """The fields of the fit that `pack` was given.
 
     Raises:
         ModelError: a tensor or setting is missing or not valid; names file and field.
@@ -72,10 +207,7 @@ def _specification(
         priors,
         Noise(**settings.noise.model_dump()),
         parameters,
-        settings.inference,
-        settings.inducing_points,
-        inertia=settings.inertia,
-        standardize=settings.standardize,
+        options=StructuredOptions.of(dict(settings)),
     )
 
 
@@ -95,8 +227,7 @@ def _check_types(tensors: Mapping[str, Tensor]) -> None:
 def _training(settings: StructuredSettings, spec: Specification, tensors: Mapping[str, Tensor]) -> Training:
     measurements, noise = [], []
     for i, quantity in enumerate(settings.measured):
-        names = COLUMNS + (IN_TIME if any(prior.in_time for prior in spec.priors) else ())
-        m = Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in names})
+        m = Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in _columns(spec)})
         n, nq = len(m.values) if m.values.ndim == 2 else -1, spec.system.robot.nq
         shapes = {"q": (n, nq), "qd": (n, nq), "tau": (n, nq), "active": (n, len(spec.system.contacts))}
         shapes |= {"segment": (n,), "t": (n,)}
@@ -149,7 +280,7 @@ def _restored(
     tensors: Mapping[str, Tensor],
     settings: StructuredSettings,
     system: ConstrainedSystem,
-) -> StructuredFit:
+) -> Parts:
     """The fit with its weights as they were; the factorisation waits until a covariance is asked for."""
     problem = dataclasses.replace(
         spec.problem(training),
@@ -165,9 +296,8 @@ def _restored(
         for p, scale in zip(spec.priors, training.scales, strict=True)
         for name in scale.constant
     )
-    result = FitResult(**dict(settings.result), constant_inputs=constant)
-    noise = _below(tensors, "noise_std.")
-    return StructuredFit(spec, problem, hyper, posterior, result, system, noise)
+    result = dataclasses.replace(settings.result, constant_inputs=constant, history=())
+    return spec, problem, hyper, posterior, result, system, _below(tensors, "noise_std.")
 
 
 def _correlation(
@@ -201,7 +331,7 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
     params, process = kernel_parameters(hyper), problem.process_at(hyper)
     if "alpha" not in tensors:
         kept = _in_order(problem, _below(tensors, "sparse."))
-        latent = posterior_of_tensors(problem.priors, params, kept)
+        latent = SparsePosterior.of_tensors(problem.priors, params, kept)
         return ForcePosterior(process, latent)
     blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
     rows = sum(block.rows for block in blocks)

@@ -1,0 +1,68 @@
+"""Options of models: one table each for the constructor, the table `[model]` of scenes and saved files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, PositiveInt, ValidationError
+
+from forcegp.errors import ModelError, UnknownNameError
+from forcegp.gp.inducing import LIMIT
+
+SettingsT = TypeVar("SettingsT", bound="Settings")
+
+
+class Settings(BaseModel):
+    """Base of what a kind of models keeps in `ModelHeader.settings`: frozen, no unknown field."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def of(cls: type[SettingsT], values: Mapping[str, Any]) -> SettingsT:
+        """The fields that are among named values, with their types checked.
+
+        Raises:
+            UnknownNameError: a value is not one of the names that the field takes.
+            ModelError: a value is not valid.
+        """
+        known = {name: values[name] for name in cls.model_fields if name in values}
+        try:
+            return cls.model_validate(known, strict=True)
+        except ValidationError as cause:
+            first = cause.errors()[0]
+            name = str(first["loc"][0])
+            if first["type"] == "literal_error":
+                names = re.findall(r"'([^']*)'", first["msg"])
+                raise UnknownNameError(name, values[name], names) from cause
+            raise ModelError(f"invalid `{name}`", expected=first["msg"], got=values[name]) from cause
+
+
+class KernelOptions(Settings):
+    """Options of models with kernels on the states.
+
+    Attributes:
+        standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
+            in the paper.
+    """
+
+    standardize: bool = True
+
+
+class StructuredOptions(KernelOptions):
+    """Options of `StructuredGP` that are plain values.
+
+    A field is an argument of the constructor, a key of `[model]` and a setting of saved models. Only the
+    signature of the constructor repeats it.
+
+    Attributes:
+        inference: how to condition; `"auto"` by the number of samples.
+        inducing_points: maximum number of inducing points of one prior.
+        inertia: `"file"`, or `"auto"` where the log may show another one; `None` leaves that to the data if
+            they choose the priors, and is `"file"` elsewhere.
+    """
+
+    inference: Literal["auto", "exact", "sparse"] = "auto"
+    inducing_points: PositiveInt = LIMIT
+    inertia: Literal["file", "auto"] | None = None
