@@ -25,15 +25,11 @@ from forcegp.checks.fit import (
 )
 from forcegp.checks.log import Array, Log, displacement
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.identification import regressor
+from forcegp.identification import MASS_SHARE, MOMENT_ARM, regressor
 from forcegp.robot.model import RobotModel
 
 LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
 """Delays between torque and motion that are tried, in samples either way."""
-MASS_SHARE = 0.3
-"""How far the masses of a robot file may be off, as a share."""
-MOMENT_ARM = 0.1
-"""How far centres of mass may be off [m]."""
 TOOL_MASS = 5.0
 """How heavy a tool may be that the robot file lacks [kg]."""
 SHARPER = (2.0, 10.0)

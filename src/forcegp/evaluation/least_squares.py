@@ -19,7 +19,7 @@ from torch import Tensor
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.identification import parameter_vector, regressor
+from forcegp.identification import MASS_SHARE, MOMENT_ARM, parameter_vector, regressor
 from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, log_cholesky
 from forcegp.robot.inertia import pseudo_inertia as pseudo_inertia_of
 from forcegp.robot.model import RobotModel
@@ -28,8 +28,6 @@ CHUNK_STATES = 1000
 """States handled at a time, which bounds the memory."""
 MOST = 4000
 """Samples used at most, evenly spaced: some hundred times the number of unknowns in equations."""
-MASS_SHARE, LENGTH = 0.3, 0.1
-"""Prior standard deviation of a link's parameters: 30 % of its mass m, m · 0.1 m and m · (0.1 m)²."""
 WIDE = 10.0
 """Prior standard deviation of friction and offset, relative to the largest torque of the joint."""
 NOISE_PASSES, STEPS = 3, 30
@@ -97,7 +95,7 @@ def _friction_columns(robot: RobotModel, qd: Tensor) -> Tensor:
 def _prior_std(robot: RobotModel, train: Dataset) -> Tensor:
     """Prior standard deviation of every unknown, `(13 nq,)`."""
     mass = robot.mass.clamp(min=1e-3 * float(robot.mass.max()))
-    shares = torch.tensor([MASS_SHARE, *[LENGTH] * 3, *[LENGTH**2] * 6]).to(mass)
+    shares = torch.tensor([MASS_SHARE, *[MOMENT_ARM] * 3, *[MOMENT_ARM**2] * 6]).to(mass)
     torque = WIDE * train.tau.abs().amax(0).clamp(min=1e-6)
     speed = train.qd.abs().amax(0).clamp(min=1e-3)
     return torch.cat([(mass[:, None] * shares).flatten(), torque / speed, torque, torque])
@@ -135,7 +133,7 @@ def _rows(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, Tensor]:
 def _start(robot: RobotModel) -> Tensor:
     """Log-Cholesky coordinates of the robot file `(nq, 10)`; bodies without extent get a little of it."""
     J = pseudo_inertia_of(robot.mass, robot.com, robot.inertia)
-    least = POINT * float(robot.mass.max()) * torch.tensor([LENGTH**2] * 3 + [1.0]).to(J)
+    least = POINT * float(robot.mass.max()) * torch.tensor([MOMENT_ARM**2] * 3 + [1.0]).to(J)
     bad = torch.linalg.cholesky_ex(J - 1e-2 * torch.diag(least)).info != 0
     return log_cholesky(J + bad[:, None, None] * torch.diag(least))
 

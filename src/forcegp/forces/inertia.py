@@ -39,8 +39,9 @@ from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.inference import force_posterior
 from forcegp.forces.inverse_dynamics import (
     LEAST,
+    Estimate,
+    NormalEquations,
     Rows,
-    Sums,
     acceleration_errors,
     free_rows,
     held_out,
@@ -90,18 +91,15 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
         power = _power(rows, left / noise)
         mean = _estimate(every, noise, power)
 
-    def compared(estimate: Tensor | None) -> Tensor:
-        """Held-out errors in units of the noise, of an estimate, or of that of the other stretches."""
-        errors = []
-        for g in range(len(judged.gram)):
-            rest = by_stretch.without(g)
-            delta = _estimate(rest, noise, power) if estimate is None else estimate
-            errors.append(judged.of(g).error(delta, rest.friction(delta)) / noise**2)
-        return torch.stack(errors)
+    def compared(estimate: Estimate) -> Tensor:
+        """Held-out errors in units of the noise."""
+        return held_out(by_stretch, estimate, judged) / noise**2
 
     nothing, drives = torch.zeros_like(mean), _drives_alone(every, noise, n)
-    known = min(compared(nothing), compared(drives), key=lambda error: float(error.mean()))
-    if not _is_better(compared(None), known):
+    known = min(
+        (compared(lambda _, x=x: x) for x in (nothing, drives)), key=lambda error: float(error.mean())
+    )
+    if not _is_better(compared(lambda rest: _estimate(rest, noise, power)), known):
         return None
     driven = robot.replace(armature=robot.armature + size * mean[:n])
     _, precision = _normal(every, noise, power)
@@ -111,7 +109,8 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
         acceleration_errors(rows, by_stretch, C, delta, mass_matrix(each, rows.q))
         for each, delta in ((robot, nothing), (consistent, found))
     )
-    return consistent if _is_better(compared(found), known) and is_harmless(after, before) else None
+    better = _is_better(compared(lambda _: found), known)
+    return consistent if better and is_harmless(after, before) else None
 
 
 def _power(rows: Rows, left: Tensor) -> float:
@@ -120,7 +119,7 @@ def _power(rows: Rows, left: Tensor) -> float:
     return min(1.0, math.exp(-float(times.log().mean())))
 
 
-def _normal(given: Sums, noise: Tensor, power: float) -> tuple[Tensor, Tensor]:
+def _normal(given: NormalEquations, noise: Tensor, power: float) -> tuple[Tensor, Tensor]:
     """Linear term κ h and precision κ H + 1 of the unknowns, without directions in which H is negative."""
     H, h = given.quadratic(noise)
     values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
@@ -129,7 +128,7 @@ def _normal(given: Sums, noise: Tensor, power: float) -> tuple[Tensor, Tensor]:
     return power * shown @ (vectors.mT @ h), precision + torch.eye(len(h), dtype=h.dtype, device=h.device)
 
 
-def _estimate(given: Sums, noise: Tensor, power: float) -> Tensor:
+def _estimate(given: NormalEquations, noise: Tensor, power: float) -> Tensor:
     """Most probable unknowns, of which the first n, the drives, are not negative."""
     h, precision = _normal(given, noise, power)
     n = len(noise)
@@ -138,7 +137,7 @@ def _estimate(given: Sums, noise: Tensor, power: float) -> Tensor:
     return torch.cat([drives, links])
 
 
-def _drives_alone(every: Sums, noise: Tensor, n: int) -> Tensor:
+def _drives_alone(every: NormalEquations, noise: Tensor, n: int) -> Tensor:
     """The unknowns with the inertia of drives alone, which is not negative."""
     H, h = every.quadratic(noise)
     drives = torch.linalg.lstsq(H[:n, :n], h[:n, None]).solution[:, 0].clamp(min=0.0)
@@ -241,13 +240,13 @@ def _lacking(rows: Rows, M: Tensor) -> Tensor:
     return found if is_harmless(after, before) else none
 
 
-def _noise(every: Sums) -> Tensor:
+def _noise(every: NormalEquations) -> Tensor:
     """Root mean square of the torque that the file and friction leave `(nq,)`."""
     none = every.gram.new_zeros(every.unknowns)
     return every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
 
 
-def _excess(rows: Rows, every: Sums, M: Tensor, armature: Tensor) -> float:
+def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> float:
     """Logarithm of the squared acceleration error over that of the mean acceleration, mean of the joints."""
     friction = every.friction(armature)
     left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
@@ -283,7 +282,7 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
     return found
 
 
-def _drives(given: Sums, noise: Tensor, M: Tensor, weight: float) -> Tensor:
+def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> Tensor:
     """a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a|, both over all samples."""
     H, h = given.quadratic(noise)
     n, M = float(given.count.max()), M[:: max(1, len(M) // VOLUME_STATES)]

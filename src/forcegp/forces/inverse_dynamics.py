@@ -86,7 +86,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Sums:
+class NormalEquations:
     """Σ ZᵀX `(..., nq, p + f, p + f)`, Σ Zᵀr, Σ r² and the numbers of samples, by joint.
 
     X = (C, Φ), and Z = X or (C′, Φ) with instruments. In sums of products r², XᵀX and Xᵀr are r r′,
@@ -99,20 +99,22 @@ class Sums:
     count: Tensor
     unknowns: int
 
-    def total(self) -> Sums:
+    def total(self) -> NormalEquations:
         """Over all stretches."""
         return self._each(lambda x: x.sum(0))
 
-    def of(self, g: int) -> Sums:
+    def of(self, g: int) -> NormalEquations:
         """One stretch."""
         return self._each(lambda x: x[g])
 
-    def without(self, g: int) -> Sums:
+    def without(self, g: int) -> NormalEquations:
         """All stretches but one."""
         return self._each(lambda x: x.sum(0) - x[g])
 
-    def _each(self, part: Callable[[Tensor], Tensor]) -> Sums:
-        return Sums(part(self.gram), part(self.right), part(self.square), part(self.count), self.unknowns)
+    def _each(self, part: Callable[[Tensor], Tensor]) -> NormalEquations:
+        return NormalEquations(
+            part(self.gram), part(self.right), part(self.square), part(self.count), self.unknowns
+        )
 
     def friction(self, delta: Tensor) -> Tensor:
         """w `(nq, f)` that explains what δ leaves."""
@@ -143,7 +145,7 @@ class Sums:
         return (self.square - fitted) / self.count
 
 
-Estimate = Callable[[Sums], Tensor]
+Estimate = Callable[[NormalEquations], Tensor]
 """δ from sums."""
 
 
@@ -262,21 +264,21 @@ def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
     return moving | ~sticks
 
 
-def sums(rows: Rows, columns: Tensor) -> Sums:
-    """Sums by stretch, with C `(n, nq, p)`."""
+def sums(rows: Rows, columns: Tensor) -> NormalEquations:
+    """NormalEquations by stretch, with C `(n, nq, p)`."""
     X, r = _equations(rows, columns)
     return _by_stretch(rows, X, X, r, r)
 
 
-def instrumental(rows: Rows, columns: Tensor) -> Sums:
+def instrumental(rows: Rows, columns: Tensor) -> NormalEquations:
     """The same with the columns of partners as instruments; velocities, and so friction, are precise."""
     X, r = _equations(rows, columns, paired=True)
     p = columns.shape[-1]
     return _by_stretch(rows, torch.cat([X[rows.partner][..., :p], X[..., p:]], dim=-1), X, r, r)
 
 
-def products(rows: Rows, columns: Tensor) -> Sums:
-    """Sums of products with the partners."""
+def products(rows: Rows, columns: Tensor) -> NormalEquations:
+    """NormalEquations of products with the partners."""
     X, r = _equations(rows, columns, paired=True)
     return _by_stretch(rows, X[rows.partner], X, r[rows.partner], r)
 
@@ -288,7 +290,7 @@ def _equations(rows: Rows, columns: Tensor, paired: bool = False) -> tuple[Tenso
     return X * slides[..., None], rows.residual * slides
 
 
-def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> Sums:
+def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> NormalEquations:
     """Σ ZᵀX, Σ Zᵀr and Σ s r; X holds a column of ones, which is zero for what does not count."""
     groups = []
     for g in range(int(rows.group.max()) + 1):
@@ -298,20 +300,30 @@ def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> Sums:
         right = (z.mT @ r[inside].mT[..., None])[..., 0]
         groups.append((z.mT @ x, right, (s[inside] * r[inside]).sum(0), count))
     gram, right, square, count = (torch.stack(parts) for parts in zip(*groups, strict=True))
-    return Sums(gram, right, square, count, X.shape[-1] - rows.friction.shape[-1])
+    return NormalEquations(gram, right, square, count, X.shape[-1] - rows.friction.shape[-1])
 
 
-def held_out(by_stretch: Sums, estimate: Estimate) -> Tensor:
-    """Mean squares of torque errors on stretches that neither δ nor friction have seen, `(groups, nq)`."""
+def held_out(
+    by_stretch: NormalEquations, estimate: Estimate, judged: NormalEquations | None = None
+) -> Tensor:
+    """Mean squares of torque errors on stretches that neither δ nor friction have seen, `(groups, nq)`.
+
+    Args:
+        by_stretch: what is estimated from.
+        estimate: δ from all stretches but one.
+        judged: what errors are computed from, such as `products`; by default the same.
+    """
     errors = []
     for g in range(len(by_stretch.gram)):
         rest = by_stretch.without(g)
         delta = estimate(rest)
-        errors.append(by_stretch.of(g).error(delta, rest.friction(delta)))
+        errors.append((judged or by_stretch).of(g).error(delta, rest.friction(delta)))
     return torch.stack(errors)
 
 
-def acceleration_errors(rows: Rows, by_stretch: Sums, columns: Tensor, delta: Tensor, M: Tensor) -> Tensor:
+def acceleration_errors(
+    rows: Rows, by_stretch: NormalEquations, columns: Tensor, delta: Tensor, M: Tensor
+) -> Tensor:
     """Mean squares of acceleration errors at δ on stretches that friction has not seen, `(groups, nq)`.
 
     Args:

@@ -28,7 +28,7 @@ from forcegp.forces.priors.base import JOINT, ForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.gp.optimise import LearningOptions, minimise
-from forcegp.identification import PARAMETER_NAMES, regressor
+from forcegp.identification import MASS_SHARE, MOMENT_ARM, PARAMETER_NAMES, regressor
 from forcegp.robot.inertia import (
     from_log_cholesky,
     from_pseudo_inertia,
@@ -62,8 +62,8 @@ class InertialPrior(ForcePrior):
         20
     """
 
-    mass: float = 0.3
-    length: float = 0.1
+    mass: float = MASS_SHARE
+    length: float = MOMENT_ARM
     inertia: float = 0.15
     kernel: Kernel = field(default_factory=lambda: Constant(group=PER_LINK))
     name: str = "inertial"
