@@ -1,21 +1,17 @@
 """Which inertia a measured robot has: that of its file, with drives that the file lacks, or another one.
 
-Stretches of the log that an estimate has not seen say whether it predicts torques better than the file
-(`inverse_dynamics.py`). Where other inertial parameters of the links do, the robot gets them (`links.py`).
+Held-out stretches of the log say whether an estimate predicts torques better than the file
+(`inverse_dynamics.py`). Least squares make inertia too small where accelerations are noisy, and the
+likelihood of accelerations given torques makes it too large where the torque is noisy and a controller chose
+the motion. The equations of motion a little earlier and later are instruments that neither disturbs. The
+unknowns are Gaussian around the robot file, each link stays physically consistent, and the inertia of a drive
+is not negative.
 
 Torques do not settle everything. In a closed loop the noise of the torque sensor exceeds the torque
 that accelerates a light joint; divided by the inertia of the file it predicts accelerations that are larger
 than all that were measured. Where that is so, the drives get the inertia that maximises
 −½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
 mean, as long as the error of no joint's torque on held-out stretches grows by more than 2 %.
-
-Inertial parameters of the links, with the inertia of drives, that a log in free motion determines.
-
-Least squares make inertia too small where accelerations are noisy. The likelihood of accelerations given
-torques makes it too large where the torque is noisy and a controller chose the motion. Here the equations of
-motion a little earlier and later are the instruments (`inverse_dynamics.py`), which neither disturbs. The
-unknowns are Gaussian around the robot file, each link stays physically consistent, and the inertia of a drive
-is not negative.
 
 Where a caller asks for an `InertialPrior` itself, the robot moves to the posterior mean of its inertial
 parameters: one Gauss–Newton step, physically consistent.

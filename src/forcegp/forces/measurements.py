@@ -1,9 +1,7 @@
-"""Values of quantities at states, and all that a posterior is conditioned on.
+"""Values of quantities at states, all that a posterior is conditioned on, and which samples are impacts.
 
-Samples in contact whose measured acceleration does not keep to the surface: impacts, wrong flags.
-
-In contact A q̈ = b. Where a measurement departs from it by far more than the usual noise, the multiplier is
-not that of a contact that persists, and the other directions of q̈ are wrong with it.
+In contact A q̈ = b. Where a measurement departs from it by far more than the usual noise (an impact, a wrong
+flag), the multiplier is not that of a contact that persists, and the other directions of q̈ are wrong with it.
 """
 
 from __future__ import annotations

@@ -1,21 +1,16 @@
-"""The noise of what a log measures, as a model states it: accelerations, motor torques, and the state.
+"""The noise of what a log measures: accelerations, motor torques, and the state.
 
-Unknown torques that are no function of the state: noise of the sensor, sticking, and what lies beyond
-the trained region.
+**Torques that are no function of the state.** Inside its static friction, the friction of a joint is whatever
+balances the other forces. A joint that hardly moves therefore has an unknown force of variance
+σ_s² e^{−(q̇/v_s)²} more. And noise learned where nothing moves says little about a jump: beyond the range of
+speeds and torques that a joint was trained on, its force has a standard deviation g D more, with D the
+distance from that range in training standard deviations. `calibration.growth` estimates g.
 
-Inside its static friction, the friction of a joint is whatever balances the other forces, and no function of
-its velocity. A joint that hardly moves therefore has an unknown force of variance σ_s² e^{−(q̇/v_s)²} more.
-
-Noise learned where nothing moves says little about a jump. Beyond the range of speeds and torques that a
-joint was trained on, its force has a standard deviation g D more, with D the distance from that range in
-training standard deviations. `calibration.growth` estimates g.
-
-Noise of the measured state, carried to measured quantities to first order.
-
-At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts z(x + δ) ≈ z(x) + G δ, so a sample's rows
-have the noise G Σ_x Gᵀ more, with G = ∂z/∂(q, q̇) (McHutchon and Rasmussen, *Gaussian process training with
-input noise*, 2011). G is that of the robot file's equations of motion under the measured torque, or, once
-forces have been learned, that of q̈ = L b + H F̄ with their posterior mean F̄ (`forces/noise_learning.py`).
+**Noise of the state**, to first order. At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts
+z(x + δ) ≈ z(x) + G δ, so a sample's rows have the noise G Σ_x Gᵀ more, with G = ∂z/∂(q, q̇) (McHutchon and
+Rasmussen, *Gaussian process training with input noise*, 2011). G is that of the robot file's equations of
+motion under the measured torque, or, once forces have been learned, that of q̈ = L b + H F̄ with their
+posterior mean F̄ (`forces/noise_learning.py`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""Gaussian-process priors on unknown forces.
+"""Gaussian-process priors on unknown forces: where a force acts, on what it depends, and how it varies.
 
-A prior says where a force acts, on what it depends and how it varies.
-
-A prior on any force, carried by an operator of the user.
+`OperatorForcePrior` is a prior on any force, carried by an operator of the user.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Priors on the tangential force at a contact with a surface, whose inputs are those of the surface.
+"""Priors on the force at a contact with a surface: along it, or against it, which no acceleration shows.
 
 What touches knows no world axes: vectors along the surface have two coordinates in a tangent frame that turns
 with the surface. The frame at normal n is (R e_x, R e_y), with the smallest rotation R that takes e_z to n.
@@ -8,8 +8,6 @@ Friction proportional to the normal force couples force and multiplier. With one
 g = Lᵀ u, the equations λ = λ_K − Lᵀ Q_z and Q_z = μ λ u have the solution λ = λ_K / (1 + μ g), where λ_K is
 the multiplier without friction. A latent function must enter the force linearly, and μ does not: the operator
 is the secant at a given μ̂, u λ_K / (1 + μ̂ g).
-
-A prior on the part of the joint force along the constraint, which no acceleration shows.
 """
 
 from __future__ import annotations

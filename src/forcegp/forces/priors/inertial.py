@@ -1,15 +1,11 @@
-"""A Gaussian prior on the errors of the robot file's inertial parameters, marginalised in closed form.
+"""Gaussian priors on errors of inertial parameters and on a payload, marginalised in closed form.
 
 Inverse dynamics is linear in the inertial parameters π: with π = π₀ + δ, M₀ q̈ − Q_C,0 − Q_G,0 + Y(q, q̇,
 q̈) δ = Q is an identity at the measured acceleration. So δ acts like a joint force −Y δ with a constant
 latent δ ~ N(0, S²), and least-squares identification with a ridge towards the file is a special case. A
 prediction takes the robot with the updated parameters; what remains uncertain acts through Y at the
-predicted acceleration.
-
-A mass that is attached to a link: an unknown payload, marginalised in closed form.
-
-Its equations of motion are linear in its mass and first moment, so it acts like a joint force −Y_k δ with
-constant δ and the columns Y_k of the regressor that belong to the link (Atkeson, An, Hollerbach 1986).
+predicted acceleration. An unknown mass that is attached to a link is the same with the columns Y_k of that
+link for its mass and first moment (Atkeson, An, Hollerbach 1986).
 """
 
 from __future__ import annotations

@@ -1,23 +1,14 @@
-"""What is known of the joint force Q before data: its mean from the robot file, and one process per joint.
+"""What is known of the joint force Q before data: its mean from the robot file, and priors on the rest.
 
-A prior on the friction of each joint, a function of its own velocity, and on the offset of its torque
-sensor.
-
-Friction that no robot file declares is the rule: viscous, Coulomb, a transition between the two (Stribeck),
-and a part that grows with the load on the bearing. Each joint reads only its own velocity, so the prior
-extrapolates to
-motions in which other joints do something new, and it never reads τ: in a closed loop the likeliest force
-would be the one that cancels the noise of the torque sensor.
-
-A prior on torques that are correlated in time and no function of the state.
-
-Temperature, hysteresis and filters leave residuals that last for a while and are another time different. A
-function of the state would take them for signal, white noise for more evidence than there is.
-
-A prior on joint forces that are correlated with each other.
-
-One cause moves several joints: a cable, a payload, a contact that the scene does not have. Independent
-processes must learn such a force once per joint.
+- `JointForcePrior`: any force, one process per joint.
+- `JointFrictionPrior`: friction that no robot file declares (viscous, Coulomb, a transition between the two,
+  a part that grows with the load) and the offset of the torque sensor. Each joint reads only its own
+  velocity, so the prior extrapolates to motions in which other joints do something new. It never reads τ: in
+  a closed loop the likeliest force would be the one that cancels the noise of the torque sensor.
+- `DisturbancePrior`: torques that last for a while and are another time different (temperature, hysteresis).
+  A function of the state would take them for signal, white noise for more evidence than there is.
+- `CoregionalPrior`: one cause that moves several joints, such as a cable or a contact that the scene lacks;
+  independent processes must learn such a force once per joint.
 """
 
 from __future__ import annotations
