@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -60,3 +61,20 @@ def test_what_cannot_be_updated() -> None:
         sparse.forget(0.0)
     with pytest.raises(ModelError, match="measures other quantities"):
         sparse.update([forcegp.Observation(data[:2], "multiplier", 1.0)])
+
+
+@pytest.mark.parametrize("inference", ["sparse", "exact"])
+def test_samples_at_rest_change_no_fit_of_a_measured_robot(inference: str) -> None:
+    """However few samples an update brings, those at rest only say that friction is below a limit."""
+    spec = forcegp.StructuredGP(
+        two_contacts(), "analytical", [JointFrictionPrior()], noise=0.1, inference=inference
+    )
+    fit = spec.fit(data, learn=[])
+    still = dataclasses.replace(data[:3], qd=0.0 * data.qd[:3])
+    assert fit.update(still) is fit
+    both = forcegp.Dataset.concatenate([still, data[3:5]])
+    q, qd, tau = draw(5, seed=3)
+    one, other = (fit.update(new).predict(q, qd, tau, active=mixed_contacts(5)) for new in (both, data[3:5]))
+    torch.testing.assert_close(one.mean, other.mean, rtol=SAME, atol=SAME)
+    if inference == "sparse":
+        assert fit.forget(still) is fit

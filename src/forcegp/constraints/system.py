@@ -57,7 +57,7 @@ class Baumgarte:
                 )
 
     def stabilized(self, b: ConstraintVector, c: ConstraintVector, cd: ConstraintVector) -> ConstraintVector:
-        """b̃ = b − 2ωξ ċ − ω² c, `(*batch, m)`."""
+        """b̃ = b − 2ωξ ċ − ω² c, `(*batch, m)` (eq. 30, with its signs corrected)."""
         omega = self.natural_frequency
         return b - 2.0 * omega * self.damping_ratio * cd - omega**2 * c
 

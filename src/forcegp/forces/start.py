@@ -310,7 +310,7 @@ class Search:
         return {**self.held, **learned.tensors}
 
     def objective(self, problem: Problem, tensors: Tensors) -> Tensor:
-        """Negative log posterior: the likelihood of the rows, and weak priors around the start if any."""
+        """−κ log p(y | θ) − log p(θ): exact or its bound, and weak priors around the start if any."""
         hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL + ".")}
         weak = negative_log_prior(hyper, self.start) if self.options.hyperpriors else 0.0
         rows = problem.rows_for(tensors, self.held)

@@ -1,0 +1,1 @@
+"""Gaussian processes of latent components: kernels, likelihoods, exact and sparse posteriors, draws."""

@@ -1,4 +1,4 @@
-"""Exact marginal likelihood of whitened rows, with its gradient in closed form (eqs. 10 and 11).
+"""The covariance of whitened rows (eq. 10) and their exact likelihood, with its gradient in closed form.
 
 A block holds `n` samples with `r` rows each. Between two samples the covariance of their rows is
 Σ_k W[i,:,k] k_k(x_i, x_j) W[j,:,k]ᵀ, summed over the components k of every prior: the block-by-block
@@ -83,7 +83,7 @@ def cross_gram(
     blocks1: Sequence[Block],
     blocks2: Sequence[Block] | None = None,
 ) -> Tensor:
-    """Covariance between the rows of two lists of blocks, `(rows1, rows2)`.
+    """Covariance between the rows of two lists of blocks, `(rows1, rows2)` (eqs. 10, 13 and 19).
 
     Without a second list it is that of the first with itself, of which the lower triangle is valid.
     """

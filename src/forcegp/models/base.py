@@ -1,6 +1,6 @@
 """Models of the forward dynamics: a specification, and the fitted model that predicts.
 
-Fitted models of accelerations alone, which know neither contacts nor forces.
+`AccelerationFit` is that of models of accelerations alone, which know neither contacts nor forces.
 """
 
 from __future__ import annotations

@@ -197,13 +197,15 @@ class StructuredFit(FittedModel):
         Raises:
             ModelError: the data measure something else.
         """
-        measurements, _ = training_for(self.specification, self.problem, data, learned=())
+        measurements, _ = training_for(self.specification, self.problem, data, learned=(), fewest=0)
         if measurements.quantities != tuple(self.noise):
             raise ModelError(
                 "an update measures other quantities than the fit",
                 expected=", ".join(self.noise),
                 got=", ".join(measurements.quantities),
             )
+        if not measurements.samples:
+            return self
         measurements = self._with_slopes(measurements)
         problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
@@ -244,7 +246,9 @@ class StructuredFit(FittedModel):
         """
         latent = _sparse(self.posterior)
         if not isinstance(what, int | float):
-            without, _ = training_for(self.specification, self.problem, what, learned=())
+            without, _ = training_for(self.specification, self.problem, what, learned=(), fewest=0)
+            if not without.samples:
+                return self
             return self._with(latent.without(self._problem_of(without).rows(self.hyperparameters).blocks))
         factor = float(what)
         if priors is not None:

@@ -1,6 +1,8 @@
 """Gaussian-process priors on forces, carried to accelerations and multipliers by the known mechanics.
 
-q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and likewise for every other quantity (eqs. 19 to 25).
+q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and likewise for every other quantity (eqs. 19 to 25). `fit` learns
+(`structured_learning.solve`) and conditions (`structured_fit.conditioned`); the posterior covariance of
+equation 10 is made of `gram` in `gp/likelihood.py`.
 """
 
 from __future__ import annotations

@@ -145,10 +145,12 @@ def training_for(
     before: Problem | None,
     data: Dataset | Sequence[Observation],
     learned: Sequence[str] | None,
+    fewest: int = FEWEST_MOVING,
 ) -> tuple[Training, tuple[str, ...]]:
     """What is learned from, with doubts about it.
 
-    Priors that are not learned (`None`: all are) keep the scales of their inputs.
+    Priors that are not learned (`None`: all are) keep the scales of their inputs. With fewer samples in
+    motion than `fewest`, those at rest are kept.
     """
     kept = {}
     if before is not None and learned is not None:
@@ -157,7 +159,7 @@ def training_for(
     training = training_of(
         data, spec.system, spec.priors, spec.noise.acceleration, kept, spec.options.standardize
     )
-    return in_motion(spec.system, training) if spec.noise.learns_torque else (training, ())
+    return in_motion(spec.system, training, fewest) if spec.noise.learns_torque else (training, ())
 
 
 def check_learned(spec: Specification, learn: Iterable[str]) -> None:
@@ -198,10 +200,12 @@ def search_of(
     return Search({key: value for key, value in start.items() if key not in held}, held, options)
 
 
-def in_motion(system: ConstrainedSystem, training: Training) -> tuple[Training, tuple[str, ...]]:
+def in_motion(
+    system: ConstrainedSystem, training: Training, fewest: int = FEWEST_MOVING
+) -> tuple[Training, tuple[str, ...]]:
     """The samples in motion, without impacts, and doubts about them."""
     moving = training.moving(REST_SPEED)
-    if moving.samples < FEWEST_MOVING:
+    if moving.samples < fewest:
         return training, (
             f"only {moving.samples} samples are in motion: friction cannot be told from noise at rest",
         )

@@ -1,1 +1,1 @@
-"""Models and systems as folders of versioned JSON and safetensors."""
+"""Models and systems in files: safetensors with a versioned header, TOML and JSON."""

@@ -2,9 +2,7 @@
 
 The hash is the SHA-256 of the file with 64 zeros in the place of the hash, so that no bit of header or
 tensors changes unnoticed. The file is put in its place by one `os.replace`: a reader sees the old model or
-the new one.
-
-What every tensor in a saved model must be, checked once, when the file is read.
+the new one. What every tensor must be is checked once, when the file is read.
 """
 
 from __future__ import annotations

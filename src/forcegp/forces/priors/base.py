@@ -35,7 +35,8 @@ class ForcePrior(ABC):
     """A zero-mean prior on an unknown force f(x), carried to generalized forces by a known operator E(x).
 
     The generalized force is E(x) f(x); `target` says whether it is part of Q, of Q_z, or of Q along the
-    constraint.
+    constraint. A subclass has a `name`, a `kernel` and a `target`, and implements `outputs`, `features` and
+    `operator`; a saved model knows the classes among `CLASSES` in `models/structured_spec.py`.
     """
 
     name: str
