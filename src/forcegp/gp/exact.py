@@ -184,7 +184,7 @@ class ExactPosterior:
         return 0.5 * (covariance + covariance.mT)
 
     def _cross(self, new: Block) -> Tensor:
-        """Covariance of the rows of another block with those of the data (eqs. 10, 19), `(new rows, rows)`."""
+        """Covariance of the rows of another block with those of the data, `(new, rows)` (eqs. 10 and 19)."""
         starts = offsets(self.blocks)
         cross = new.target.new_zeros(new.rows, starts[-1])
         for p, W in enumerate(new.operators):
