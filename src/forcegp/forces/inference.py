@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import ModelError
 from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
@@ -118,20 +118,8 @@ def posterior_of(
     return ForcePosterior(problem.process_at(hyperparameters), latent)
 
 
-METHODS = ("auto", "exact", "sparse")
 EXACT_SAMPLES = 1000
 """Samples up to which inference is exact by default."""
-
-
-def check_method(inference: str) -> str:
-    """The name of a method of inference.
-
-    Raises:
-        UnknownNameError: no such method.
-    """
-    if inference not in METHODS:
-        raise UnknownNameError("inference", inference, METHODS)
-    return inference
 
 
 def require_double(system: ConstrainedSystem) -> None:

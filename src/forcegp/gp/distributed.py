@@ -8,7 +8,6 @@ Each process holds its own samples; the inducing points and hyperparameters must
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 
 import torch
 import torch.distributed as dist
@@ -16,12 +15,10 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.features import Block, Features
+from forcegp.gp.factor import Spectrum
+from forcegp.gp.features import Features
 from forcegp.gp.kernels import Parameters
-from forcegp.gp.sums import CHUNK_SAMPLES, Sums, accumulate
-
-Group = dist.ProcessGroup | None
-"""The processes that take part; all of them where it is `None`."""
+from forcegp.gp.sums import Sums
 
 
 def shard(samples: int, rank: int, processes: int) -> slice:
@@ -41,80 +38,53 @@ def shard(samples: int, rank: int, processes: int) -> slice:
     return slice(first, first + size + (rank < more))
 
 
-def reduce_sums(sums: Sums, group: Group = None) -> Sums:
-    """The sums of all processes added, the same in each of them."""
-    flat = add_over_processes(torch.cat([part.reshape(-1) for part in sums.tensors]), group)
-    pieces = flat.split([part.numel() for part in sums.tensors])
-    return Sums(*(new.reshape(old.shape) for new, old in zip(pieces, sums.tensors, strict=True)))
+def reduce_sums(sums: Sums) -> Sums:
+    """The sums of all processes added, the same in each of them.
 
-
-def add_over_processes(x: Tensor, group: Group = None) -> Tensor:
-    """The tensors of all processes added, the same in each of them."""
-    _require_processes()
-    total = x.detach().clone()
-    dist.all_reduce(total, op=dist.ReduceOp.SUM, group=group)
-    return total
-
-
-def accumulate_shards(
-    basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_SAMPLES, group: Group = None
-) -> Sums:
-    """Sum over the samples of all processes, each of which gives its own.
-
-    The basis must be that of `share_basis`, or computed by each process on equal hardware: eigenvectors
-    are defined up to sign and rotation.
-
-    Args:
-        basis: basis functions.
-        blocks: whitened rows of this process.
-        chunk: samples whose basis functions are held at a time.
-        group: the processes that take part.
+    All must use the basis of `share_basis`: eigenvectors are defined up to sign and rotation.
 
     Raises:
         ModelError: no group of processes has been initialised.
     """
-    return reduce_sums(accumulate(basis, blocks, chunk), group)
+    flat = add_over_processes(torch.cat([part.reshape(-1) for part in sums.tensors]))
+    pieces = flat.split([part.numel() for part in sums.tensors])
+    return Sums(*(new.reshape(old.shape) for new, old in zip(pieces, sums.tensors, strict=True)))
 
 
-def share_basis(basis: LatentBasis, source: int = 0, group: Group = None) -> LatentBasis:
-    """The basis of one process in all of them, which must hold one of the same shapes.
+def add_over_processes(x: Tensor) -> Tensor:
+    """The tensors of all processes added, the same in each of them."""
+    _require_processes()
+    total = x.detach().clone()
+    dist.all_reduce(total, op=dist.ReduceOp.SUM)
+    return total
 
-    Args:
-        basis: with the same processes and number of inducing points in every process.
-        source: whose hyperparameters, inducing points and eigenvectors are taken.
-        group: the processes that take part.
+
+def share_basis(basis: LatentBasis) -> LatentBasis:
+    """The basis of the first process in all of them, which must hold one of the same shapes.
 
     Raises:
         ModelError: no group of processes has been initialised.
     """
     _require_processes()
     dropped = [s.dropped for part in basis.parts for s in part.spectra]
-    counts = iter(_broadcast(torch.tensor(dropped), source, group).tolist())
+    counts = iter(_broadcast(torch.tensor(dropped)).tolist())
     parts = []
     for part in basis.parts:
         spectra = tuple(
-            dataclasses.replace(
-                s,
-                values=_broadcast(s.values, source, group),
-                vectors=_broadcast(s.vectors, source, group),
-                dropped=next(counts),
-            )
-            for s in part.spectra
+            Spectrum(_broadcast(s.values), _broadcast(s.vectors), next(counts)) for s in part.spectra
         )
-        params, Z = (share_tensors(named, source, group) for named in (part.params, part.inducing))
+        params, Z = _shared(part.params), _shared(part.inducing)
         parts.append(dataclasses.replace(part, params=params, inducing=Z, spectra=spectra))
-    return LatentBasis(basis.processes, share_tensors(basis.params, source, group), tuple(parts))
+    return LatentBasis(basis.processes, _shared(basis.params), tuple(parts))
 
 
-def share_tensors(tensors: Parameters | Features, source: int = 0, group: Group = None) -> dict[str, Tensor]:
-    """Named tensors of one process in all of them, which must hold some of the same shapes."""
-    _require_processes()
-    return {key: _broadcast(tensors[key], source, group) for key in sorted(tensors)}
+def _shared(tensors: Parameters | Features) -> dict[str, Tensor]:
+    return {key: _broadcast(tensors[key]) for key in sorted(tensors)}
 
 
-def _broadcast(x: Tensor, source: int, group: Group) -> Tensor:
+def _broadcast(x: Tensor) -> Tensor:
     copy = x.detach().clone(memory_format=torch.contiguous_format)
-    dist.broadcast(copy, src=source, group=group)
+    dist.broadcast(copy, src=0)
     return copy
 
 
