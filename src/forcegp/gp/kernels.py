@@ -94,10 +94,10 @@ class Kernel(ABC):
         return Product(self, other)
 
 
-def _sides(left: Initial, right: Initial) -> Initial:
+def sides(left: Parameters, right: Parameters) -> Initial:
     """The hyperparameters of two kernels in one dictionary."""
-    sides = {"left": left, "right": right}
-    return {f"{side}.{key}": value for side, part in sides.items() for key, value in part.items()}
+    parts = (("left", left), ("right", right))
+    return {f"{side}.{key}": value for side, part in parts for key, value in part.items()}
 
 
 def width_of(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
@@ -306,7 +306,7 @@ class Sum(Kernel):
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         half = log_std - 0.5 * math.log(2.0)
-        return _sides(self.left.initial(outputs, widths, half), self.right.initial(outputs, widths, half))
+        return sides(self.left.initial(outputs, widths, half), self.right.initial(outputs, widths, half))
 
     @staticmethod
     def combined(left: Tensor, right: Tensor) -> Tensor:
@@ -336,7 +336,7 @@ class Product(Sum):
     """k = k_1 k_2; the second factor starts at unit size."""
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
-        return _sides(self.left.initial(outputs, widths, log_std), self.right.initial(outputs, widths))
+        return sides(self.left.initial(outputs, widths, log_std), self.right.initial(outputs, widths))
 
     @staticmethod
     def combined(left: Tensor, right: Tensor) -> Tensor:
@@ -350,7 +350,7 @@ class Product(Sum):
             if isinstance(inner, Sum) and not isinstance(inner, Product):
                 terms = (
                     Product(getattr(inner, part), getattr(self, other)).draw(
-                        _sides(sub(params, f"{side}.{part}"), sub(params, other)), x, features, generator
+                        sides(sub(params, f"{side}.{part}"), sub(params, other)), x, features, generator
                     )
                     for part in ("left", "right")
                 )
