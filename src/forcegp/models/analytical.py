@@ -20,18 +20,16 @@ from forcegp.forces.measurements import Measurement
 from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import affine_maps, flat_states, states
-from forcegp.gp.optimise import Learned, LearningOptions, minimise
+from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, FittedModel, ForceField, Model, Prediction
 from forcegp.models.fit_result import FitResult
-from forcegp.models.minibatch import BatchOptions, Loss, train
+from forcegp.models.minibatch import BatchOptions, train
 from forcegp.robot.parameters import AnalyticalParameters
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from forcegp.storage.model_file import ModelHeader, settings_of
 from forcegp.storage.options import Settings
 from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
 
 KIND = "analytical"
-Tensors = dict[str, Tensor]
 LearnedParameters = Mapping[str, Sequence[str] | Literal["all"]]
 EVERY_LINK: LearnedParameters = {"inertia": "all", "damping": "all"}
 """Mass, centre of mass and rotational inertia of every link, and the viscous friction of every joint."""
@@ -129,7 +127,6 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         Raises:
             ModelError, DataError: the data do not fit the model.
         """
-        options = options or ADAM
         measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system)
         generator, width = torch.Generator().manual_seed(self.seed), self.window
         theta = AnalyticalParameters(self.parameters.start, self.parameters.joints)
@@ -141,14 +138,8 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             return _mean_squared_error(self.system.with_robot(robot), measured, rows)
 
         record, robot = pack_system(self.system)
-        begin = (part for pair in start.items() for part in pair)
-        key = (options, self.seed, record, *robot.values(), *measured.tensors, *begin)
-        if isinstance(options, BatchOptions):
-            saved = None if checkpoint is None else Checkpoint(Path(checkpoint), Checkpoint.key_of(*key))
-            learned = train(loss, start, len(measured.q), options, generator, progress, saved)
-        else:
-            evaluations = Evaluations.resumed(checkpoint, start, *key)
-            learned = _minimise(loss, start, len(measured.q), options, progress, evaluations)
+        key = (self.seed, record, *robot.values(), *measured.tensors)
+        learned = train(loss, start, len(measured.q), options or ADAM, generator, progress, checkpoint, key)
         theta.load_state_dict(learned.tensors)
         with torch.no_grad():
             system = self.system.with_robot(theta())
@@ -249,29 +240,6 @@ class AnalyticalFit(FittedModel):
         )
         start = {f"start.{name}": getattr(theta.start, name) for name in robot_tensors(theta.start)}
         return settings, dict(theta.state_dict()) | start
-
-
-def _minimise(
-    loss: Loss,
-    start: dict[str, Tensor],
-    samples: int,
-    options: LearningOptions,
-    progress: FitProgress | None,
-    saved: Evaluations,
-) -> Learned:
-    """Minimise over all samples at once."""
-    rows = torch.arange(samples, device=next(iter(start.values())).device)
-
-    def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
-        if progress is not None:
-            progress(evaluations, options.max_evaluations, value)
-
-    def objective(tensors: Tensors) -> Tensor:
-        return loss(tensors, rows)
-
-    learned = minimise(saved.recorded(objective), start, options, progress=report)
-    saved.write()
-    return learned
 
 
 def _mean_squared_error(system: ConstrainedSystem, measured: Measurement, rows: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.quantities import FlatStates, ForceLinearization, flat_states, linearize_field
+from forcegp.gp.optimise import Progress
 from forcegp.models.fit_result import HasResult, fit_table, model_line
 from forcegp.models.prediction import Prediction
 from forcegp.rollout.forward import rollout_model
@@ -34,6 +35,13 @@ if TYPE_CHECKING:
 
 FitProgress = Callable[[int, int, float], None]
 """Called with the number of evaluations, their maximum, and the objective."""
+
+
+def reported(progress: FitProgress | None, most: int, before: int = 0) -> Progress | None:
+    """The progress of an optimisation of at most so many evaluations, after those `before`."""
+    if progress is None:
+        return None
+    return lambda evaluations, value, _: progress(before + evaluations, most, value)
 
 
 class Predictor(ABC):

@@ -27,7 +27,7 @@ from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
-from forcegp.models.base import AccelerationFit, FitProgress, Model
+from forcegp.models.base import AccelerationFit, FitProgress, Model, reported
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
 from forcegp.storage.checkpoint import Evaluations
@@ -152,11 +152,7 @@ class IndependentGP(Model["IndependentFit"]):
         parts: list[Learned] = []
         for joint, prior in enumerate(priors):
             before = sum(part.evaluations for part in parts)
-
-            def report(evaluations: int, value: float, _: dict[str, Tensor], before: int = before) -> None:
-                if progress is not None:
-                    progress(before + evaluations, options.max_evaluations * len(priors), value)
-
+            report = reported(progress, options.max_evaluations * len(priors), before)
             parts.append(_learn(training, prior, joint, options, report, saved))
         saved.write()
         hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
@@ -178,7 +174,7 @@ def _learn(
     prior: JointForcePrior,
     joint: int,
     options: LearningOptions,
-    report: Progress,
+    report: Progress | None,
     saved: Evaluations,
 ) -> Learned:
     """Learn the process of one joint; the record of one joint follows that of the one before."""

@@ -19,7 +19,6 @@ from forcegp.gp.features import Standardization
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
-from forcegp.storage.checkpoint import Checkpoint
 from forcegp.storage.model_file import ModelHeader, settings_of
 from forcegp.storage.options import Settings
 from forcegp.storage.system import take
@@ -111,11 +110,7 @@ class NeuralNetwork(Model["NetworkFit"]):
 
         options = options or (DEEP if len(self.hidden) > 2 else SHALLOW)
         start = dict(network.named_parameters())
-        saved = None
-        if checkpoint is not None:
-            weights = (part for pair in start.items() for part in pair)
-            saved = Checkpoint(Path(checkpoint), Checkpoint.key_of(options, self.seed, x, y, *weights))
-        learned = train(loss, start, len(x), options, generator, progress, saved)
+        learned = train(loss, start, len(x), options, generator, progress, checkpoint, (self.seed, x, y))
         network.load_state_dict(learned.tensors)
         result = FitResult.of(learned, constant_inputs=inputs.constant)
         network.requires_grad_(False)
