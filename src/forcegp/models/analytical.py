@@ -16,6 +16,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.files import Record
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
@@ -25,8 +26,8 @@ from forcegp.models.base import FitProgress, FittedModel, ForceField, Model, Pre
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.robot.parameters import AnalyticalParameters
-from forcegp.storage.model_file import ModelHeader, settings_of
-from forcegp.storage.options import Settings
+from forcegp.storage.model_file import ModelHeader
+from forcegp.storage.options import Window
 from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
 
 KIND = "analytical"
@@ -38,29 +39,10 @@ CHUNK_STATES = 4096
 """States predicted at a time, which bounds the memory."""
 
 
-@dataclass(frozen=True)
-class Window:
-    """How far from the parameters of the robot file learning starts.
-
-    Args:
-        relative: half width for logarithms of masses, moments and friction; 0.5 is a factor of 0.37 to
-            2.7 for the mass of a link, and of 0.61 to 1.65 for friction.
-        length: half width for centres of mass and other lengths [m].
-        angle: half width for turns [rad].
-    """
-
-    relative: float = 0.5
-    length: float = 0.05
-    angle: float = 0.1
-
-
-class AnalyticalSettings(Settings):
+class AnalyticalSettings(Window):
     """What is kept of an analytical model besides its tensors; the robot is the learned one."""
 
     analytical_parameters: dict[str, tuple[str, ...]]
-    relative: float
-    length: float
-    angle: float
     seed: int
 
 
@@ -128,9 +110,9 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             ModelError, DataError: the data do not fit the model.
         """
         measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system)
-        generator, width = torch.Generator().manual_seed(self.seed), self.window
+        generator = torch.Generator().manual_seed(self.seed)
         theta = AnalyticalParameters(self.parameters.start, self.parameters.joints)
-        theta.reset(generator, relative=width.relative, length=width.length, angle=width.angle)
+        theta.reset(generator, **dict(self.window))
         start = {name: value.detach().clone() for name, value in theta.named_parameters()}
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
@@ -213,31 +195,25 @@ class AnalyticalFit(FittedModel):
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> AnalyticalFit:
-        settings = settings_of(header, AnalyticalSettings, source)
+        settings = header.settings_as(AnalyticalSettings, source)
         original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
-        window = Window(settings.relative, settings.length, settings.angle)
+        window = Window(relative=settings.relative, length=settings.length, angle=settings.angle)
         try:
             model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
         except ForceGPError as cause:
             raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
+        theta = model.parameters
         state = {
             name: take(tensors, name, tuple(old.shape), old.dtype, source)
-            for name, old in model.parameters.state_dict().items()
+            for name, old in theta.state_dict().items()
         }
-        theta = AnalyticalParameters(original.robot, settings.analytical_parameters)
         theta.load_state_dict(state)
         result = FitResult(True, 0, 0.0, 0.0, message="loaded")
         return cls(system, theta, window, settings.seed, result)
 
-    def record(self) -> tuple[Settings, dict[str, Tensor]]:
-        theta, width = self.parameters, self.window
-        settings = AnalyticalSettings(
-            analytical_parameters=theta.joints,
-            relative=width.relative,
-            length=width.length,
-            angle=width.angle,
-            seed=self.seed,
-        )
+    def record(self) -> tuple[Record, dict[str, Tensor]]:
+        theta = self.parameters
+        settings = AnalyticalSettings(**dict(self.window), analytical_parameters=theta.joints, seed=self.seed)
         start = {f"start.{name}": getattr(theta.start, name) for name in robot_tensors(theta.start)}
         return settings, dict(theta.state_dict()) | start
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
+from forcegp.files import Record
 from forcegp.forces.quantities import FlatStates, ForceLinearization, flat_states, linearize_field
 from forcegp.gp.optimise import Progress
 from forcegp.models.fit_result import HasResult, fit_table, model_line
@@ -25,7 +26,6 @@ from forcegp.rollout.inputs import Torque
 from forcegp.rollout.law import ForceField
 from forcegp.rollout.trajectory import Rollout
 from forcegp.storage.model_file import ModelHeader, write_model
-from forcegp.storage.options import Settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -247,7 +247,7 @@ class FittedModel(HasResult, Predictor):
         """
 
     @abstractmethod
-    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+    def record(self) -> tuple[Record, dict[str, Tensor]]:
         """Settings and tensors that the model can be restored from."""
 
     def save(self, path: str | Path) -> None:

@@ -17,6 +17,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.files import Record
 from forcegp.forces.inference import require_double
 from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
@@ -31,8 +32,8 @@ from forcegp.models.base import AccelerationFit, FitProgress, Model, reported
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
 from forcegp.storage.checkpoint import Evaluations
-from forcegp.storage.model_file import ModelHeader, settings_of
-from forcegp.storage.options import KernelOptions, Settings
+from forcegp.storage.model_file import ModelHeader
+from forcegp.storage.options import KernelOptions
 from forcegp.storage.system import take
 
 KIND = "independent_gp"
@@ -266,7 +267,7 @@ class IndependentFit(AccelerationFit):
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> IndependentFit:
-        settings = settings_of(header, IndependentSettings, source)
+        settings = header.settings_as(IndependentSettings, source)
         model = IndependentGP(system, settings.noise_std, settings.standardize)
         nq, dtype = system.robot.nq, system.robot.dtype
         n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
@@ -292,7 +293,7 @@ class IndependentFit(AccelerationFit):
         except ForceGPError as cause:
             raise ModelError.at(f"{source}: the training data", cause) from cause
 
-    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+    def record(self) -> tuple[Record, dict[str, Tensor]]:
         model = self.specification
         settings = IndependentSettings(**dict(model.options), noise_std=plain(model.noise))
         tensors = {f"training.{name}": value for name, value in self.training.features.items()}

@@ -1,4 +1,4 @@
-"""Minimising a mean over samples, by ADAM on batches with a held-out part that says when to stop, or at once."""
+"""Minimising a mean over samples: by ADAM on batches, with a held-out part to stop by, or on all of them."""
 
 from __future__ import annotations
 

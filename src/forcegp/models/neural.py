@@ -13,14 +13,14 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
+from forcegp.files import Record
 from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.quantities import FlatStates
 from forcegp.gp.features import Standardization
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
-from forcegp.storage.model_file import ModelHeader, settings_of
-from forcegp.storage.options import Settings
+from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.system import take
 
 KIND = "neural_network"
@@ -29,7 +29,7 @@ DEEP = BatchOptions(epochs=300, batch=256, learning_rate=0.003)
 """For networks of more than two hidden layers, whose epochs take longer and whose steps must be smaller."""
 
 
-class NetworkSettings(Settings):
+class NetworkSettings(Record):
     """What is kept of a neural network besides its tensors."""
 
     hidden: tuple[int, ...]
@@ -147,7 +147,7 @@ class NetworkFit(AccelerationFit):
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> NetworkFit:
-        settings = settings_of(header, NetworkSettings, source)
+        settings = header.settings_as(NetworkSettings, source)
         robot = NeuralNetwork(system, settings.hidden, settings.seed).system.robot  # checks the widths
         widths = [3 * robot.nq, *settings.hidden, robot.nq]
         state = {}
@@ -169,7 +169,7 @@ class NetworkFit(AccelerationFit):
         network = network.requires_grad_(False)
         return cls(system, settings.hidden, settings.seed, network, scales[0], scales[1], result)
 
-    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+    def record(self) -> tuple[Record, dict[str, Tensor]]:
         settings = NetworkSettings(hidden=self.hidden, seed=self.seed, constant=self.inputs.constant)
         tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
         for part in (self.inputs, self.outputs):

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.files import Record
 from forcegp.forces.learn import Problem, analytical_parameters, kernel_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import Noise
@@ -31,8 +32,8 @@ from forcegp.models.fit_result import FitResult
 from forcegp.models.structured_spec import CLASSES, Specification
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode, encode
-from forcegp.storage.model_file import ModelHeader, settings_of
-from forcegp.storage.options import Settings, StructuredOptions
+from forcegp.storage.model_file import ModelHeader
+from forcegp.storage.options import StructuredOptions
 from forcegp.storage.system import robot_tensors, take_robot
 
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
@@ -47,7 +48,7 @@ Parts = tuple[
 """The fields of a `StructuredFit`."""
 
 
-class NoiseSettings(Settings):
+class NoiseSettings(Record):
     """Fields of `Noise`."""
 
     acceleration: PositiveFloat | tuple[PositiveFloat, ...] | None
@@ -175,7 +176,7 @@ def unpack(
     Raises:
         ModelError: a tensor or setting is missing or not valid; names file and field.
     """
-    settings = settings_of(header, StructuredSettings, source)
+    settings = header.settings_as(StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)
     try:
         _check_types(tensors)

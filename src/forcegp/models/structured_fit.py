@@ -13,6 +13,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
+from forcegp.files import Record
 from forcegp.forces.identifiability import doubts_of
 from forcegp.forces.inference import forces_and_constant, is_sparse, log_likelihood, lost_by_inducing
 from forcegp.forces.learn import Problem, typical
@@ -39,7 +40,6 @@ from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import prepared, training_for
 from forcegp.models.structured_spec import Specification
 from forcegp.storage.model_file import ModelHeader
-from forcegp.storage.options import Settings
 
 KIND = "structured_gp"
 
@@ -267,7 +267,7 @@ class StructuredFit(FittedModel):
     ) -> StructuredFit:
         return cls(*unpack(header, tensors, system, source))
 
-    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+    def record(self) -> tuple[Record, dict[str, Tensor]]:
         settings, tensors = pack(
             self.specification, self.problem, self.hyperparameters, self.posterior, self.result
         )
