@@ -36,7 +36,7 @@ from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel, ForceField, Prediction
 from forcegp.models.fit_result import FitResult
-from forcegp.models.structured_file import pack, unpack
+from forcegp.models.structured_file import constant_inputs, pack, unpack
 from forcegp.models.structured_learning import prepared, training_for
 from forcegp.models.structured_spec import Specification
 from forcegp.storage.model_file import ModelHeader
@@ -385,11 +385,7 @@ def conditioned(
         learned,
         log_marginal_likelihood=likelihood,
         jitter=jitter,
-        constant_inputs=tuple(
-            f"{prior.name}.{name}"
-            for prior, scale in zip(problem.priors, training.scales, strict=True)
-            for name in scale.constant
-        ),
+        constant_inputs=constant_inputs(problem),
         force_correlation=doubts.correlation,
         warnings=(*warnings, *learned.doubts, *doubts.warnings, *more_points),
         samples=training.all_samples,
