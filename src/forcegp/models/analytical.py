@@ -20,12 +20,13 @@ from forcegp.files import Record
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
-from forcegp.forces.quantities import affine_maps, flat_states, states
+from forcegp.forces.quantities import FlatStates, affine_maps, states
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.base import FitProgress, FittedModel, ForceField, Model, Prediction
+from forcegp.models.base import FitProgress, Model, PointwiseFit
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.robot.parameters import AnalyticalParameters
+from forcegp.rollout.law import ForceField
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.options import Window
 from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
@@ -35,8 +36,6 @@ LearnedParameters = Mapping[str, Sequence[str] | Literal["all"]]
 EVERY_LINK: LearnedParameters = {"inertia": "all", "damping": "all"}
 """Mass, centre of mass and rotational inertia of every link, and the viscous friction of every joint."""
 ADAM = BatchOptions(epochs=30, batch=128, learning_rate=0.05, patience=10)
-CHUNK_STATES = 4096
-"""States predicted at a time, which bounds the memory."""
 
 
 class AnalyticalSettings(Window):
@@ -134,7 +133,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class AnalyticalFit(FittedModel):
+class AnalyticalFit(PointwiseFit):
     """The equations of motion of a robot with learned parameters.
 
     Attributes:
@@ -155,37 +154,12 @@ class AnalyticalFit(FittedModel):
     def described(self) -> list[tuple[str, object]]:
         return [(name, getattr(self.system.robot, name)) for name in ("mass", "damping")]
 
-    @torch.no_grad()
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: str | Sequence[str] = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-        system: ConstrainedSystem | None = None,
-    ) -> Prediction:
-        """Values `(*batch, d)` by the equations of motion; there is no covariance.
-
-        The arguments are those of `Predictor.predict`; `quantity` may be several names.
-
-        Raises:
-            UnknownNameError: no such quantity.
-            ShapeError: a state does not fit the robot.
-        """
-        system = system or self.system
-        flat = flat_states(system, q, qd, tau, active)
-        values: list[Tensor] = []
-        parts: dict[str, slice] = {}
-        for first in range(0, max(len(flat.q), 1), CHUNK_STATES):
-            chunk = flat.rows(slice(first, first + CHUNK_STATES))
-            at = states(system, chunk.q, chunk.qd, chunk.tau, chunk.active)
-            z, parts = affine_maps(system, at, quantity)
-            values.append(z.o + (z.B_Q @ AnalyticalMean()(system, at)[..., None])[..., 0])
-        mean = torch.cat(values)
-        return Prediction(mean.reshape(*flat.batch, mean.shape[-1]), None, parts)
+    def at(
+        self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
+    ) -> tuple[Tensor, None, dict[str, slice]]:
+        here = states(system, at.q, at.qd, at.tau, at.active)
+        z, parts = affine_maps(system, here, quantity)
+        return z.o + (z.B_Q @ AnalyticalMean()(system, here)[..., None])[..., 0], None, parts
 
     def force_field(self) -> ForceField:
         """Q_C + Q_G + Q_D + Q_u at states."""

@@ -34,11 +34,13 @@ from forcegp.forces.quantities import AffineMap, affine_map, affine_maps, states
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.models.base import FittedModel, ForceField, Prediction
+from forcegp.models.base import FittedModel
 from forcegp.models.fit_result import FitResult
+from forcegp.models.prediction import Prediction
 from forcegp.models.structured_file import constant_inputs, pack, unpack
 from forcegp.models.structured_learning import prepared, training_for
 from forcegp.models.structured_spec import Specification
+from forcegp.rollout.law import ForceField
 from forcegp.storage.model_file import ModelHeader
 
 KIND = "structured_gp"
