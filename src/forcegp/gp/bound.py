@@ -177,15 +177,13 @@ class _BoundGradient:
         """Add what arrives at hyperparameters; return what arrives at kernel inputs."""
         leaves = {("param", f"{prefix}.{key}"): value for key, value in params.items()}
         leaves |= {("feature", p, key): value for key, value in x.items()}
-        grads = torch.autograd.grad(outputs, list(leaves.values()), gradients, allow_unused=True)
-        by_feature: Gradient = {}
-        for (place, leaf), grad in zip(leaves.items(), grads, strict=True):
-            value = torch.zeros_like(leaf) if grad is None else grad
-            if place[0] == "feature":
-                by_feature[place] = value
-            else:
-                self.total[place] = self.total[place] + value if place in self.total else value
-        return by_feature
+        inputs = list(leaves.values())
+        grads = torch.autograd.grad(outputs, inputs, gradients, allow_unused=True, materialize_grads=True)
+        found = dict(zip(leaves, grads, strict=True))
+        for place in [place for place in found if place[0] == "param"]:
+            value = found.pop(place)
+            self.total[place] = self.total[place] + value if place in self.total else value
+        return found
 
     def _through_inducing(self, part: ProcessBasis, prefix: str, dR: Tensor) -> None:
         """Derivatives through K_zz."""

@@ -7,7 +7,7 @@ v = Σ V_i c_i, with V_i the basis functions of each component at sample i.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -39,9 +39,9 @@ class Moments:
     missed: Tensor
 
     @property
-    def moments(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The sums."""
-        return self.v, self.yy, self.rows, self.prior, self.missed
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All sums."""
+        return tuple(getattr(self, field.name) for field in fields(self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +59,6 @@ class Sums(Moments):
         """Sums over no samples."""
         n, p = basis.size, len(basis.parts)
         return cls(*(like.new_zeros(shape) for shape in ((n,), (), (), (p,), (p,), (n, n))))
-
-    @property
-    def tensors(self) -> tuple[Tensor, ...]:
-        """All sums."""
-        return *self.moments, self.G
 
     def __add__(self, other: Sums) -> Sums:
         """Sums over the samples of both.

@@ -147,7 +147,7 @@ class PointwiseFit(FittedModel):
         covariance: bool = True,
         system: ConstrainedSystem | None = None,
     ) -> Prediction:
-        """Mean `(*batch, d)` of a quantity, and covariance `(*batch, d, d)` if the model has one, without noise.
+        """Mean `(*batch, d)` of a quantity and, if the model has one, its covariance without noise.
 
         The arguments are those of `Predictor.predict`; a model that knows forces takes several names.
 

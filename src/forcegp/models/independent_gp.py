@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -161,13 +162,8 @@ class IndependentGP(Model["IndependentFit"]):
         saved = Evaluations.resumed(checkpoint, first, KIND, options, len(processes), *known)
         for prior, block, constant in processes:
             start = initial_hyperparameters([prior], [block])
-
-            def objective(
-                tensors: dict[str, Tensor], prior=prior, block=block, constant=constant, start=start
-            ) -> Tensor:
-                value = negative_log_likelihood([prior], tensors, [block])
-                return value + constant + (negative_log_prior(tensors, start) if options.hyperpriors else 0.0)
-
+            centre = start if options.hyperpriors else {}
+            objective = partial(_objective, prior, block, constant, centre)
             before = sum(part.evaluations for part in parts)
             report = reported(progress, options.max_evaluations * len(processes), before)
             box = box_around(start)
@@ -181,6 +177,18 @@ class IndependentGP(Model["IndependentFit"]):
         """Training data with their standardization."""
         scaled = Standardization.of if self.options.standardize else Standardization.none
         return IndependentTraining(features, qdd, noise_std, scaled(features))
+
+
+def _objective(
+    prior: JointForcePrior,
+    block: Block,
+    constant: Tensor,
+    centre: Mapping[str, Tensor],
+    theta: dict[str, Tensor],
+) -> Tensor:
+    """Negative log posterior of the hyperparameters of a joint, with weak priors around a centre if any."""
+    value = negative_log_likelihood([prior], theta, [block]) + constant
+    return value + negative_log_prior(theta, centre) if centre else value
 
 
 def fitted(
