@@ -9,9 +9,8 @@ import torch.distributed as dist
 from safetensors.torch import save_file
 
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.distributed import reduce_sums, shard, share_basis
 from forcegp.gp.features import rows_of
-from forcegp.gp.sums import accumulate
+from forcegp.gp.sums import accumulate, reduce_sums, shard, share_basis
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
 
 SAMPLES, POINTS = 61, 12

@@ -21,11 +21,10 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.bound import bound_of
-from forcegp.gp.distributed import add_over_processes, reduce_sums
 from forcegp.gp.exact import ExactPosterior, require_exact_fits
 from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.sums import Sums, accumulate
+from forcegp.gp.sums import Sums, accumulate, add_over_processes, reduce_sums
 
 PIECE_SAMPLES = 8192
 """Samples whose equations of motion are held at a time."""
