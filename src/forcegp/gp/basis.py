@@ -142,11 +142,6 @@ class ProcessBasis:
         return used
 
     @cached_property
-    def sizes(self) -> list[int]:
-        """Number of basis functions of each component."""
-        return self.used.sum(-1).tolist()
-
-    @cached_property
     def columns(self) -> Tensor:
         """Positions of the basis functions among the values of all components."""
         device = next(iter(self.inducing.values())).device
@@ -222,16 +217,13 @@ class ProcessBasis:
         """
         return (variance - explained).clamp(min=0.0)
 
-    def rest_variance(self, features: Features) -> Tensor:
-        """Prior variance of the part that inducing points approximate, `(components, n)`."""
-        if self._variance is None:
-            return next(iter(features.values())).new_zeros(self.components, points(features))
-        return self._variance(features)
-
     @cached_property
-    def _variance(self) -> Callable[[Features], Tensor] | None:
+    def rest_variance(self) -> Callable[[Features], Tensor]:
+        """x ↦ prior variance `(components, n)` of the part that inducing points approximate."""
         rest = self.split.rest
-        return None if rest is None else rest.kernel.variance(rest.params)
+        if rest is None:
+            return lambda x: next(iter(x.values())).new_zeros(self.components, points(x))
+        return rest.kernel.variance(rest.params)
 
     def evaluate(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
         """The basis functions at n samples `(n, Σ sizes)`, and their share in `LatentBasis.evaluate`."""
@@ -258,7 +250,7 @@ class LatentBasis:
     @cached_property
     def columns(self) -> tuple[slice, ...]:
         """The basis functions of each component, the components of all processes in order."""
-        sizes = [size for part in self.parts for size in part.sizes]
+        sizes = [size for part in self.parts for size in part.used.sum(-1).tolist()]
         ends = torch.tensor([0, *sizes]).cumsum(0).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 

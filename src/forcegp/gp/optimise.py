@@ -229,14 +229,11 @@ def _adam(
     bounds: Bounds,
 ) -> tuple[bool, str]:
     tensors = {key: value.detach().clone() for key, value in start.items()}
-    optimizers = [
-        torch.optim.Adam([tensors[key] for key in keys], lr=rate)
-        for keys, rate in (
-            ([key for key in tensors if key not in analytical], options.learning_rate),
-            ([key for key in tensors if key in analytical], options.analytical_learning_rate),
-        )
-        if keys
-    ]
+    rates = {False: options.learning_rate, True: options.analytical_learning_rate}
+    optimizer = torch.optim.Adam(
+        {"params": [x for key, x in tensors.items() if (key in analytical) == own], "lr": rate}
+        for own, rate in rates.items()
+    )
     since = 0
     for _ in range(options.max_evaluations):
         best = recorder.value
@@ -246,6 +243,5 @@ def _adam(
             return True, f"no improvement within {options.patience} evaluations"
         for key, tensor in tensors.items():
             tensor.grad = grads[key]
-        for optimizer in optimizers:
-            optimizer.step()
+        optimizer.step()
     return False, f"stopped after {options.max_evaluations} evaluations"

@@ -57,17 +57,6 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         window: how far from the parameters of the file learning starts.
         seed: of the start.
 
-    Example:
-        >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-        >>> t = torch.arange(20, dtype=torch.float64)
-        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = AnalyticalModel(system).fit(data)
-        >>> fit.predict(q, qd, tau).mean.shape
-        torch.Size([20, 2])
-
     Raises:
         UnknownNameError, ModelError, InertiaError: `analytical_parameters` do not fit the robot.
     """

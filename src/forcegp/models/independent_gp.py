@@ -99,17 +99,6 @@ class IndependentGP(Model["IndependentFit"]):
 
     Raises:
         ModelError: the robot is not float64, or `noise` states more than that of accelerations.
-
-    Example:
-        >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-        >>> t = torch.arange(20, dtype=torch.float64)
-        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = IndependentGP(system, noise=0.1).fit(data)
-        >>> fit.predict(q, qd, tau).std.shape
-        torch.Size([20, 2])
     """
 
     kind = KIND

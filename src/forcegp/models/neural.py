@@ -47,17 +47,6 @@ class NeuralNetwork(Model["NetworkFit"]):
         hidden: widths of the hidden layers.
         seed: of the initial weights, the held-out samples and the order of the batches.
 
-    Example:
-        >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-        >>> t = torch.arange(20, dtype=torch.float64)
-        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = NeuralNetwork(system, hidden=[8]).fit(data)
-        >>> fit.predict(q, qd, tau).mean.shape
-        torch.Size([20, 2])
-
     Raises:
         ModelError: a width is not positive.
     """
