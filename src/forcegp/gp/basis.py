@@ -62,10 +62,8 @@ def _terms(part: KernelPart) -> tuple[list[KernelPart], list[KernelPart]]:
         return [part], []
     if not isinstance(kernel, Sum):
         return [], [part]
-    (finite_left, rest_left), (finite_right, rest_right) = (
-        _terms(KernelPart(side, sub(part.params, name)))
-        for name, side in (("left", kernel.left), ("right", kernel.right))
-    )
+    both = (_terms(KernelPart(side, theta)) for side, theta in kernel.parts(part.params))
+    (finite_left, rest_left), (finite_right, rest_right) = both
     if not isinstance(kernel, Product):
         return finite_left + finite_right, rest_left + rest_right
     if not finite_left or not finite_right:

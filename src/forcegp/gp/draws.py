@@ -143,8 +143,7 @@ def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> 
         Functions `(k or 1, ·, terms)`, each with weights `(k, terms, samples)`.
     """
     if isinstance(kernel, Sum) and not isinstance(kernel, Product):
-        sides = ((getattr(kernel, side), sub(params, side)) for side in ("left", "right"))
-        return [term for k, theta in sides for term in kernel_terms(k, theta, X, w)]
+        return [term for k, theta in kernel.parts(params) for term in kernel_terms(k, theta, X, w)]
     parts = split(kernel, params)
     if parts.rest is None and parts.finite is not None:
         # k(x, X) w = φ(x)ᵀ (φ(X) w)
@@ -179,7 +178,7 @@ def _common(
 
         return functions, [size, bias]
     if isinstance(kernel, Product):
-        left, right = (_common(getattr(kernel, side), sub(params, side), X) for side in ("left", "right"))
+        left, right = (_common(side, theta, X) for side, theta in kernel.parts(params))
         if left is not None and right is not None:
             functions_of = (left[0], right[0])
             return (

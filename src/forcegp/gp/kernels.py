@@ -317,18 +317,21 @@ class Sum(Kernel):
     def is_finite(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.left.is_finite and self.right.is_finite
 
+    def parts(self, params: Parameters) -> tuple[tuple[Kernel, Initial], tuple[Kernel, Initial]]:
+        """Both kernels, with their hyperparameters."""
+        return (self.left, sub(params, "left")), (self.right, sub(params, "right"))
+
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
-        left = self.left.towards(sub(params, "left"), x2)
-        right = self.right.towards(sub(params, "right"), x2)
+        left, right = (kernel.towards(theta, x2) for kernel, theta in self.parts(params))
         return lambda x1: self.combined(left(x1), right(x1))
 
     def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
-        left, right = self.left.variance(sub(params, "left")), self.right.variance(sub(params, "right"))
+        left, right = (kernel.variance(theta) for kernel, theta in self.parts(params))
         return lambda x: self.combined(left(x), right(x))
 
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        left = self.left.draw(sub(params, "left"), x, features, generator)
-        return left + self.right.draw(sub(params, "right"), x, features, generator)
+        left, right = (kernel.draw(theta, x, features, generator) for kernel, theta in self.parts(params))
+        return left + right
 
 
 @dataclass(frozen=True)
@@ -358,8 +361,7 @@ class Product(Sum):
         linear = max(_linear_factors(self.left), _linear_factors(self.right))
         # A linear factor has few features and all of them matter, so the other one is given fewer.
         few = max(1, features // (LINEAR_PAIRS * linear)) if linear else features
-        left = self.left.draw(sub(params, "left"), x, few, generator)
-        right = self.right.draw(sub(params, "right"), x, few, generator)
+        left, right = (kernel.draw(theta, x, few, generator) for kernel, theta in self.parts(params))
         return left * right if linear else left.paired(right, features, generator)
 
 

@@ -244,7 +244,12 @@ class StructuredFit(FittedModel):
             UnknownNameError: no such prior.
             NumericalError: the samples to remove were not among those of the fit.
         """
-        latent = _sparse(self.posterior)
+        latent = self.posterior.latent
+        if not isinstance(latent, SparsePosterior):
+            raise ModelError(
+                "a fit with exact inference cannot forget",
+                hint='make the model with inference="sparse", or condition it on the data that count',
+            )
         if not isinstance(what, int | float):
             without, _ = training_for(self.specification, self.problem, what, learned=())
             return self._with(latent.without(self._problem_of(without).rows(self.hyperparameters).blocks))
@@ -340,15 +345,6 @@ class StructuredFit(FittedModel):
 def _carried(z: AffineMap, variance: Tensor) -> Tensor:
     """B Σ Bᵀ of white noise on the joint force, `(n, d, d)`."""
     return (z.B_Q * variance[..., None, :]) @ z.B_Q.mT
-
-
-def _sparse(posterior: ForcePosterior) -> SparsePosterior:
-    if not isinstance(posterior.latent, SparsePosterior):
-        raise ModelError(
-            "a fit with exact inference cannot forget",
-            hint='make the model with inference="sparse", or condition it on the data that count',
-        )
-    return posterior.latent
 
 
 @torch.no_grad()

@@ -192,37 +192,29 @@ def _constraint(record: ConstraintRecord, fallback: ConstrainedSystem | None) ->
 
 def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> RobotModel:
     sizes = {"nq": len(record.joint_names), "nf": len(record.frame_names)}
-    # Parents come before their children, and frames belong to joints that exist.
-    below = {"parents": range(sizes["nq"]), "frame_parents": [sizes["nq"]] * sizes["nf"]}
-    for name, limits in {"joint_types": range(sizes["nq"]), **below}.items():
-        values = getattr(record, name)
-        if len(values) != len(limits):
+    joints = {"joint_types": sizes["nq"], "parents": sizes["nq"], "frame_parents": sizes["nf"]}
+    for name, length in joints.items():
+        if len(getattr(record, name)) != length:
             raise ModelError(
                 f"{source}: field 'system.robot.{name}' has the wrong length",
-                expected=len(limits),
-                got=len(values),
+                expected=length,
+                got=len(getattr(record, name)),
             )
-        for i, (parent, limit) in enumerate(zip(values, limits, strict=True)):
-            if name in below and not -1 <= parent < limit:
+    # Parents come before their children, and frames belong to joints that exist.
+    limits = {"parents": range(sizes["nq"]), "frame_parents": [sizes["nq"]] * sizes["nf"]}
+    for name, limit in limits.items():
+        for i, (parent, below) in enumerate(zip(getattr(record, name), limit, strict=True)):
+            if not -1 <= parent < below:
                 raise ModelError(f"{source}: field 'system.robot.{name}.{i}' names no joint", got=parent)
-    axis, known = tensors.get(PREFIX + "axis"), set(type(record).model_fields)
+    axis = tensors.get(PREFIX + "axis")
     dtype = axis.dtype if axis is not None and axis.is_floating_point() else torch.float64
-    names = [field.name for field in dataclasses.fields(RobotModel) if field.name not in known]
-    shapes = {name: tuple(sizes.get(str(n), n) for n in SHAPES.get(name, ("nq",))) for name in names}
-    return RobotModel(**dict(record), **_arrays(tensors, PREFIX, shapes, dtype, source))
-
-
-def _arrays(
-    tensors: Mapping[str, Tensor],
-    prefix: str,
-    shapes: Mapping[str, tuple[int | str, ...]],
-    dtype: torch.dtype,
-    source: str,
-) -> dict[str, Tensor]:
-    return {
-        name: take(tensors, prefix + name, shape, dtype, source, finite=name not in MAY_BE_INFINITE)
-        for name, shape in shapes.items()
-    }
+    arrays = {}
+    for field in dataclasses.fields(RobotModel):
+        if field.name not in type(record).model_fields:
+            shape = tuple(sizes.get(str(n), n) for n in SHAPES.get(field.name, ("nq",)))
+            finite = field.name not in MAY_BE_INFINITE
+            arrays[field.name] = take(tensors, PREFIX + field.name, shape, dtype, source, finite=finite)
+    return RobotModel(**{name: getattr(record, name) for name in type(record).model_fields}, **arrays)
 
 
 def take(
@@ -261,5 +253,9 @@ def robot_tensors(robot: RobotModel) -> list[str]:
 
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
     """A robot with tensors named `<prefix><field>`, checked by `take`, and all else as in another one."""
-    shapes = {name: tuple(getattr(like, name).shape) for name in robot_tensors(like)}
-    return like.replace(**_arrays(tensors, prefix, shapes, like.dtype, source))
+    fields = {}
+    for name in robot_tensors(like):
+        value, finite = getattr(like, name), name not in MAY_BE_INFINITE
+        shape = tuple(value.shape)
+        fields[name] = take(tensors, prefix + name, shape, value.dtype, source, finite=finite)
+    return like.replace(**fields)
