@@ -172,7 +172,7 @@ class SparsePosterior:
     def sums(self) -> Sums:
         """All sums over the samples, G from the factor where samples were added to it."""
         eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
-        return Sums(*self.moments.tensors, self.L @ self.L.mT - (1.0 + self.jitter) * eye)
+        return Sums(**vars(self.moments), G=self.L @ self.L.mT - (1.0 + self.jitter) * eye)
 
     @cached_property
     def weights(self) -> Tensor:
@@ -223,7 +223,7 @@ class SparsePosterior:
         G = self.L @ self.L.mT - torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
         v = self.moments.v - G[:, own] @ weights
         G[own], G[:, own], v[own] = 0.0, 0.0, 0.0
-        return SparsePosterior.of(self.basis, Sums(v, *self.moments.tensors[1:], G))
+        return SparsePosterior.of(self.basis, Sums(**vars(replace(self.moments, v=v)), G=G))
 
     @cached_property
     def _inverse_factor(self) -> list[Tensor]:
