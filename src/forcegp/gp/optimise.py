@@ -18,6 +18,8 @@ from forcegp.errors import ModelError, NumericalError, UnknownNameError
 Objective = Callable[[dict[str, Tensor]], Tensor]
 Progress = Callable[[int, float, dict[str, Tensor]], None]
 """Called after each evaluation with their number, the objective, and the best tensors so far."""
+FitProgress = Callable[[int, int, float], None]
+"""Called with the number of evaluations, their maximum, and the objective."""
 Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
 """Box of each tensor: a lower and an upper bound of all its entries, or of each."""
 
@@ -93,6 +95,13 @@ class Learned:
     message: str
     history: list[float] = field(default_factory=list)
     doubts: tuple[str, ...] = ()
+
+
+def reported(progress: FitProgress | None, most: int, before: int = 0) -> Progress | None:
+    """The progress of an optimisation of at most so many evaluations, after those `before`."""
+    if progress is None:
+        return None
+    return lambda evaluations, value, _: progress(before + evaluations, most, value)
 
 
 class _SpentError(Exception):

@@ -6,7 +6,7 @@ Fitted models of accelerations alone, which know neither contacts nor forces.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -18,20 +18,10 @@ from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.files import Record
 from forcegp.forces.quantities import FlatStates, flat_states
-from forcegp.gp.optimise import Progress
+from forcegp.gp.optimise import FitProgress
 from forcegp.models.fit_result import HasResult, fit_table, model_line
 from forcegp.models.prediction import CHUNK, Prediction, Predictor
 from forcegp.storage.model_file import ModelHeader, write_model
-
-FitProgress = Callable[[int, int, float], None]
-"""Called with the number of evaluations, their maximum, and the objective."""
-
-
-def reported(progress: FitProgress | None, most: int, before: int = 0) -> Progress | None:
-    """The progress of an optimisation of at most so many evaluations, after those `before`."""
-    if progress is None:
-        return None
-    return lambda evaluations, value, _: progress(before + evaluations, most, value)
 
 
 class FittedModel(HasResult, Predictor):

@@ -28,8 +28,8 @@ from forcegp.forces.start import box_around, doubts_at_bounds, initial_hyperpara
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.gp.optimise import Learned, LearningOptions, minimise
-from forcegp.models.base import AccelerationFit, FitProgress, Model, reported
+from forcegp.gp.optimise import Learned, LearningOptions, minimise, reported
+from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
 from forcegp.storage.checkpoint import Evaluations

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, NumericalError
-from forcegp.gp.optimise import Learned, LearningOptions, minimise
-from forcegp.models.base import FitProgress, reported
+from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, minimise, reported
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
 
 HISTORY = "history"

@@ -30,7 +30,7 @@ from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.fit_result import FitResult
-from forcegp.models.structured_spec import CLASSES, Specification
+from forcegp.models.structured_spec import CLASSES, Specification, constant_inputs
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode, encode
 from forcegp.storage.model_file import ModelHeader
@@ -281,12 +281,6 @@ def _restored(
     posterior = _posterior(*problem.with_coulomb_errors(hyper), tensors)
     result = dataclasses.replace(settings.result, constant_inputs=constant_inputs(problem), history=())
     return spec, problem, hyper, posterior, result, system, _below(tensors, "noise_std.")
-
-
-def constant_inputs(problem: Problem) -> tuple[str, ...]:
-    """Inputs of priors that do not vary in the training data."""
-    pairs = zip(problem.priors, problem.training.scales, strict=True)
-    return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
 
 
 def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -37,9 +37,9 @@ from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Prediction
-from forcegp.models.structured_file import constant_inputs, pack, unpack
+from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import prepared, training_for
-from forcegp.models.structured_spec import Specification
+from forcegp.models.structured_spec import Specification, constant_inputs
 from forcegp.rollout.law import ForceField
 from forcegp.storage.model_file import ModelHeader
 

@@ -40,8 +40,7 @@ from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.start import Search, initial
 from forcegp.gp.exact import require_exact_fits
-from forcegp.gp.optimise import Learned, LearningOptions, Progress
-from forcegp.models.base import FitProgress, reported
+from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, Progress, reported
 from forcegp.models.structured_spec import Specification
 from forcegp.robot.model import RobotModel
 from forcegp.storage.checkpoint import Evaluations
