@@ -17,12 +17,11 @@ from torch import Tensor
 
 from forcegp.forces.priors.sets import REMAINING
 from forcegp.gp.basis import LatentBasis, latent_basis
-from forcegp.gp.distributed import reduce_sums, shard
 from forcegp.gp.features import Block
 from forcegp.gp.inducing import select_inducing
 from forcegp.gp.kernels import Kernel
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.sums import accumulate
+from forcegp.gp.sums import accumulate, reduce_sums, shard
 
 JOINTS, CHUNK = 7, 4096
 POINTS = 70

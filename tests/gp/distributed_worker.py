@@ -9,8 +9,8 @@ import torch.distributed as dist
 from safetensors.torch import save_file
 
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.distributed import accumulate_shards, shard, share_basis
 from forcegp.gp.features import rows_of
+from forcegp.gp.sums import accumulate, reduce_sums, shard, share_basis
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
 
 SAMPLES, POINTS = 61, 12
@@ -25,7 +25,7 @@ def run(rank: int, processes: int, folder: str) -> None:
     own = rows_of(block, shard(SAMPLES, rank, processes))
     wrong = {key: value + 0.1 * rank for key, value in parameters().items()}
     mine = latent_basis(PROCESSES, wrong, first(rows(POINTS, seed=5 + rank), POINTS), COMPONENTS)
-    sums = accumulate_shards(share_basis(mine), [own])
+    sums = reduce_sums(accumulate(share_basis(mine), [own]))
     kept = {f"sum.{i}": part.clone() for i, part in enumerate(sums.tensors)}
     save_file(kept, Path(folder) / f"{rank}.safetensors")
     dist.destroy_process_group()

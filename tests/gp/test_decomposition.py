@@ -39,18 +39,17 @@ def random(kernel: Kernel) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[s
 @cases
 def test_the_parts_add_up_to_the_kernel(kernel: Kernel, features: int, has_rest: bool) -> None:
     params, x1, x2 = random(kernel)
-    whole, parts = kernel.covariance(params, x1, x2), split(kernel)
+    whole, parts = kernel.covariance(params, x1, x2), split(kernel, params)
     total, diagonal = torch.zeros_like(whole), torch.zeros(OUTPUTS, 5, dtype=torch.float64)
     assert (parts.finite is not None, parts.rest is not None) == (features > 0, has_rest)
     if parts.finite is not None:
-        phi = parts.finite.features(params, x1)
+        phi = parts.finite.features(x1)
         assert phi.basis(x1).shape == (OUTPUTS, 5, features)
         total = total + phi.basis(x1) @ phi.basis(x2).mT
         diagonal = diagonal + (phi.basis(x1) ** 2).sum(-1)
     if parts.rest is not None:
-        own = parts.rest.parameters(params)
-        total = total + parts.rest.kernel.covariance(own, x1, x2)
-        diagonal = diagonal + parts.rest.kernel.diagonal(own, x1)
+        total = total + parts.rest.kernel.covariance(parts.rest.params, x1, x2)
+        diagonal = diagonal + parts.rest.kernel.diagonal(parts.rest.params, x1)
     assert torch.allclose(total, whole, rtol=1e-12, atol=1e-12)
     assert torch.allclose(diagonal, kernel.diagonal(params, x1), rtol=1e-12, atol=1e-12)
 
@@ -61,13 +60,13 @@ def test_hyperparameters_reach_the_parts_with_their_gradient(
 ) -> None:
     params, x1, x2 = random(kernel)
     leaves = {key: value.requires_grad_() for key, value in params.items()}
-    parts = split(kernel)
+    parts = split(kernel, leaves)
     total = torch.zeros(OUTPUTS, 5, 4, dtype=torch.float64)
     if parts.finite is not None:
-        phi = parts.finite.features(leaves, x1)
+        phi = parts.finite.features(x1)
         total = total + phi.basis(x1) @ phi.basis(x2).mT
     if parts.rest is not None:
-        total = total + parts.rest.kernel.covariance(parts.rest.parameters(leaves), x1, x2)
+        total = total + parts.rest.kernel.covariance(parts.rest.params, x1, x2)
     got = torch.autograd.grad(total.sin().sum(), list(leaves.values()))
     expected = torch.autograd.grad(kernel.covariance(leaves, x1, x2).sin().sum(), list(leaves.values()))
     for one, other in zip(got, expected, strict=True):

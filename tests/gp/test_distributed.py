@@ -11,8 +11,7 @@ from safetensors.torch import load_file
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.distributed import reduce_sums, shard
-from forcegp.gp.sums import accumulate
+from forcegp.gp.sums import accumulate, reduce_sums, shard
 from gp.distributed_worker import POINTS, SAMPLES, run
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
 

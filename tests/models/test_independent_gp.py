@@ -12,7 +12,7 @@ from forcegp import IndependentGP, Noise
 from forcegp.errors import DataError, ModelError, ShapeError
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.independent_gp import IndependentFit, joint_processes
+from forcegp.models.independent_gp import IndependentFit
 from random_data import NOISE_STD, random_data, table_system
 
 ROUNDING = 1e-9
@@ -83,7 +83,8 @@ def test_gradient_is_that_of_the_textbook_formula(model: IndependentFit) -> None
     expected = torch.autograd.grad(dense, list(leaves.values()))
 
     own = {f"qdd_2.{n}": leaves[n] for n in names}
-    value = negative_log_likelihood(joint_processes(7)[2:3], own, [model.training.block(2)])
+    prior, block, _ = model.training.processes()[2]
+    value = negative_log_likelihood([prior], own, [block])
     for got, wanted in zip(torch.autograd.grad(value, list(leaves.values())), expected, strict=True):
         torch.testing.assert_close(got, wanted, rtol=GRADIENT, atol=GRADIENT * float(wanted.abs().max()))
 
@@ -114,7 +115,7 @@ def test_batches_of_any_shape_and_chunks_agree(
     shaped = model.predict(test.q.reshape(5, 5, 7), test.qd.reshape(5, 5, 7), test.tau.reshape(5, 5, 7))
     assert shaped.covariance is not None and whole.covariance is not None
     torch.testing.assert_close(shaped.mean.reshape(25, 7), whole.mean, rtol=ROUNDING, atol=ROUNDING)
-    monkeypatch.setattr("forcegp.models.independent_gp.CHUNK_STATES", 4)
+    monkeypatch.setattr("forcegp.models.base.CHUNK", 4)
     parts = model.predict(test.q, test.qd, test.tau)
     assert parts.covariance is not None
     torch.testing.assert_close(parts.mean, whole.mean, rtol=ROUNDING, atol=ROUNDING)

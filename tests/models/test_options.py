@@ -12,7 +12,7 @@ from forcegp.models.independent_gp import IndependentGP, IndependentSettings
 from forcegp.models.structured_file import StructuredSettings
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.scene.sections import ModelSection
-from forcegp.storage.options import KernelOptions, Settings, StructuredOptions
+from forcegp.storage.options import KernelOptions, StructuredOptions
 from random_data import table_system
 
 SYSTEM = table_system()
@@ -26,7 +26,7 @@ SYSTEM = table_system()
     ],
 )
 def test_every_place_has_the_options_with_their_defaults(
-    made: type, table: type[Settings], saved: type[Settings]
+    made: type, table: type[KernelOptions], saved: type[KernelOptions]
 ) -> None:
     arguments = inspect.signature(made).parameters
     for name, field in table.model_fields.items():

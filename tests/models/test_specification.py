@@ -33,7 +33,7 @@ CASES: dict[type, tuple[dict[str, Any], Any]] = {
     forcegp.IndependentGP: ({"noise": [0.2] * 7, "standardize": False}, LearningOptions(max_evaluations=2)),
     forcegp.NeuralNetwork: ({"hidden": [6, 5], "seed": 4}, EPOCHS),
     forcegp.AnalyticalModel: (
-        {"analytical_parameters": {"damping": "all"}, "window": Window(0.2), "seed": 4},
+        {"analytical_parameters": {"damping": "all"}, "window": Window(relative=0.2), "seed": 4},
         EPOCHS,
     ),
 }

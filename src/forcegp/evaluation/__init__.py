@@ -127,9 +127,9 @@ def evaluate(
     """
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
-    data.check_robot(getattr(model, "specified", model.system).robot)
+    data.check_robot(model.specified.robot)
     model.system.announce_states(len(data), 2.0, f"an evaluation on {len(data):,} samples")
-    before = system or getattr(model, "specified", model.system)
+    before = system or model.specified
     predicted = predict_all(model, data, system or model.system, progress)
     clean, noise_std = data.extras.get("qdd_clean"), predicted.noise_std
     spread = None

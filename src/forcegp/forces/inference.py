@@ -14,18 +14,17 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import ModelError
 from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import CONTACT, ForcePrior
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.bound import bound_of
-from forcegp.gp.distributed import add_over_processes, reduce_sums
 from forcegp.gp.exact import ExactPosterior, require_exact_fits
 from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.sums import Sums, accumulate
+from forcegp.gp.sums import Sums, accumulate, add_over_processes, reduce_sums
 
 PIECE_SAMPLES = 8192
 """Samples whose equations of motion are held at a time."""
@@ -118,22 +117,10 @@ def posterior_of(
     return ForcePosterior(problem.process_at(hyperparameters), latent)
 
 
-METHODS = ("auto", "exact", "sparse")
 EXACT_SAMPLES, EXACT_ON_SURFACE = 1000, 300
 """Samples up to which inference is exact by default, and where only forces at contacts are unknown: a few
 points cover their inputs, and exact inference costs the cube of all rows, however few latent forces there
 are."""
-
-
-def check_method(inference: str) -> str:
-    """The name of a method of inference.
-
-    Raises:
-        UnknownNameError: no such method.
-    """
-    if inference not in METHODS:
-        raise UnknownNameError("inference", inference, METHODS)
-    return inference
 
 
 def require_double(system: ConstrainedSystem) -> None:

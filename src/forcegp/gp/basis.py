@@ -9,7 +9,7 @@ with a standard normal prior on their weights, and V(x)ᵀV(x′) = k(x, Z) K_zz
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from forcegp.gp.factor import Spectrum
 from forcegp.gp.features import FeatureMap, Features, points
-from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sub
+from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sides, sub
 
 EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
 """Kernels without factors whose `draw` holds all their features, whatever number it is asked for."""
@@ -26,66 +26,48 @@ EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
 
 @dataclass(frozen=True)
 class KernelPart:
-    """A kernel made of factors of another one.
-
-    Attributes:
-        kernel: the sum of products of the factors.
-        names: the prefix of each factor's hyperparameters here, and in the whole kernel.
-    """
+    """A kernel made of factors of another one, with their log-hyperparameters."""
 
     kernel: Kernel
-    names: Mapping[str, str]
+    params: Parameters
 
-    def parameters(self, whole: Parameters) -> dict[str, Tensor]:
-        """The part's hyperparameters among those of the whole kernel."""
-        params = {}
-        for here, there in self.names.items():
-            factor = sub(whole, there) if there else whole
-            params |= {f"{here}.{key}" if here else key: value for key, value in factor.items()}
-        return params
-
-    def features(self, whole: Parameters, x: Features) -> FeatureMap:
+    def features(self, x: Features) -> FeatureMap:
         """φ of a finite part: features whose products are the kernel exactly.
 
         Args:
-            whole: log-hyperparameters of the whole kernel.
             x: any inputs, whose widths count.
         """
         # Such a draw takes no random number, so any generator does.
-        return self.kernel.draw(self.parameters(whole), x, 1, torch.Generator())
+        return self.kernel.draw(self.params, x, 1, torch.Generator())
 
 
 @dataclass(frozen=True)
 class KernelSplit:
-    """A kernel as the sum of a finite part and the rest.
-
-    Attributes:
-        finite: sums and products of linear kernels.
-        rest: everything else.
-    """
+    """A kernel as the sum of a finite part, sums and products of linear kernels, and the rest."""
 
     finite: KernelPart | None
     rest: KernelPart | None
 
 
-def split(kernel: Kernel) -> KernelSplit:
+def split(kernel: Kernel, params: Parameters) -> KernelSplit:
     """The finite part of a kernel and the rest; products of sums are multiplied out where needed."""
-    finite, rest = _terms(kernel, "")
+    finite, rest = _terms(KernelPart(kernel, params))
     return KernelSplit(_sum(finite), _sum(rest))
 
 
-def _terms(kernel: Kernel, path: str) -> tuple[list[KernelPart], list[KernelPart]]:
+def _terms(part: KernelPart) -> tuple[list[KernelPart], list[KernelPart]]:
     """Terms with and without a finite number of features."""
+    kernel = part.kernel
     if isinstance(kernel, EXACT):
-        return [KernelPart(kernel, {"": path})], []
+        return [part], []
     if not isinstance(kernel, Sum):
-        return [], [KernelPart(kernel, {"": path})]
-    sides = [_terms(getattr(kernel, side), f"{path}.{side}".lstrip(".")) for side in ("left", "right")]
-    (finite_left, rest_left), (finite_right, rest_right) = sides
+        return [], [part]
+    both = (_terms(KernelPart(side, theta)) for side, theta in kernel.parts(part.params))
+    (finite_left, rest_left), (finite_right, rest_right) = both
     if not isinstance(kernel, Product):
         return finite_left + finite_right, rest_left + rest_right
     if not finite_left or not finite_right:
-        return [], [KernelPart(kernel, {"": path})]
+        return [], [part]
     finite = [_join(Product, a, b) for a in finite_left for b in finite_right]
     rest = [_join(Product, a, b) for a in finite_left for b in rest_right]
     rest += [_join(Product, a, b) for a in rest_left for b in finite_right + rest_right]
@@ -93,9 +75,7 @@ def _terms(kernel: Kernel, path: str) -> tuple[list[KernelPart], list[KernelPart
 
 
 def _join(kind: type[Sum], left: KernelPart, right: KernelPart) -> KernelPart:
-    names = {f"left.{key}".rstrip("."): path for key, path in left.names.items()}
-    names |= {f"right.{key}".rstrip("."): path for key, path in right.names.items()}
-    return KernelPart(kind(left.kernel, right.kernel), names)
+    return KernelPart(kind(left.kernel, right.kernel), sides(left.params, right.params))
 
 
 def _sum(terms: list[KernelPart]) -> KernelPart | None:
@@ -107,18 +87,23 @@ class ProcessBasis:
     """Basis functions of the components of one process.
 
     Attributes:
-        split: finite part and rest of the kernel.
-        params: the process's own log-hyperparameters.
+        kernel: covariance of a component.
+        params: its log-hyperparameters.
         components: number of components.
         inducing: kernel inputs of the inducing points, none where only the finite part has features.
         spectra: of K_zz of each component.
     """
 
-    split: KernelSplit
+    kernel: Kernel
     params: dict[str, Tensor]
     components: int
     inducing: Features
     spectra: tuple[Spectrum, ...]
+
+    @cached_property
+    def split(self) -> KernelSplit:
+        """Finite part and rest of the kernel."""
+        return split(self.kernel, self.params)
 
     @cached_property
     def roots(self) -> Tensor:
@@ -133,14 +118,12 @@ class ProcessBasis:
         rest = self.split.rest
         if rest is None or not points(self.inducing):
             return None
-        return rest.kernel.towards(self._rest_params, self.inducing)
+        return rest.kernel.towards(rest.params, self.inducing)
 
     @cached_property
     def finite(self) -> FeatureMap | None:
         """The exact features of the finite part; `None` without one."""
-        return (
-            self.split.finite.features(self.params, self.inducing) if self.split.finite is not None else None
-        )
+        return None if self.split.finite is None else self.split.finite.features(self.inducing)
 
     @cached_property
     def finite_size(self) -> int:
@@ -155,11 +138,6 @@ class ProcessBasis:
         for k, spectrum in enumerate(self.spectra):
             used[k, len(spectrum.values) - spectrum.dropped : width - self.finite_size] = False
         return used
-
-    @cached_property
-    def sizes(self) -> list[int]:
-        """Number of basis functions of each component."""
-        return self.used.sum(-1).tolist()
 
     @cached_property
     def columns(self) -> Tensor:
@@ -237,21 +215,13 @@ class ProcessBasis:
         """
         return (variance - explained).clamp(min=0.0)
 
-    def rest_variance(self, features: Features) -> Tensor:
-        """Prior variance of the part that inducing points approximate, `(components, n)`."""
-        if self._variance is None:
-            return next(iter(features.values())).new_zeros(self.components, points(features))
-        return self._variance(features)
-
     @cached_property
-    def _variance(self) -> Callable[[Features], Tensor] | None:
+    def rest_variance(self) -> Callable[[Features], Tensor]:
+        """x ↦ prior variance `(components, n)` of the part that inducing points approximate."""
         rest = self.split.rest
-        return None if rest is None else rest.kernel.variance(self._rest_params)
-
-    @cached_property
-    def _rest_params(self) -> dict[str, Tensor]:
-        assert self.split.rest is not None
-        return self.split.rest.parameters(self.params)
+        if rest is None:
+            return lambda x: next(iter(x.values())).new_zeros(self.components, points(x))
+        return rest.kernel.variance(rest.params)
 
     def evaluate(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
         """The basis functions at n samples `(n, Σ sizes)`, and their share in `LatentBasis.evaluate`."""
@@ -278,7 +248,7 @@ class LatentBasis:
     @cached_property
     def columns(self) -> tuple[slice, ...]:
         """The basis functions of each component, the components of all processes in order."""
-        sizes = [size for part in self.parts for size in part.sizes]
+        sizes = [size for part in self.parts for size in part.used.sum(-1).tolist()]
         ends = torch.tensor([0, *sizes]).cumsum(0).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
@@ -331,7 +301,7 @@ class LatentBasis:
             saved = [sub(tensors, f"{p}.{k}") for k in range(components if f"{p}.0.values" in tensors else 0)]
             spectra = tuple(Spectrum(s["values"], s["vectors"], int(s["dropped"])) for s in saved)
             own = sub(params, process.prefix)
-            parts.append(ProcessBasis(split(process.kernel), own, components, inducing, spectra))
+            parts.append(ProcessBasis(process.kernel, own, components, inducing, spectra))
         return cls(tuple(processes), dict(params), tuple(parts))
 
     def of_process(self, p: int) -> slice:
@@ -370,11 +340,10 @@ def latent_basis(
     """
     parts = []
     for process, Z, count in zip(processes, inducing, components, strict=True):
-        process_params, kernel = sub(params, process.prefix), split(process.kernel)
-        spectra: tuple[Spectrum, ...] = ()
-        if kernel.rest is not None and points(Z):
+        part = ProcessBasis(process.kernel, sub(params, process.prefix), count, Z, ())
+        if (rest := part.split.rest) is not None and points(Z):
             # K_zz = U Λ Uᵀ
-            K = kernel.rest.kernel.covariance(kernel.rest.parameters(process_params), Z, Z)
-            spectra = tuple(Spectrum.of(0.5 * (k + k.mT)) for k in K)
-        parts.append(ProcessBasis(kernel, process_params, count, Z, spectra))
+            K = rest.kernel.covariance(rest.params, Z, Z)
+            part = replace(part, spectra=tuple(Spectrum.of(0.5 * (k + k.mT)) for k in K))
+        parts.append(part)
     return LatentBasis(tuple(processes), dict(params), tuple(parts))

@@ -13,7 +13,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from forcegp.gp.basis import ProcessBasis, latent_basis
+from forcegp.gp.basis import ProcessBasis, latent_basis, split
 from forcegp.gp.features import Block, Features, components_of, rows_of
 from forcegp.gp.kernels import Parameters, Process
 from forcegp.gp.likelihood import Gradient, Valued, with_gradient
@@ -149,20 +149,19 @@ class _BoundGradient:
         params, x = _leaves(part.params), _leaves(features, self.deep)
         outputs, gradients = [], []
         with torch.enable_grad():
-            rest, finite = part.split.rest, part.split.finite
-            if rest is not None:
-                rest_params = rest.parameters(params)
+            kernels = split(part.kernel, params)
+            if (rest := kernels.rest) is not None:
                 # d k(x, x) = ½ S_kk
-                outputs.append(rest.kernel.diagonal(rest_params, x))
+                outputs.append(rest.kernel.diagonal(rest.params, x))
                 gradients.append(weight[:, self.basis.components[p]].mT)
                 if part.spectra:
                     # V = k(x, Z) R: dR += k(Z, x) dV, dk(x, Z) = dV Rᵀ
-                    kernel = rest.kernel.covariance(rest_params, x, part.inducing)
+                    kernel = rest.kernel.covariance(rest.params, x, part.inducing)
                     self.roots[p] = self.roots[p] + kernel.detach().mT @ filled[..., :width]
                     outputs.append(kernel)
                     gradients.append(filled[..., :width] @ part.roots.mT)
-            if finite is not None:
-                outputs.append(finite.features(params, part.inducing).basis(x))
+            if kernels.finite is not None:
+                outputs.append(kernels.finite.features(part.inducing).basis(x))
                 gradients.append(filled[..., width:])
         return self._add(prefix, params, x if self.deep else {}, outputs, gradients, p)
 
@@ -178,23 +177,21 @@ class _BoundGradient:
         """Add what arrives at hyperparameters; return what arrives at kernel inputs."""
         leaves = {("param", f"{prefix}.{key}"): value for key, value in params.items()}
         leaves |= {("feature", p, key): value for key, value in x.items()}
-        grads = torch.autograd.grad(outputs, list(leaves.values()), gradients, allow_unused=True)
-        by_feature: Gradient = {}
-        for (place, leaf), grad in zip(leaves.items(), grads, strict=True):
-            value = torch.zeros_like(leaf) if grad is None else grad
-            if place[0] == "feature":
-                by_feature[place] = value
-            else:
-                self.total[place] = self.total[place] + value if place in self.total else value
-        return by_feature
+        inputs = list(leaves.values())
+        grads = torch.autograd.grad(outputs, inputs, gradients, allow_unused=True, materialize_grads=True)
+        found = dict(zip(leaves, grads, strict=True))
+        for place in [place for place in found if place[0] == "param"]:
+            value = found.pop(place)
+            self.total[place] = self.total[place] + value if place in self.total else value
+        return found
 
     def _through_inducing(self, part: ProcessBasis, prefix: str, dR: Tensor) -> None:
         """Derivatives through K_zz."""
-        rest = part.split.rest
-        assert rest is not None
         params = _leaves(part.params)
         with torch.enable_grad():
-            K = rest.kernel.covariance(rest.parameters(params), part.inducing, part.inducing)
+            rest = split(part.kernel, params).rest
+            assert rest is not None
+            K = rest.kernel.covariance(rest.params, part.inducing, part.inducing)
         dK = torch.stack([s.pull_back(d) for s, d in zip(part.spectra, dR, strict=True)])
         self._add(prefix, params, {}, [K], [dK])
 

@@ -143,12 +143,11 @@ def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> 
         Functions `(k or 1, ·, terms)`, each with weights `(k, terms, samples)`.
     """
     if isinstance(kernel, Sum) and not isinstance(kernel, Product):
-        sides = ((getattr(kernel, side), sub(params, side)) for side in ("left", "right"))
-        return [term for k, theta in sides for term in kernel_terms(k, theta, X, w)]
-    finite = split(kernel)
-    if finite.rest is None and finite.finite is not None:
+        return [term for k, theta in kernel.parts(params) for term in kernel_terms(k, theta, X, w)]
+    parts = split(kernel, params)
+    if parts.rest is None and parts.finite is not None:
         # k(x, X) w = φ(x)ᵀ (φ(X) w)
-        draw = finite.finite.features(params, X)
+        draw = parts.finite.features(X)
         return [(draw.basis, draw.basis(X).mT @ w)]
     common = _common(kernel, params, X)
     if common is None:
@@ -179,7 +178,7 @@ def _common(
 
         return functions, [size, bias]
     if isinstance(kernel, Product):
-        left, right = (_common(getattr(kernel, side), sub(params, side), X) for side in ("left", "right"))
+        left, right = (_common(side, theta, X) for side, theta in kernel.parts(params))
         if left is not None and right is not None:
             functions_of = (left[0], right[0])
             return (
@@ -220,7 +219,7 @@ def _terms(
     rest = part.split.rest
     if rest is not None:
         # f_prior(Z) = φ(Z)ᵀ u with u ~ N(0, I)
-        draw = rest.kernel.draw(rest.parameters(part.params), part.inducing, features, generator)
+        draw = rest.kernel.draw(rest.params, part.inducing, features, generator)
         count = draw.basis(part.inducing).shape[-1]
         shape = (part.components, count, weights.shape[1])
         u = torch.randn(shape, dtype=torch.float64, generator=generator).to(weights)
@@ -229,7 +228,7 @@ def _terms(
         if part.to_inducing is not None:
             # R Rᵀ f_prior(Z) are the weights of k(x, Z) that interpolate the prior function.
             w = on_kernel - part.roots @ (part.roots.mT @ at_points)
-            terms += kernel_terms(rest.kernel, rest.parameters(part.params), part.inducing, w)
+            terms += kernel_terms(rest.kernel, rest.params, part.inducing, w)
     if part.finite is not None:
         terms.append((part.finite.basis, on_features))
     return terms

@@ -119,10 +119,10 @@ class ExactPosterior:
 
     @cached_property
     def _weights(self) -> list[list[Tensor]]:
-        """By process and block, `(components, n)`: the mean is k(x, X) times these weights."""
-        return self.weights_of(self.alpha[:, None], squeeze=True)
+        """By process and block, `(components, n, 1)`: the mean is k(x, X) times these weights."""
+        return self.weights_of(self.alpha[:, None])
 
-    def weights_of(self, rows: Tensor, squeeze: bool = False) -> list[list[Tensor]]:
+    def weights_of(self, rows: Tensor) -> list[list[Tensor]]:
         """Wᵀ applied to vectors over the rows `(rows, s)`, by process and block `(components, n, s)`."""
         weights: list[list[Tensor]] = [[] for _ in self.processes]
         first = 0
@@ -130,8 +130,7 @@ class ExactPosterior:
             by_sample = rows[first : first + block.rows].unflatten(0, block.target.shape)
             first += block.rows
             for p, W in enumerate(block.operators):
-                weighted = torch.einsum("nak,nas->kns", W, by_sample)
-                weights[p].append(weighted[..., 0] if squeeze else weighted)
+                weights[p].append(torch.einsum("nak,nas->kns", W, by_sample))
         return weights
 
     @cached_property
@@ -149,7 +148,7 @@ class ExactPosterior:
             return x.new_zeros(len(x), components)
         # μ(x) = k(x, X) Wᵀα (eqs. 11 and 23)
         parts = [
-            (kernel(features) @ w[..., None])[..., 0]
+            (kernel(features) @ w)[..., 0]
             for kernel, w in zip(self.kernels_to_data[p], self._weights[p], strict=True)
         ]
         return sum(parts[1:], start=parts[0]).mT

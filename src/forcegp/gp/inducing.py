@@ -91,28 +91,26 @@ def select_inducing(
         names = blocks[0].features[p]
         x = {name: torch.cat([block.features[p][name] for block in blocks]) for name in names}
         weight = torch.cat([(block.operators[p] ** 2).sum(1) for block in blocks]).mT / candidate_rows
-        rest = split(prior.kernel).rest
-        process_params = sub(params, prior.prefix)
-        chosen.append(_greedy(rest, process_params, x, weight, limit, tolerance))
+        rest = split(prior.kernel, sub(params, prior.prefix)).rest
+        chosen.append(_greedy(rest, x, weight, limit, tolerance))
     return chosen
 
 
-def _greedy(
-    rest: KernelPart | None, whole: Parameters, x: Features, weight: Tensor, limit: int, tolerance: float
-) -> Selection:
+def _greedy(rest: KernelPart | None, x: Features, weight: Tensor, limit: int, tolerance: float) -> Selection:
     """Pivoted partial Cholesky factorisation of every component with common pivots."""
     none = Selection({name: value[:0] for name, value in x.items()}, weight.new_zeros(1))
     if rest is None or not bool(weight.any()):
         return none
-    params = rest.parameters(whole)
-    prior = rest.kernel.diagonal(params, x)
+    prior = rest.kernel.diagonal(rest.params, x)
     residual = prior.clone()
     columns = prior.new_zeros(len(prior), min(limit, points(x)), points(x))
     kept, functions, missed = [], 0, [float((weight * residual).sum())]
     while len(kept) < columns.shape[1] and missed[-1] > tolerance * functions:
         # i = argmax Σ_k S_kk Var(f_k(x_i) | f(Z))
         i = int((weight * residual).sum(0).argmax())
-        k = rest.kernel.covariance(params, x, {name: value[i : i + 1] for name, value in x.items()})[..., 0]
+        k = rest.kernel.covariance(rest.params, x, {name: value[i : i + 1] for name, value in x.items()})[
+            ..., 0
+        ]
         # ℓ = (k(X, x_i) − Lᵀ L_i) / √d_i
         so_far = columns[:, : len(kept)]
         k = k - (so_far[..., i, None].mT @ so_far)[:, 0]

@@ -94,10 +94,10 @@ class Kernel(ABC):
         return Product(self, other)
 
 
-def _sides(left: Initial, right: Initial) -> Initial:
+def sides(left: Parameters, right: Parameters) -> Initial:
     """The hyperparameters of two kernels in one dictionary."""
-    sides = {"left": left, "right": right}
-    return {f"{side}.{key}": value for side, part in sides.items() for key, value in part.items()}
+    parts = (("left", left), ("right", right))
+    return {f"{side}.{key}": value for side, part in parts for key, value in part.items()}
 
 
 def width_of(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
@@ -306,7 +306,7 @@ class Sum(Kernel):
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         half = log_std - 0.5 * math.log(2.0)
-        return _sides(self.left.initial(outputs, widths, half), self.right.initial(outputs, widths, half))
+        return sides(self.left.initial(outputs, widths, half), self.right.initial(outputs, widths, half))
 
     @staticmethod
     def combined(left: Tensor, right: Tensor) -> Tensor:
@@ -317,18 +317,21 @@ class Sum(Kernel):
     def is_finite(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.left.is_finite and self.right.is_finite
 
+    def parts(self, params: Parameters) -> tuple[tuple[Kernel, Initial], tuple[Kernel, Initial]]:
+        """Both kernels, with their hyperparameters."""
+        return (self.left, sub(params, "left")), (self.right, sub(params, "right"))
+
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
-        left = self.left.towards(sub(params, "left"), x2)
-        right = self.right.towards(sub(params, "right"), x2)
+        left, right = (kernel.towards(theta, x2) for kernel, theta in self.parts(params))
         return lambda x1: self.combined(left(x1), right(x1))
 
     def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
-        left, right = self.left.variance(sub(params, "left")), self.right.variance(sub(params, "right"))
+        left, right = (kernel.variance(theta) for kernel, theta in self.parts(params))
         return lambda x: self.combined(left(x), right(x))
 
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        left = self.left.draw(sub(params, "left"), x, features, generator)
-        return left + self.right.draw(sub(params, "right"), x, features, generator)
+        left, right = (kernel.draw(theta, x, features, generator) for kernel, theta in self.parts(params))
+        return left + right
 
 
 @dataclass(frozen=True)
@@ -336,7 +339,7 @@ class Product(Sum):
     """k = k_1 k_2; the second factor starts at unit size."""
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
-        return _sides(self.left.initial(outputs, widths, log_std), self.right.initial(outputs, widths))
+        return sides(self.left.initial(outputs, widths, log_std), self.right.initial(outputs, widths))
 
     @staticmethod
     def combined(left: Tensor, right: Tensor) -> Tensor:
@@ -350,7 +353,7 @@ class Product(Sum):
             if isinstance(inner, Sum) and not isinstance(inner, Product):
                 terms = (
                     Product(getattr(inner, part), getattr(self, other)).draw(
-                        _sides(sub(params, f"{side}.{part}"), sub(params, other)), x, features, generator
+                        sides(sub(params, f"{side}.{part}"), sub(params, other)), x, features, generator
                     )
                     for part in ("left", "right")
                 )
@@ -358,8 +361,7 @@ class Product(Sum):
         linear = max(_linear_factors(self.left), _linear_factors(self.right))
         # A linear factor has few features and all of them matter, so the other one is given fewer.
         few = max(1, features // (LINEAR_PAIRS * linear)) if linear else features
-        left = self.left.draw(sub(params, "left"), x, few, generator)
-        right = self.right.draw(sub(params, "right"), x, few, generator)
+        left, right = (kernel.draw(theta, x, few, generator) for kernel, theta in self.parts(params))
         return left * right if linear else left.paired(right, features, generator)
 
 

@@ -303,20 +303,25 @@ def with_gradient(
     """The value of a function that knows its own derivatives, as a node of the autograd graph.
 
     Args:
-        function: of detached hyperparameters and rows; its derivatives are asked for right after the value.
+        function: of hyperparameters and rows, called without a graph; its derivatives are asked for right
+            after the value.
         params, blocks: what it is evaluated at.
     """
-    named = dict(_tensors_of(params, blocks))
-    return _WithGradient.apply(function, list(named), *named.values())  # pyright: ignore[reportReturnType]
+    named: dict[Place, Tensor] = {("param", key): x for key, x in params.items()}
+    for g, block in enumerate(blocks):
+        for p, (features, W) in enumerate(zip(block.features, block.operators, strict=True)):
+            named |= {("feature", g, p, name): x for name, x in features.items()}
+            named["operator", g, p] = W
+        named["target", g] = block.target
+    return _WithGradient.apply(lambda: function(params, blocks), list(named), *named.values())  # pyright: ignore[reportReturnType]
 
 
 class _WithGradient(torch.autograd.Function):
     """Computes the gradient beside the value, while what both need is at hand."""
 
     @staticmethod
-    def forward(ctx: Any, function: Any, places: list[Place], *tensors: Tensor) -> Tensor:
-        params, blocks = _from_tensors(dict(zip(places, (t.detach() for t in tensors), strict=True)))
-        value, gradient_of = function(params, blocks)
+    def forward(ctx: Any, function: Callable[[], Valued], places: list[Place], *tensors: Tensor) -> Tensor:
+        value, gradient_of = function()
         ctx.wanted = [i for i, need in enumerate(ctx.needs_input_grad[2:]) if need]
         if ctx.wanted:
             gradient = gradient_of(any(places[i][0] != "param" for i in ctx.wanted))
@@ -331,32 +336,3 @@ class _WithGradient(torch.autograd.Function):
         for i, saved in zip(ctx.wanted, ctx.saved_tensors, strict=True):
             gradients[2 + i] = grad[0] * saved
         return tuple(gradients)
-
-
-def _tensors_of(params: Parameters, blocks: Sequence[Block]) -> Iterator[tuple[Place, Tensor]]:
-    """Every tensor that a likelihood depends on, by its place."""
-    for key, value in params.items():
-        yield ("param", key), value
-    for g, block in enumerate(blocks):
-        for p, (features, W) in enumerate(zip(block.features, block.operators, strict=True)):
-            for name, x in features.items():
-                yield ("feature", g, p, name), x
-            yield ("operator", g, p), W
-        yield ("target", g), block.target
-
-
-def _from_tensors(named: Mapping[Place, Tensor]) -> tuple[dict[str, Tensor], list[Block]]:
-    """Hyperparameters and blocks of the tensors of `_tensors_of`."""
-    params = {place[1]: x for place, x in named.items() if place[0] == "param"}
-    features: dict[int, dict[int, dict[str, Tensor]]] = {}
-    operators: dict[int, list[Tensor]] = {}
-    for place, x in named.items():
-        if place[0] == "feature":
-            features.setdefault(place[1], {}).setdefault(place[2], {})[place[3]] = x
-        elif place[0] == "operator":
-            operators.setdefault(place[1], []).append(x)
-    blocks = [
-        Block(tuple(features[g][p] for p in range(len(W))), tuple(W), named["target", g])
-        for g, W in operators.items()
-    ]
-    return params, blocks

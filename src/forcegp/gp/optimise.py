@@ -18,6 +18,8 @@ from forcegp.errors import ModelError, NumericalError, UnknownNameError
 Objective = Callable[[dict[str, Tensor]], Tensor]
 Progress = Callable[[int, float, dict[str, Tensor]], None]
 """Called after each evaluation with their number, the objective, and the best tensors so far."""
+FitProgress = Callable[[int, int, float], None]
+"""Called with the number of evaluations, their maximum, and the objective."""
 Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
 """Box of each tensor: a lower and an upper bound of all its entries, or of each."""
 
@@ -95,6 +97,13 @@ class Learned:
     doubts: tuple[str, ...] = ()
 
 
+def reported(progress: FitProgress | None, most: int, before: int = 0) -> Progress | None:
+    """The progress of an optimisation of at most so many evaluations, after those `before`."""
+    if progress is None:
+        return None
+    return lambda evaluations, value, _: progress(before + evaluations, most, value)
+
+
 class _SpentError(Exception):
     """The evaluations allowed are spent."""
 
@@ -110,16 +119,15 @@ class _Recorder:
     def __call__(self, tensors: dict[str, Tensor]) -> tuple[float, dict[str, Tensor]]:
         leaves = {key: value.detach().clone().requires_grad_() for key, value in tensors.items()}
         objective = self.objective(leaves)
-        grads = torch.autograd.grad(objective, list(leaves.values()), allow_unused=True)
+        inputs = list(leaves.values())
+        grads = torch.autograd.grad(objective, inputs, allow_unused=True, materialize_grads=True)
         value = float(objective.detach())
         self.history.append(value)
         if value < self.value:
             self.value, self.best = value, {key: leaf.detach() for key, leaf in leaves.items()}
         if self.progress is not None:
             self.progress(len(self.history), value, self.best)
-        zero = (torch.zeros_like(leaf) for leaf in leaves.values())
-        pairs = zip(leaves, grads, zero, strict=True)
-        return value, {key: z if grad is None else grad for key, grad, z in pairs}
+        return value, dict(zip(leaves, grads, strict=True))
 
 
 def minimise(
@@ -129,7 +137,6 @@ def minimise(
     analytical: frozenset[str] = frozenset(),
     bounds: Bounds | None = None,
     progress: Progress | None = None,
-    first_step: float = FIRST_STEP,
 ) -> Learned:
     """Minimise an objective over tensors.
 
@@ -140,7 +147,6 @@ def minimise(
         analytical: names of the analytical parameters θ_A, which have an ADAM of their own.
         bounds: box of each tensor, for L-BFGS.
         progress: called after each evaluation.
-        first_step: largest change of an entry in the first step of L-BFGS.
 
     Raises:
         NumericalError: the objective is not finite at the start.
@@ -148,7 +154,7 @@ def minimise(
     began = time.perf_counter()
     recorder = _Recorder(objective, start, progress)
     if options.optimizer == "lbfgs":
-        converged, message = _lbfgs(recorder, start, options, bounds or {}, first_step)
+        converged, message = _lbfgs(recorder, start, options, bounds or {})
     else:
         converged, message = _adam(recorder, start, options, analytical, bounds or {})
     if not np.isfinite(recorder.value):
@@ -164,7 +170,6 @@ def _lbfgs(
     start: Mapping[str, Tensor],
     options: LearningOptions,
     bounds: Bounds,
-    first_step: float,
 ) -> tuple[bool, str]:
     def function(x: np.ndarray) -> tuple[float, np.ndarray]:
         # SciPy counts between iterations only, so a line search would go on beyond the limit.
@@ -182,7 +187,7 @@ def _lbfgs(
         return False, "not finite at the start"
     # In a box, L-BFGS-B's first step is the whole gradient, to the corners of the box where that is steep. In
     # units of √(first step ÷ gradient) the gradient is that step.
-    unit = min(1.0, math.sqrt(first_step / max(steepest, 1e-300)))
+    unit = min(1.0, math.sqrt(FIRST_STEP / max(steepest, 1e-300)))
 
     def scaled(u: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = function(np.clip(x + unit * u, low, high)) if u.any() else first
@@ -233,14 +238,11 @@ def _adam(
     bounds: Bounds,
 ) -> tuple[bool, str]:
     tensors = {key: value.detach().clone() for key, value in start.items()}
-    optimizers = [
-        torch.optim.Adam([tensors[key] for key in keys], lr=rate)
-        for keys, rate in (
-            ([key for key in tensors if key not in analytical], options.learning_rate),
-            ([key for key in tensors if key in analytical], options.analytical_learning_rate),
-        )
-        if keys
-    ]
+    rates = {False: options.learning_rate, True: options.analytical_learning_rate}
+    optimizer = torch.optim.Adam(
+        {"params": [x for key, x in tensors.items() if (key in analytical) == own], "lr": rate}
+        for own, rate in rates.items()
+    )
     since = 0
     for _ in range(options.max_evaluations):
         best = recorder.value
@@ -250,6 +252,5 @@ def _adam(
             return True, f"no improvement within {options.patience} evaluations"
         for key, tensor in tensors.items():
             tensor.grad = grads[key]
-        for optimizer in optimizers:
-            optimizer.step()
+        optimizer.step()
     return False, f"stopped after {options.max_evaluations} evaluations"

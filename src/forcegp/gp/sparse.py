@@ -16,7 +16,7 @@ information form, with A = I + G, v, the drifting weights p and the others o,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import torch
@@ -61,7 +61,7 @@ def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
     G[p[:, None], p[None, :]] = a * eye - (factor * a) ** 2 * inverse - eye
     v[p] = factor * a * (inverse @ sums.v[p])
     yy = sums.yy - sums.v[p] @ (inverse @ sums.v[p])
-    return Sums(v, yy, sums.rows, sums.prior, sums.missed, G)
+    return replace(sums, v=v, yy=yy, G=G)
 
 
 MISSED = 0.1
@@ -89,7 +89,7 @@ class Diagnostics:
         return self.missed > MISSED * self.learned
 
 
-MOMENTS = ("v", "yy", "rows", "prior", "missed")
+MOMENTS = tuple(field.name for field in fields(Moments))
 """Names of the sums in saved posteriors."""
 CHUNK_PREDICTIONS = 256
 """Samples whose covariance is computed at a time."""
@@ -124,7 +124,7 @@ class SparsePosterior:
         # A = I + G = L Lᵀ
         A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
         L, jitter = cholesky(A)
-        result = cls(basis, Moments(*sums.moments), L, jitter)
+        result = cls(basis, Moments(*sums.tensors[:-1]), L, jitter)
         result.__dict__["sums"] = sums
         return result
 
@@ -172,7 +172,7 @@ class SparsePosterior:
     def sums(self) -> Sums:
         """All sums over the samples, G from the factor where samples were added to it."""
         eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
-        return Sums(*self.moments.moments, self.L @ self.L.mT - (1.0 + self.jitter) * eye)
+        return Sums(**vars(self.moments), G=self.L @ self.L.mT - (1.0 + self.jitter) * eye)
 
     @cached_property
     def weights(self) -> Tensor:
@@ -223,8 +223,7 @@ class SparsePosterior:
         G = self.L @ self.L.mT - torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
         v = self.moments.v - G[:, own] @ weights
         G[own], G[:, own], v[own] = 0.0, 0.0, 0.0
-        _, yy, rows, prior, missed = self.moments.moments
-        return SparsePosterior.of(self.basis, Sums(v, yy, rows, prior, missed, G))
+        return SparsePosterior.of(self.basis, Sums(**vars(replace(self.moments, v=v)), G=G))
 
     @cached_property
     def _inverse_factor(self) -> list[Tensor]:

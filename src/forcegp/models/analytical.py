@@ -16,53 +16,32 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.files import Record
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
-from forcegp.forces.quantities import affine_maps, flat_states, states
-from forcegp.gp.optimise import Learned, LearningOptions, minimise
-from forcegp.models.base import FitProgress, FittedModel, ForceField, Model, Prediction
+from forcegp.forces.quantities import FlatStates, affine_maps, states
+from forcegp.gp.optimise import LearningOptions
+from forcegp.models.base import FitProgress, Model, PointwiseFit
 from forcegp.models.fit_result import FitResult
-from forcegp.models.minibatch import BatchOptions, Loss, train
+from forcegp.models.minibatch import BatchOptions, train
 from forcegp.robot.parameters import AnalyticalParameters
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
-from forcegp.storage.model_file import ModelHeader, settings_of
-from forcegp.storage.options import Settings
+from forcegp.rollout.law import ForceField
+from forcegp.storage.model_file import ModelHeader
+from forcegp.storage.options import Window
 from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
 
 KIND = "analytical"
-Tensors = dict[str, Tensor]
 LearnedParameters = Mapping[str, Sequence[str] | Literal["all"]]
 EVERY_LINK: LearnedParameters = {"inertia": "all", "damping": "all"}
 """Mass, centre of mass and rotational inertia of every link, and the viscous friction of every joint."""
 ADAM = BatchOptions(epochs=30, batch=128, learning_rate=0.05, patience=10)
-CHUNK_STATES = 4096
-"""States predicted at a time, which bounds the memory."""
 
 
-@dataclass(frozen=True)
-class Window:
-    """How far from the parameters of the robot file learning starts.
-
-    Args:
-        relative: half width for logarithms of masses, moments and friction; 0.5 is a factor of 0.37 to
-            2.7 for the mass of a link, and of 0.61 to 1.65 for friction.
-        length: half width for centres of mass and other lengths [m].
-        angle: half width for turns [rad].
-    """
-
-    relative: float = 0.5
-    length: float = 0.05
-    angle: float = 0.1
-
-
-class AnalyticalSettings(Settings):
+class AnalyticalSettings(Window):
     """What is kept of an analytical model besides its tensors; the robot is the learned one."""
 
     analytical_parameters: dict[str, tuple[str, ...]]
-    relative: float
-    length: float
-    angle: float
     seed: int
 
 
@@ -77,17 +56,6 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         analytical_parameters: what is learned: joint names by quantity, as for `AnalyticalParameters`.
         window: how far from the parameters of the file learning starts.
         seed: of the start.
-
-    Example:
-        >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-        >>> t = torch.arange(20, dtype=torch.float64)
-        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = AnalyticalModel(system).fit(data)
-        >>> fit.predict(q, qd, tau).mean.shape
-        torch.Size([20, 2])
 
     Raises:
         UnknownNameError, ModelError, InertiaError: `analytical_parameters` do not fit the robot.
@@ -129,11 +97,10 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         Raises:
             ModelError, DataError: the data do not fit the model.
         """
-        options = options or ADAM
         measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system)
-        generator, width = torch.Generator().manual_seed(self.seed), self.window
+        generator = torch.Generator().manual_seed(self.seed)
         theta = AnalyticalParameters(self.parameters.start, self.parameters.joints)
-        theta.reset(generator, relative=width.relative, length=width.length, angle=width.angle)
+        theta.reset(generator, **dict(self.window))
         start = {name: value.detach().clone() for name, value in theta.named_parameters()}
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
@@ -141,14 +108,8 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             return _mean_squared_error(self.system.with_robot(robot), measured, rows)
 
         record, robot = pack_system(self.system)
-        begin = (part for pair in start.items() for part in pair)
-        key = (options, self.seed, record, *robot.values(), *measured.tensors, *begin)
-        if isinstance(options, BatchOptions):
-            saved = None if checkpoint is None else Checkpoint(Path(checkpoint), Checkpoint.key_of(*key))
-            learned = train(loss, start, len(measured.q), options, generator, progress, saved)
-        else:
-            evaluations = Evaluations.resumed(checkpoint, start, *key)
-            learned = _minimise(loss, start, len(measured.q), options, progress, evaluations)
+        key = (self.seed, record, *robot.values(), *measured.tensors)
+        learned = train(loss, start, len(measured.q), options or ADAM, generator, progress, checkpoint, key)
         theta.load_state_dict(learned.tensors)
         with torch.no_grad():
             system = self.system.with_robot(theta())
@@ -161,7 +122,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class AnalyticalFit(FittedModel):
+class AnalyticalFit(PointwiseFit):
     """The equations of motion of a robot with learned parameters.
 
     Attributes:
@@ -182,37 +143,12 @@ class AnalyticalFit(FittedModel):
     def described(self) -> list[tuple[str, object]]:
         return [(name, getattr(self.system.robot, name)) for name in ("mass", "damping")]
 
-    @torch.no_grad()
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: str | Sequence[str] = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-        system: ConstrainedSystem | None = None,
-    ) -> Prediction:
-        """Values `(*batch, d)` by the equations of motion; there is no covariance.
-
-        The arguments are those of `Predictor.predict`; `quantity` may be several names.
-
-        Raises:
-            UnknownNameError: no such quantity.
-            ShapeError: a state does not fit the robot.
-        """
-        system = system or self.system
-        flat = flat_states(system, q, qd, tau, active)
-        values: list[Tensor] = []
-        parts: dict[str, slice] = {}
-        for first in range(0, max(len(flat.q), 1), CHUNK_STATES):
-            chunk = flat.rows(slice(first, first + CHUNK_STATES))
-            at = states(system, chunk.q, chunk.qd, chunk.tau, chunk.active)
-            z, parts = affine_maps(system, at, quantity)
-            values.append(z.o + (z.B_Q @ AnalyticalMean()(system, at)[..., None])[..., 0])
-        mean = torch.cat(values)
-        return Prediction(mean.reshape(*flat.batch, mean.shape[-1]), None, parts)
+    def at(
+        self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
+    ) -> tuple[Tensor, None, dict[str, slice]]:
+        here = states(system, at.q, at.qd, at.tau, at.active)
+        z, parts = affine_maps(system, here, quantity)
+        return z.o + (z.B_Q @ AnalyticalMean()(system, here)[..., None])[..., 0], None, parts
 
     def force_field(self) -> ForceField:
         """Q_C + Q_G + Q_D + Q_u at states."""
@@ -222,56 +158,27 @@ class AnalyticalFit(FittedModel):
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> AnalyticalFit:
-        settings = settings_of(header, AnalyticalSettings, source)
+        settings = header.settings_as(AnalyticalSettings, source)
         original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
-        window = Window(settings.relative, settings.length, settings.angle)
+        window = Window(relative=settings.relative, length=settings.length, angle=settings.angle)
         try:
             model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
         except ForceGPError as cause:
             raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
+        theta = model.parameters
         state = {
             name: take(tensors, name, tuple(old.shape), old.dtype, source)
-            for name, old in model.parameters.state_dict().items()
+            for name, old in theta.state_dict().items()
         }
-        theta = AnalyticalParameters(original.robot, settings.analytical_parameters)
         theta.load_state_dict(state)
         result = FitResult(True, 0, 0.0, 0.0, message="loaded")
         return cls(system, theta, window, settings.seed, result)
 
-    def record(self) -> tuple[Settings, dict[str, Tensor]]:
-        theta, width = self.parameters, self.window
-        settings = AnalyticalSettings(
-            analytical_parameters=theta.joints,
-            relative=width.relative,
-            length=width.length,
-            angle=width.angle,
-            seed=self.seed,
-        )
+    def record(self) -> tuple[Record, dict[str, Tensor]]:
+        theta = self.parameters
+        settings = AnalyticalSettings(**dict(self.window), analytical_parameters=theta.joints, seed=self.seed)
         start = {f"start.{name}": getattr(theta.start, name) for name in robot_tensors(theta.start)}
         return settings, dict(theta.state_dict()) | start
-
-
-def _minimise(
-    loss: Loss,
-    start: dict[str, Tensor],
-    samples: int,
-    options: LearningOptions,
-    progress: FitProgress | None,
-    saved: Evaluations,
-) -> Learned:
-    """Minimise over all samples at once."""
-    rows = torch.arange(samples, device=next(iter(start.values())).device)
-
-    def report(evaluations: int, value: float, _: dict[str, Tensor]) -> None:
-        if progress is not None:
-            progress(evaluations, options.max_evaluations, value)
-
-    def objective(tensors: Tensors) -> Tensor:
-        return loss(tensors, rows)
-
-    learned = minimise(saved.recorded(objective), start, options, progress=report)
-    saved.write()
-    return learned
 
 
 def _mean_squared_error(system: ConstrainedSystem, measured: Measurement, rows: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from forcegp.forces.observations import NoiseStd
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.analytical import ADAM, AnalyticalModel, Window
+from forcegp.models.analytical import ADAM, AnalyticalModel
 from forcegp.models.base import FitProgress, FittedModel, Model
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import DEEP, SHALLOW, NeuralNetwork
@@ -119,8 +119,6 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
             value = at(("model", "mean"), AnalyticalMean, value)
         elif key == "priors" and not isinstance(value, str):
             value = _priors(table, value)
-        elif key == "window":
-            value = Window(**table.section.window.given())
         elif key == "analytical_parameters":
             theta = at(("model", key), AnalyticalParameters, system.robot, value)
             value = theta if made is StructuredGP else value

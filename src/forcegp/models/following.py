@@ -97,11 +97,12 @@ def _knowing(
         else prior
         for p, prior in enumerate(fit.posterior.priors)
     )
+    process = dataclasses.replace(fit.posterior.process, priors=updated_priors)
     return dataclasses.replace(
         fit,
         specification=dataclasses.replace(fit.specification, priors=updated_priors),
         problem=dataclasses.replace(fit.problem, priors=updated_priors),
-        posterior=dataclasses.replace(fit.posterior, priors=updated_priors),
+        posterior=dataclasses.replace(fit.posterior, process=process),
     )
 
 

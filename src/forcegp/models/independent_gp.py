@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.files import Record
 from forcegp.forces.inference import require_double
 from forcegp.forces.noise import Noise
 from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
@@ -26,20 +28,18 @@ from forcegp.forces.start import box_around, doubts_at_bounds, initial_hyperpara
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
-from forcegp.gp.optimise import Learned, LearningOptions, Progress, minimise
+from forcegp.gp.optimise import Learned, LearningOptions, minimise, reported
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
 from forcegp.storage.checkpoint import Evaluations
-from forcegp.storage.model_file import ModelHeader, settings_of
-from forcegp.storage.options import KernelOptions, Settings
+from forcegp.storage.model_file import ModelHeader
+from forcegp.storage.options import KernelOptions
 from forcegp.storage.system import take
 
 KIND = "independent_gp"
 LEARNING = 6
 """Matrices over the samples that learning one joint holds besides the factors of all joints; measured."""
-CHUNK_STATES = 2000
-"""States predicted at a time, which bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,26 @@ class IndependentTraining:
     noise_std: Tensor
     scale: Standardization
 
-    def block(self, joint: int) -> Block:
-        """The accelerations of one joint in units of their noise."""
-        inverse = 1.0 / self.noise_std.expand_as(self.qdd)[:, joint : joint + 1]
-        inputs = self.scale.apply(self.features)
-        return Block((inputs,), (inverse[..., None],), self.qdd[:, joint : joint + 1] * inverse)
+    def processes(self) -> list[tuple[JointForcePrior, Block, Tensor]]:
+        """Of each joint, its process, its accelerations in units of their noise, and Σ log of that noise.
 
-    def constant(self, joint: int) -> float:
-        """Normalisation of the noise of one joint."""
-        return float(self.noise_std.expand_as(self.qdd)[:, joint].log().sum())
+        The likelihood reads only name and kernel of a process.
+        """
+        inputs, noise = self.scale.apply(self.features), self.noise_std.expand_as(self.qdd)
+        columns = enumerate(zip(self.qdd.split(1, dim=1), noise.split(1, dim=1), strict=True))
+        return [
+            (
+                JointForcePrior(name=f"qdd_{joint}"),
+                Block((inputs,), ((1.0 / std)[..., None],), qdd * (1.0 / std)),
+                std.log().sum(),
+            )
+            for joint, (qdd, std) in columns
+        ]
+
+    def announce(self, copies: int) -> None:
+        """Announce the matrices of all joints, two each beside those that learning holds."""
+        n, nq = self.qdd.shape
+        announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
 
 
 class IndependentSettings(KernelOptions):
@@ -88,17 +99,6 @@ class IndependentGP(Model["IndependentFit"]):
 
     Raises:
         ModelError: the robot is not float64, or `noise` states more than that of accelerations.
-
-    Example:
-        >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-        >>> t = torch.arange(20, dtype=torch.float64)
-        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = IndependentGP(system, noise=0.1).fit(data)
-        >>> fit.predict(q, qd, tau).std.shape
-        torch.Size([20, 2])
     """
 
     kind = KIND
@@ -144,20 +144,20 @@ class IndependentGP(Model["IndependentFit"]):
         measured, noise_std = measurement_of(Observation(data), self.system, self.noise)
         features = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
         training = self.training(features, measured.values, noise_std)
-        priors = joint_processes(self.system.robot.nq)
-        announce(training, LEARNING)
-        first = initial_hyperparameters(priors[:1], [training.block(0)])
+        training.announce(LEARNING)
+        processes, parts = training.processes(), list[Learned]()
+        first = initial_hyperparameters([processes[0][0]], [processes[0][1]])
         known = (*features.values(), training.qdd, noise_std)
-        saved = Evaluations.resumed(checkpoint, first, KIND, options, len(priors), *known)
-        parts: list[Learned] = []
-        for joint, prior in enumerate(priors):
+        saved = Evaluations.resumed(checkpoint, first, KIND, options, len(processes), *known)
+        for prior, block, constant in processes:
+            start = initial_hyperparameters([prior], [block])
+            centre = start if options.hyperpriors else {}
+            objective = partial(_objective, prior, block, constant, centre)
             before = sum(part.evaluations for part in parts)
-
-            def report(evaluations: int, value: float, _: dict[str, Tensor], before: int = before) -> None:
-                if progress is not None:
-                    progress(before + evaluations, options.max_evaluations * len(priors), value)
-
-            parts.append(_learn(training, prior, joint, options, report, saved))
+            report = reported(progress, options.max_evaluations * len(processes), before)
+            box = box_around(start)
+            learned = minimise(saved.recorded(objective), start, options, bounds=box, progress=report)
+            parts.append(dataclasses.replace(learned, doubts=doubts_at_bounds(learned.tensors, box)))
         saved.write()
         hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
         return fitted(self, training, hyperparameters, parts)
@@ -168,37 +168,16 @@ class IndependentGP(Model["IndependentFit"]):
         return IndependentTraining(features, qdd, noise_std, scaled(features))
 
 
-def joint_processes(nq: int) -> tuple[JointForcePrior, ...]:
-    """One process per joint; the likelihood reads only name and kernel of each."""
-    return tuple(JointForcePrior(name=f"qdd_{j}") for j in range(nq))
-
-
-def _learn(
-    training: IndependentTraining,
+def _objective(
     prior: JointForcePrior,
-    joint: int,
-    options: LearningOptions,
-    report: Progress,
-    saved: Evaluations,
-) -> Learned:
-    """Learn the process of one joint; the record of one joint follows that of the one before."""
-    blocks = [training.block(joint)]
-    start = initial_hyperparameters([prior], blocks)
-    constant = training.constant(joint)
-
-    def objective(tensors: dict[str, Tensor]) -> Tensor:
-        value = negative_log_likelihood([prior], tensors, blocks)
-        return value + constant + (negative_log_prior(tensors, start) if options.hyperpriors else 0.0)
-
-    box = box_around(start)
-    learned = minimise(saved.recorded(objective), start, options, bounds=box, progress=report)
-    return dataclasses.replace(learned, doubts=doubts_at_bounds(learned.tensors, box))
-
-
-def announce(training: IndependentTraining, copies: int) -> None:
-    """Announce the matrices of all joints, two each beside those that learning holds."""
-    n, nq = training.qdd.shape
-    announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
+    block: Block,
+    constant: Tensor,
+    centre: Mapping[str, Tensor],
+    theta: dict[str, Tensor],
+) -> Tensor:
+    """Negative log posterior of the hyperparameters of a joint, with weak priors around a centre if any."""
+    value = negative_log_likelihood([prior], theta, [block]) + constant
+    return value + negative_log_prior(theta, centre) if centre else value
 
 
 def fitted(
@@ -212,13 +191,11 @@ def fitted(
     Raises:
         NumericalError: a covariance is not positive definite.
     """
-    robot = model.system.robot
-    processes = joint_processes(robot.nq)
-    posteriors = tuple(
-        ExactPosterior.of([prior], hyperparameters, [training.block(j)]) for j, prior in enumerate(processes)
-    )
-    value = sum(float(p.log_likelihood() - training.constant(j)) for j, p in enumerate(posteriors))
-    ended = zip(robot.joint_names, parts, strict=False)
+    processes = training.processes()
+    posteriors = tuple(ExactPosterior.of([prior], hyperparameters, [block]) for prior, block, _ in processes)
+    pairs = zip(posteriors, processes, strict=True)
+    value = sum(float(p.log_likelihood() - constant) for p, (_, _, constant) in pairs)
+    ended = zip(model.system.robot.joint_names, parts, strict=False)
     result = FitResult(
         converged=all(part.converged for part in parts),
         evaluations=sum(part.evaluations for part in parts),
@@ -258,19 +235,18 @@ class IndependentFit(AccelerationFit):
 
     def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:
         features = self.training.scale.apply({"q": at.q, "qd": at.qd, "tau": at.tau})
-        means, variances = [], []
-        for first in range(0, max(len(at.q), 1), CHUNK_STATES):
-            part = {name: x[first : first + CHUNK_STATES] for name, x in features.items()}
-            means.append(torch.cat([p.latent_mean(0, part) for p in self.posteriors], dim=-1))
-            if variance:
-                variances.append(torch.stack([_variance(p, part) for p in self.posteriors], dim=-1))
-        return torch.cat(means), torch.cat(variances) if variance else None
+        mean = torch.cat([p.latent_mean(0, features) for p in self.posteriors], dim=-1)
+        if not variance:
+            return mean, None
+        like = torch.ones_like(mean[:, :1])
+        rows = Block((features,), (like[..., None],), torch.zeros_like(like))
+        return mean, torch.stack([p.covariance(rows)[:, 0, 0] for p in self.posteriors], dim=-1)
 
     @classmethod
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> IndependentFit:
-        settings = settings_of(header, IndependentSettings, source)
+        settings = header.settings_as(IndependentSettings, source)
         model = IndependentGP(system, settings.noise_std, settings.standardize)
         nq, dtype = system.robot.nq, system.robot.dtype
         n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
@@ -278,35 +254,26 @@ class IndependentFit(AccelerationFit):
             name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
         }
         noise = take(tensors, "training.noise_std", None, dtype, source)
-        if noise.shape not in ((nq,), (n, nq)) or not bool((noise > 0.0).all()):
-            raise ModelError(
-                f"{source}: tensor 'training.noise_std' is not valid", expected="positive numbers"
-            )
+        if noise.shape not in ((nq,), (n, nq)):
+            raise ModelError(f"{source}: tensor 'training.noise_std' does not fit", got=tuple(noise.shape))
         training = model.training(features, take(tensors, "training.qdd", (n, nq), dtype, source), noise)
         hyperparameters = {
             f"{prior.name}.{name}": take(
                 tensors, f"hyperparameters.{prior.name}.{name}", tuple(value.shape), torch.float64, source
             )
-            for prior in joint_processes(nq)
+            for prior, _, _ in training.processes()
             for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
         }
-        announce(training, 0)
+        training.announce(0)
         try:
             return fitted(model, training, hyperparameters)
         except ForceGPError as cause:
             raise ModelError.at(f"{source}: the training data", cause) from cause
 
-    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+    def record(self) -> tuple[Record, dict[str, Tensor]]:
         model = self.specification
         settings = IndependentSettings(**dict(model.options), noise_std=plain(model.noise))
         tensors = {f"training.{name}": value for name, value in self.training.features.items()}
         tensors |= {"training.qdd": self.training.qdd, "training.noise_std": self.training.noise_std}
         tensors |= {f"hyperparameters.{name}": value for name, value in self.hyperparameters.items()}
         return settings, tensors
-
-
-def _variance(posterior: ExactPosterior, features: dict[str, Tensor]) -> Tensor:
-    """Variance of a scalar process, `(n,)`."""
-    n, like = len(features["q"]), posterior.alpha
-    rows = Block((features,), (like.new_ones(n, 1, 1),), like.new_zeros(n, 1))
-    return posterior.covariance(rows)[:, 0, 0]

@@ -1,10 +1,10 @@
-"""ADAM on batches of samples, with a held-out part that says when to stop."""
+"""Minimising a mean over samples: by ADAM on batches, with a held-out part to stop by, or on all of them."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, NumericalError
-from forcegp.gp.optimise import Learned
-from forcegp.models.base import FitProgress
-from forcegp.storage.checkpoint import Checkpoint
+from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, minimise, reported
+from forcegp.storage.checkpoint import Checkpoint, Evaluations
 
 HISTORY = "history"
 """Name of the tensor with one entry per epoch, the only one whose length changes."""
@@ -59,29 +58,53 @@ def train(
     loss: Loss,
     start: Mapping[str, Tensor],
     samples: int,
-    options: BatchOptions,
+    options: BatchOptions | LearningOptions,
     generator: torch.Generator,
     progress: FitProgress | None = None,
-    saved: Checkpoint | None = None,
+    checkpoint: str | Path | None = None,
+    key: Iterable[object] = (),
 ) -> Learned:
-    """Minimise a mean over samples; the result is the best epoch on the held-out samples.
+    """Minimise a mean over samples.
 
     Args:
         loss: mean squared error over rows, differentiable in the tensors.
         start: initial tensors by name.
         samples: how many rows there are.
-        options: how to train.
+        options: how to train: on batches, with the best epoch on the held-out samples as the result, or on
+            all samples at once.
         generator: of the held-out part and the order of rows.
-        progress: called after each epoch with its number, the most there will be, and the held-out loss.
-        saved: where the state is kept now and then, and where training resumes.
+        progress: called after each epoch or evaluation with its number, the most there will be, and the loss.
+        checkpoint: file where the state is kept now and then, and where training resumes.
+        key: identifies the loss, for the checkpoint.
 
     Returns:
-        The tensors, the held-out loss, and one entry an epoch as history.
+        The tensors, their loss, and one entry per epoch or evaluation as history.
 
     Raises:
-        ModelError: there are too few samples to hold any out, or the saved state belongs to another fit.
+        ModelError: there are too few samples to hold any out, or the checkpoint belongs to another fit.
         NumericalError: the loss is not finite.
     """
+    key = (options, *key, *(part for pair in start.items() for part in pair))
+    if isinstance(options, BatchOptions):
+        saved = None if checkpoint is None else Checkpoint(Path(checkpoint), Checkpoint.key_of(*key))
+        return _on_batches(loss, start, samples, options, generator, progress, saved)
+    rows = torch.arange(samples, device=next(iter(start.values())).device)
+    evaluations = Evaluations.resumed(checkpoint, start, *key)
+    objective = evaluations.recorded(lambda tensors: loss(tensors, rows))
+    learned = minimise(objective, start, options, progress=reported(progress, options.max_evaluations))
+    evaluations.write()
+    return learned
+
+
+def _on_batches(
+    loss: Loss,
+    start: Mapping[str, Tensor],
+    samples: int,
+    options: BatchOptions,
+    generator: torch.Generator,
+    progress: FitProgress | None,
+    saved: Checkpoint | None,
+) -> Learned:
     began = time.perf_counter()
     held, rows = _split(samples, options.held_out, generator, next(iter(start.values())).device)
     state = _State.at(start, options.learning_rate, generator)
@@ -125,6 +148,9 @@ class _State:
         """The state before the first epoch."""
         weights = {name: value.detach().clone().requires_grad_() for name, value in start.items()}
         optimizer = torch.optim.Adam(weights.values(), lr=learning_rate)
+        for x in weights.values():
+            moments = {name: torch.zeros_like(x, requires_grad=False) for name in ("exp_avg", "exp_avg_sq")}
+            optimizer.state[x] = {"step": torch.zeros(()), **moments}
         return cls(weights, optimizer, generator, {k: x.detach().clone() for k, x in start.items()}, [])
 
     @property
@@ -157,12 +183,8 @@ class _State:
         tensors = {HISTORY: torch.tensor(self.history, dtype=torch.float64)}
         tensors["generator"] = self.generator.get_state()
         for name, x in self.weights.items():
-            moments = self.optimizer.state.get(x, {})
-            tensors[f"weights.{name}"] = x.detach()
-            tensors[f"best.{name}"] = self.best[name]
-            tensors[f"step.{name}"] = moments.get("step", torch.zeros(()))
-            for moment in ("exp_avg", "exp_avg_sq"):
-                tensors[f"{moment}.{name}"] = moments.get(moment, torch.zeros_like(x.detach()))
+            parts = {"weights": x.detach(), "best": self.best[name], **self.optimizer.state[x]}
+            tensors |= {f"{part}.{name}": value for part, value in parts.items()}
         return tensors
 
     def restore(self, tensors: Mapping[str, Tensor], source: Path) -> None:
@@ -171,17 +193,14 @@ class _State:
         Raises:
             ModelError: the state of the generator is damaged.
         """
+        for name, value in self.tensors().items():
+            if name not in (HISTORY, "generator"):
+                value.copy_(tensors[name])
         try:
             self.generator.set_state(tensors["generator"])
         except RuntimeError as cause:
             raise ModelError(f"{source}: the checkpoint is damaged", got=str(cause)) from cause
         self.history = tensors[HISTORY].tolist()
-        with torch.no_grad():
-            for name, x in self.weights.items():
-                x.copy_(tensors[f"weights.{name}"])
-                self.best[name] = tensors[f"best.{name}"].clone()
-                kept = {key: tensors[f"{key}.{name}"].clone() for key in ("step", "exp_avg", "exp_avg_sq")}
-                self.optimizer.state[x] = kept
 
 
 FLAT = 0.05

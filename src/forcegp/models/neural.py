@@ -13,15 +13,14 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
+from forcegp.files import Record
 from forcegp.forces.observations import Observation, measurement_of
 from forcegp.forces.quantities import FlatStates
 from forcegp.gp.features import Standardization
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
-from forcegp.storage.checkpoint import Checkpoint
-from forcegp.storage.model_file import ModelHeader, settings_of
-from forcegp.storage.options import Settings
+from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.system import take
 
 KIND = "neural_network"
@@ -30,7 +29,7 @@ DEEP = BatchOptions(epochs=300, batch=256, learning_rate=0.003)
 """For networks of more than two hidden layers, whose epochs take longer and whose steps must be smaller."""
 
 
-class NetworkSettings(Settings):
+class NetworkSettings(Record):
     """What is kept of a neural network besides its tensors."""
 
     hidden: tuple[int, ...]
@@ -47,17 +46,6 @@ class NeuralNetwork(Model["NetworkFit"]):
         system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
         hidden: widths of the hidden layers.
         seed: of the initial weights, the held-out samples and the order of the batches.
-
-    Example:
-        >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-        >>> q, qd, tau = torch.randn(3, 20, 2, dtype=torch.float64)
-        >>> qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.5 * qd)
-        >>> t = torch.arange(20, dtype=torch.float64)
-        >>> data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-        >>> fit = NeuralNetwork(system, hidden=[8]).fit(data)
-        >>> fit.predict(q, qd, tau).mean.shape
-        torch.Size([20, 2])
 
     Raises:
         ModelError: a width is not positive.
@@ -111,11 +99,7 @@ class NeuralNetwork(Model["NetworkFit"]):
 
         options = options or (DEEP if len(self.hidden) > 2 else SHALLOW)
         start = dict(network.named_parameters())
-        saved = None
-        if checkpoint is not None:
-            weights = (part for pair in start.items() for part in pair)
-            saved = Checkpoint(Path(checkpoint), Checkpoint.key_of(options, self.seed, x, y, *weights))
-        learned = train(loss, start, len(x), options, generator, progress, saved)
+        learned = train(loss, start, len(x), options, generator, progress, checkpoint, (self.seed, x, y))
         network.load_state_dict(learned.tensors)
         result = FitResult.of(learned, constant_inputs=inputs.constant)
         network.requires_grad_(False)
@@ -152,7 +136,7 @@ class NetworkFit(AccelerationFit):
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> NetworkFit:
-        settings = settings_of(header, NetworkSettings, source)
+        settings = header.settings_as(NetworkSettings, source)
         robot = NeuralNetwork(system, settings.hidden, settings.seed).system.robot  # checks the widths
         widths = [3 * robot.nq, *settings.hidden, robot.nq]
         state = {}
@@ -174,7 +158,7 @@ class NetworkFit(AccelerationFit):
         network = network.requires_grad_(False)
         return cls(system, settings.hidden, settings.seed, network, scales[0], scales[1], result)
 
-    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+    def record(self) -> tuple[Record, dict[str, Tensor]]:
         settings = NetworkSettings(hidden=self.hidden, seed=self.seed, constant=self.inputs.constant)
         tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
         for part in (self.inputs, self.outputs):

@@ -1,22 +1,38 @@
-"""A predicted quantity with its uncertainty."""
+"""What predicts, and a predicted quantity with its uncertainty; scores and plots beside what was measured."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from forcegp.errors import NumericalError
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.data import Dataset
+from forcegp.data.fields import AXES
+from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, UnknownNameError
 from forcegp.forces.noise import warnings_beyond
+from forcegp.forces.observations import COLUMNS
+from forcegp.forces.quantities import ForceLinearization, linearize_field
 from forcegp.gp.factor import require_semidefinite
+from forcegp.rollout.forward import rollout_model
+from forcegp.rollout.inputs import Torque
+from forcegp.rollout.law import ForceField
+from forcegp.rollout.trajectory import Rollout
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from forcegp.plots import Target
+    from forcegp.plots import Panel, Target
+
+CHUNK = 2000
+"""States that are predicted at once, to bound the memory."""
+MOST_SAMPLES = 2000
+"""Samples that are predicted and drawn: more cannot be told apart."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -102,6 +118,264 @@ class Prediction:
             ShapeError: the mean is not of shape `(n, d)`, or an argument does not fit it.
             ParameterError: the number of axes is not that of the components.
         """
-        from forcegp.models.measured import plot_prediction
+        from forcegp.plots import Timeline, axis_label, draw_panels
 
-        return plot_prediction(self.mean, self.std, tuple(self.parts), t, measured, names, ax)
+        if self.mean.ndim != 2:
+            raise ShapeError(
+                "only predictions over one list of states can be drawn",
+                expected="a mean of shape (n, d)",
+                got=tuple(self.mean.shape),
+            )
+        n, d = self.mean.shape
+        names = [f"component {i + 1}" for i in range(d)] if names is None else list(names)
+        for what, value, expected in (
+            ("t", None if t is None else tuple(t.shape), (n,)),
+            ("measured", None if measured is None else tuple(measured.shape), (n, d)),
+            ("names", (len(names),), (d,)),
+        ):
+            if value is not None and value != expected:
+                raise ShapeError(f"{what} does not fit the prediction", expected=expected, got=value)
+        label = axis_label(next(iter(self.parts)) if len(self.parts) == 1 else "")
+        panels = [self.panel(i, names[i], label, measured) for i in range(d)]
+        axes = draw_panels(panels, Timeline.of(torch.arange(n) if t is None else t), (), ax)
+        if t is None:
+            axes[-1].set_xlabel("sample")
+        return axes
+
+    def panel(self, i: int, name: str, label: str, true: Tensor | None) -> Panel:
+        """Component i, and what was measured of it, if anything was."""
+        from forcegp.plots import MEASURED, PREDICTED, Curve, Panel
+
+        curves = [] if true is None else [Curve(true[:, i], "measured", MEASURED, width=0.7)]
+        band = None if self.std is None else self.std[:, i]
+        return Panel(name, label, [*curves, Curve(self.mean[:, i], "predicted", PREDICTED, band)])
+
+
+def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:
+    """Logged values `(n, d)` of a quantity.
+
+    Raises:
+        UnknownNameError: the quantity cannot be measured, or a contact of the system is not logged.
+        NotLoggedError: it is not logged.
+    """
+    if quantity not in COLUMNS:
+        raise UnknownNameError("measured quantity", quantity, COLUMNS)
+    return COLUMNS[quantity](data, system)
+
+
+def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
+    """What the components of a quantity belong to: joints, contacts, or axes of a contact's force."""
+    if quantity == "contact_force":
+        contacts = [c.name for c in system.contacts if isinstance(c, SurfaceContact)]
+        return [f"{name} {axis}" for name in contacts for axis in AXES]
+    if quantity != "multiplier":
+        return list(system.robot.joint_names)
+    return [
+        name if contact.rows == 1 else f"{name} {row + 1}"
+        for contact in system.contacts
+        for name in [contact.name]
+        for row in range(contact.rows)
+    ]
+
+
+class Predictor(ABC):
+    """A forward dynamics (q, q̇, τ) ↦ q̈ that predicts."""
+
+    kind: str
+    """Name of the class of models in saved files."""
+    has_function_samples: bool = False
+    """Whether `force_samples` draws functions from a posterior over forces."""
+
+    system: ConstrainedSystem
+    """Robot and contacts that predictions refer to."""
+
+    @abstractmethod
+    def predict(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str = "qdd",
+        *,
+        active: Tensor | None = None,
+        covariance: bool = True,
+        system: ConstrainedSystem | None = None,
+    ) -> Prediction:
+        """Predict a quantity at states `(*batch, nq)`.
+
+        Args:
+            q, qd, tau: `(*batch, nq)` states.
+            quantity: what to predict.
+            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            covariance: whether to compute the covariance.
+            system: another system to predict on, for models of forces.
+        """
+
+    def force_field(self) -> ForceField | None:
+        """The mean impressed force Q̄ `(n, nq)` at states, or `None` for a model of accelerations alone."""
+        return None
+
+    @property
+    def specified(self) -> ConstrainedSystem:
+        """The system before the fit, with the robot of the file if the fit keeps it."""
+        return self.system
+
+    @property
+    def torque_disturbance(self) -> Tensor | None:
+        """Root of the spectral density of torque noise `(nq,)` [N m √s], where one was learned with its
+        correlation in time."""
+        return None
+
+    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
+        """Force functions drawn from the posterior, all evaluated at once.
+
+        Args:
+            samples: number S of functions.
+            generator: source of the draws.
+
+        Returns:
+            A force field on `(S * k, nq)` states, of which the s-th run of k belongs to function s.
+
+        Raises:
+            ModelError: the model has no posterior over force functions.
+        """
+        raise ModelError(
+            f"a {self.kind!r} model has no function samples", hint="use StructuredGP, or samples=0"
+        )
+
+    def linearize(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        *,
+        active: Tensor | None = None,
+        system: ConstrainedSystem | None = None,
+    ) -> ForceLinearization:
+        """Mean acceleration and multiplier with their Jacobians by q, q̇ and τ, for control and filters.
+
+        Args:
+            q, qd, tau: `(*batch, nq)` states.
+            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            system: another system to predict on.
+
+        Raises:
+            ModelError: the model knows no forces.
+            ShapeError: an argument does not fit the system.
+        """
+        force = self.force_field()
+        if force is None:
+            raise ModelError(
+                f"a {self.kind!r} model has no force field to linearize",
+                hint="use StructuredGP or AnalyticalModel",
+            )
+        return linearize_field(force, system or self.system, q, qd, tau, active)
+
+    def rollout(
+        self,
+        q0: Tensor,
+        qd0: Tensor,
+        tau: Torque,
+        duration: float = 10.0,
+        samples: int = 0,
+        **settings: Any,
+    ) -> Rollout:
+        """Predict trajectories from initial states (section 4); see `forcegp.rollout.rollout_model`.
+
+        Args:
+            q0, qd0: `(*batch, nq)` initial states.
+            tau: motor torque over time: a log, or an array `(samples, nq)` or `(*batch, samples, nq)` with
+                its period in `options`; or a law of (t, q, q̇).
+            duration: simulated time [s].
+            samples: number of function samples to integrate besides the mean.
+            **settings: `options`, `seed`, `active`, `system` and `progress` of `rollout_model`.
+        """
+        return rollout_model(self, q0, qd0, tau, duration, samples, **settings)
+
+    def score(self, data: Dataset, quantity: str = "qdd") -> float:
+        """Coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
+
+        R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components: 1 is perfect, 0
+        as good as the mean of the data, and negative worse. It says nothing about the uncertainty;
+        `forcegp.evaluate` does.
+
+        Args:
+            data: logged states and measured values.
+            quantity: what to predict; the data set must contain it.
+
+        Raises:
+            UnknownNameError, NotLoggedError: the quantity is unknown or not logged.
+            DataError: the joints are not those of the robot, or the quantity does not vary.
+        """
+        data.check_robot(self.specified.robot)
+        if len(data) < 2:
+            raise DataError("a score needs two samples or more", got=len(data))
+        true, chunks = measured(self.system, data, quantity), range(0, len(data), CHUNK)
+        parts = (data[first : first + CHUNK] for first in chunks)
+        means = [self._at_logged(part, quantity, covariance=False).mean for part in parts]
+        unexplained = (true - torch.cat(means)).square().sum(0)
+        spread = (true - true.mean(0)).square().sum(0)
+        if not bool((spread > 0.0).any()):
+            raise DataError(f"{quantity} is constant in the data, so that a score is not defined")
+        return float((1.0 - unexplained / spread)[spread > 0.0].mean())
+
+    def plot(
+        self,
+        data: Dataset,
+        quantity: str = "qdd",
+        *,
+        joints: Sequence[str] | None = None,
+        ax: Target = None,
+        **settings: Any,
+    ) -> list[Axes]:
+        """Draw a predicted quantity with ±2 standard deviations beside the measured one, if it is logged.
+
+        Args:
+            data: logged states; of a long log, every k-th row is predicted and drawn.
+            quantity: what to predict.
+            joints: which joints or contacts, of a quantity with several; default all.
+            ax: matplotlib axes to draw on, one per panel; default a new figure.
+            **settings: further arguments of `predict`, such as `noise=True` for the band of a measurement.
+
+        Returns:
+            The axes, one per panel.
+
+        Raises:
+            UnknownNameError: no such quantity or joint.
+            ParameterError: the number of axes is not that of the panels.
+        """
+        from forcegp.plots import Timeline, axis_label, chosen, draw_panels
+
+        system = settings.get("system") or self.system
+        data.check_robot((settings.get("system") or self.specified).robot)
+        data = data[:: max(1, -(-len(data) // MOST_SAMPLES))]
+        prediction = self._at_logged(data, quantity, **settings)
+        try:
+            true = measured(system, data, quantity)
+        except ForceGPError:
+            true = None
+        names, kinds = component_names(system, quantity), system.robot.joint_types
+        of_joints = names == list(system.robot.joint_names)
+        panels = [
+            prediction.panel(i, names[i], axis_label(quantity, kinds[i : i + 1] if of_joints else ()), true)
+            for i in chosen(joints, names, f"component of {quantity}")
+        ]
+        time = Timeline.of(data.t, data.segment, data.header.ordered)
+        return draw_panels(panels, time, [data.contact[c] for c in system.contact_names], ax)
+
+    def _at_logged(self, data: Dataset, quantity: str, **settings: Any) -> Prediction:
+        """The prediction at logged states; contacts are closed where the log says so."""
+        active = data.active((settings.get("system") or self.system).contact_names)
+        return self.predict(data.q, data.qd, data.tau, quantity, active=active, **settings)
+
+    @abstractmethod
+    def save(self, path: str | Path) -> None:
+        """Write the model to a file; `forcegp.load_model` reads it back exactly.
+
+        Args:
+            path: the file; `.safetensors` is added if it is left out.
+
+        Raises:
+            ModelError: a part of the model is Python code.
+            OSError: the place cannot be written.
+        """

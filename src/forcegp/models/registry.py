@@ -20,9 +20,6 @@ from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.neural import NeuralNetwork
 from forcegp.models.structured_gp import StructuredGP
 
-Stated = NoiseStd | Noise | None
-"""The noise of a model, `None` for what the log states."""
-
 
 @dataclass(frozen=True)
 class Entry:
@@ -46,17 +43,6 @@ class Entry:
     def kind(self) -> str:
         """As in saved models."""
         return self.made.kind
-
-    def make(self, system: ConstrainedSystem, noise: Stated, seed: int, **options: Any) -> Model[Any]:
-        """The model, with further arguments of its class; noise and seed where it takes them."""
-        taken = signature(self.made).parameters
-        arguments: dict[str, Any] = {
-            name: x for name, x in (("noise", noise), ("seed", seed)) if name in taken
-        }
-        arguments |= {**self.options, **options}
-        if self.priors is not None and "force_priors" not in options:
-            arguments["force_priors"] = self.priors(system, arguments["mean"], self.kernel)
-        return self.made(system, **arguments)
 
 
 def _contact(system: ConstrainedSystem, mean: Any, kernel: Kernel | None) -> Sequence[ForcePrior]:
@@ -100,7 +86,7 @@ def create(
     name: str,
     system: ConstrainedSystem,
     *,
-    noise: Stated = None,
+    noise: NoiseStd | Noise | None = None,
     seed: int = 0,
     **options: Any,
 ) -> Model:
@@ -118,4 +104,10 @@ def create(
     """
     if name not in MODELS:
         raise UnknownNameError("model", name, MODELS)
-    return MODELS[name].make(system, noise, seed, **options)
+    entry = MODELS[name]
+    taken = signature(entry.made).parameters
+    arguments: dict[str, Any] = {key: x for key, x in (("noise", noise), ("seed", seed)) if key in taken}
+    arguments |= {**entry.options, **options}
+    if entry.priors is not None and "force_priors" not in options:
+        arguments["force_priors"] = entry.priors(system, arguments["mean"], entry.kernel)
+    return entry.made(system, **arguments)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -104,106 +104,106 @@ def with_priors(
     log, _ = in_motion(spec.system, training_of(data, spec.system, (), spec.noise.acceleration, {}))
     if min(len(m.q) for m in log.measurements) < FEWEST:
         return without_comparison(spec, f"fewer than {FEWEST} samples")
-    comparison = Comparison(spec, log, candidates_of(spec))
+    trials = [Trial(candidate) for candidate in candidates_of(spec)]
+    halves = [halves_of(m.q, m.qd, log.period > 0.0) for m in log.measurements]
     for half in range(HALVES):
-        comparison.test(half, progress)
-    return comparison.result()
+        rows = [(own == half).nonzero()[:, 0] for own in halves]
+        rest = [(own != half).nonzero()[:, 0] for own in halves]
+        train, test = log.of_rows(rest), log.of_rows(rows).evenly(ROWS)
+        inertia: Inertia | None = None
+        for number, trial in enumerate(trials, 1):
+            if not trial.note:
+                if trial.candidate.inertia and inertia is None:
+                    asking = spec.with_set(trial.candidate.set).with_options(inertia="auto")
+                    inertia = asking.inertia_of(train)
+                _score(spec, trial, trials, inertia, train, test)
+            if progress is not None:
+                progress(half * len(trials) + number, HALVES * len(trials), math.nan)
+        if half + 1 < HALVES:
+            _drop(trials)
+    return _result(spec, trials)
 
 
-class Comparison:
-    """Scores of candidates on halves of a log.
+@dataclass
+class Trial:
+    """What is known of a candidate so far.
 
-    Args:
-        spec: the model.
-        log: samples in motion.
-        candidates: simplest first.
+    Attributes:
+        candidate: what is tried.
+        scores: on each half, by block.
+        begin: hyperparameters that the first half taught.
+        inertia_found: whether an inertia other than that of the robot file was found.
+        note: why the candidate is not tried any more.
     """
 
-    def __init__(self, spec: Specification, log: Training, candidates: Sequence[Candidate]) -> None:
-        self.spec, self.log, self.candidates = spec, log, candidates
-        self.halves = [halves_of(m.q, m.qd, log.period > 0.0) for m in log.measurements]
-        self.scores: dict[str, list[Tensor]] = {}
-        self.notes: dict[str, str] = {}
-        self.begins: dict[str, Mapping[str, Tensor]] = {}
-        self.inertia_found = False
+    candidate: Candidate
+    scores: list[Tensor] = field(default_factory=list)
+    begin: Mapping[str, Tensor] | None = None
+    inertia_found: bool = False
+    note: str = ""
 
-    def test(self, half: int, progress: FitProgress | None) -> None:
-        """Train each candidate on the other half, score it on this one, and drop those far behind."""
-        rows = [(own == half).nonzero()[:, 0] for own in self.halves]
-        rest = [(own != half).nonzero()[:, 0] for own in self.halves]
-        train, test = self.log.of_rows(rest), self.log.of_rows(rows).evenly(ROWS)
-        inertia: Inertia | None = None
-        for number, candidate in enumerate(self.candidates, 1):
-            name = candidate.name
-            if name not in self.notes:
-                robot = Inertia(self.spec.system.robot)
-                if candidate.inertia:
-                    spec = self.spec.with_set(candidate.set).with_options(inertia="auto")
-                    inertia = inertia or spec.inertia_of(train)
-                    robot, same = inertia, inertia.robot is self.spec.system.robot
-                    self.inertia_found = self.inertia_found or not same
-                self._score(candidate, robot, train, test)
-            if progress is not None:
-                count = len(self.candidates)
-                progress(half * count + number, HALVES * count, math.nan)
-        if half + 1 < HALVES:
-            self._drop()
-
-    def _drop(self) -> None:
-        """Leave out the candidates that are far behind the best."""
-        blocks = {name: torch.cat(parts) for name, parts in self.scores.items() if name not in self.notes}
-        if not blocks:
-            return
-        best = max(blocks.values(), key=lambda x: float(x.mean()))
-        for name, own in blocks.items():
-            behind, error = difference(best, own)
-            if behind > DROPPED * error:
-                self.notes[name] = "dropped after the first half"
-
-    def _score(self, candidate: Candidate, inertia: Inertia, train: Training, test: Training) -> None:
-        name, plain = candidate.name, Candidate(candidate.set).name
-        unchanged = candidate.inertia and inertia.robot is self.spec.system.robot
-        tested = len(self.scores.get(name, ())) + 1
-        if unchanged and len(self.scores.get(plain, ())) == tested and plain not in self.notes:
-            self.scores.setdefault(name, []).append(self.scores[plain][-1])
-            return
-        try:
-            fit = trained(self.spec.with_set(candidate.set), inertia, train, self.begins.get(name))
-            score = blocks_of(log_density(fit, test))
-        except NumericalError as cause:
-            self.notes[name] = f"not computed: {str(cause).splitlines()[0]}"
-            return
-        self.begins[name] = fit.hyperparameters
-        self.scores.setdefault(name, []).append(score)
-
-    def result(self) -> tuple[Specification, tuple[Compared, ...]]:
-        """The specification with the chosen set, and the table."""
-        shown = [each for each in self.candidates if self._is_shown(each)]
-        whole = {
-            each.name: torch.cat(self.scores[each.name]) for each in shown if each.name not in self.notes
-        }
-        if not whole:
-            return without_comparison(self.spec, "no candidate could be computed")
-        best = max(whole.values(), key=lambda x: float(x.mean()))
-        near = {name for name, x in whole.items() if difference(best, x)[0] <= difference(best, x)[1]}
-        chosen = next(each for each in shown if each.name in near)
-        table = tuple(self._row(each, best, each is chosen) for each in shown)
-        identifies = chosen.inertia or not self.inertia_found
-        spec = self.spec.with_options(inertia=self.spec.options.inertia or ("auto" if identifies else "file"))
-        return spec.with_set(chosen.set), table
-
-    def _is_shown(self, candidate: Candidate) -> bool:
-        """Whether a candidate differs from those without the question about inertia."""
-        return not candidate.inertia or self.spec.options.inertia == "auto" or self.inertia_found
-
-    def _row(self, candidate: Candidate, best: Tensor, chosen: bool) -> Compared:
-        parts = self.scores.get(candidate.name, [])
-        note = self.notes.get(candidate.name, "")
-        if not parts:
-            return Compared(candidate.name, note=note)
-        own = torch.cat(parts)
+    def row(self, best: Tensor, chosen: bool) -> Compared:
+        """The row of the table."""
+        if not self.scores:
+            return Compared(self.candidate.name, note=self.note)
+        own = torch.cat(self.scores)
         behind, error = difference(best[: len(own)], own)
-        return Compared(candidate.name, float(own.mean()), behind, error, chosen, note)
+        return Compared(self.candidate.name, float(own.mean()), behind, error, chosen, self.note)
+
+
+def _score(
+    spec: Specification,
+    trial: Trial,
+    trials: Sequence[Trial],
+    inertia: Inertia | None,
+    train: Training,
+    test: Training,
+) -> None:
+    """Train a candidate on one half and score it on the other."""
+    candidate, robot = trial.candidate, spec.system.robot
+    if not candidate.inertia or inertia is None:
+        inertia = Inertia(robot)
+    trial.inertia_found |= inertia.robot is not robot
+    if candidate.inertia and inertia.robot is robot:
+        # The same model as without the question.
+        for other in trials:
+            same = other.candidate == Candidate(candidate.set) and not other.note
+            if same and len(other.scores) == len(trial.scores) + 1:
+                trial.scores.append(other.scores[-1])
+                return
+    try:
+        fit = trained(spec.with_set(candidate.set), inertia, train, trial.begin)
+        trial.scores.append(blocks_of(log_density(fit, test)))
+        trial.begin = fit.hyperparameters
+    except NumericalError as cause:
+        trial.note = f"not computed: {str(cause).splitlines()[0]}"
+
+
+def _drop(trials: Sequence[Trial]) -> None:
+    """Leave out the candidates that are far behind the best."""
+    blocks = [(trial, torch.cat(trial.scores)) for trial in trials if not trial.note]
+    best = max((own for _, own in blocks), key=lambda x: float(x.mean()), default=torch.empty(0))
+    for trial, own in blocks:
+        behind, error = difference(best, own)
+        if behind > DROPPED * error:
+            trial.note = "dropped after the first half"
+
+
+def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification, tuple[Compared, ...]]:
+    """The specification with the chosen set, and the table."""
+    found = any(trial.inertia_found for trial in trials)
+    # Without another inertia, a candidate with the question about it is the one without.
+    shown = [t for t in trials if not t.candidate.inertia or spec.options.inertia == "auto" or found]
+    whole = [(trial, torch.cat(trial.scores)) for trial in shown if not trial.note]
+    if not whole:
+        return without_comparison(spec, "no candidate could be computed")
+    best = max((own for _, own in whole), key=lambda x: float(x.mean()))
+    behind = ((trial, *difference(best, own)) for trial, own in whole)
+    chosen = next(trial for trial, by, error in behind if by <= error)
+    table = tuple(trial.row(best, trial is chosen) for trial in shown)
+    identifies = chosen.candidate.inertia or not found
+    spec = spec.with_options(inertia=spec.options.inertia or ("auto" if identifies else "file"))
+    return spec.with_set(chosen.candidate.set), table
 
 
 def halves_of(q: Tensor, qd: Tensor, in_order: bool) -> Tensor:

@@ -7,6 +7,7 @@ An exact posterior keeps its data, a sparse one its sums over them. The options 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError
+from forcegp.files import Record
 from forcegp.forces.learn import Problem, analytical_parameters, kernel_parameters
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import Noise
@@ -28,11 +30,11 @@ from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.fit_result import FitResult
-from forcegp.models.structured_spec import CLASSES, Specification
+from forcegp.models.structured_spec import CLASSES, Specification, constant_inputs
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode, encode
-from forcegp.storage.model_file import ModelHeader, settings_of
-from forcegp.storage.options import Settings, StructuredOptions
+from forcegp.storage.model_file import ModelHeader
+from forcegp.storage.options import StructuredOptions
 from forcegp.storage.system import robot_tensors, take_robot
 
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
@@ -41,13 +43,18 @@ COLUMNS = ("q", "qd", "tau", "active", "values")
 """What is kept of each measurement."""
 IN_TIME = ("segment", "t")
 """What is kept beside it where a prior is a function of time."""
+NOT_REAL = (
+    (re.compile(r"data\.\d+\.active"), torch.bool),
+    (re.compile(r"data\.\d+\.segment|sparse\..*\.(components|dropped)"), torch.int64),
+)
+"""Names of the tensors that are not of real numbers, with their type."""
 Parts = tuple[
     Specification, Problem, dict[str, Tensor], ForcePosterior, FitResult, ConstrainedSystem, dict[str, Tensor]
 ]
 """The fields of a `StructuredFit`."""
 
 
-class NoiseSettings(Settings):
+class NoiseSettings(Record):
     """Fields of `Noise`."""
 
     acceleration: PositiveFloat | tuple[PositiveFloat, ...] | None
@@ -109,31 +116,21 @@ def pack(
     for prior, scale in zip(spec.priors, problem.training.scales, strict=True):
         tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
         tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
-    return _settings_of(spec, problem, isinstance(posterior.latent, ExactPosterior), own, result), tensors
-
-
-def _settings_of(
-    spec: Specification, problem: Problem, exact: bool, own: AnalyticalParameters | None, result: FitResult
-) -> StructuredSettings:
-    """What is kept of a fit besides tensors."""
-    noise = spec.noise
-    return StructuredSettings(
+    stated = spec.noise
+    noise = {**vars(stated), "acceleration": plain(stated.acceleration), "torque": plain(stated.torque)}
+    noise["state"] = None if stated.state is None else tuple(map(plain, stated.state))
+    settings = StructuredSettings(
         **dict(spec.options),
         mean=spec.mean.terms,
-        noise=NoiseSettings(
-            acceleration=plain(noise.acceleration),
-            learn=noise.learn,
-            torque=plain(noise.torque),
-            state=None if noise.state is None else tuple(map(plain, noise.state)),  # pyright: ignore[reportArgumentType]
-            degrees_of_freedom=noise.degrees_of_freedom,
-        ),
+        noise=NoiseSettings(**noise),
         power=problem.power,
         priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
-        measured=problem.training.quantities if exact else (),
+        measured=problem.training.quantities if isinstance(posterior.latent, ExactPosterior) else (),
         constant=tuple(scale.constant for scale in problem.training.scales),
         analytical_parameters=None if own is None else own.joints,
         result=result,
     )
+    return settings, tensors
 
 
 def _conditioned_on(spec: Specification, training: Training, posterior: ForcePosterior) -> dict[str, Tensor]:
@@ -175,7 +172,7 @@ def unpack(
     Raises:
         ModelError: a tensor or setting is missing or not valid; names file and field.
     """
-    settings = settings_of(header, StructuredSettings, source)
+    settings = header.settings_as(StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)
     try:
         _check_types(tensors)
@@ -214,31 +211,27 @@ def _specification(
 def _check_types(tensors: Mapping[str, Tensor]) -> None:
     """Raise `ValueError` where a tensor is not of real numbers, or contacts are not flags."""
     for name, value in tensors.items():
-        is_flag = name.startswith("data.") and name.endswith(".active")
-        is_count = name.startswith("sparse.") and name.endswith((".components", ".dropped"))
-        is_count |= name.startswith("data.") and name.endswith(".segment")
-        fits = value.is_floating_point()
-        if is_flag or is_count:
-            fits = value.dtype == (torch.bool if is_flag else torch.int64)
-        if not fits:
+        dtype = next((dtype for names, dtype in NOT_REAL if names.fullmatch(name)), None)
+        if not value.is_floating_point() if dtype is None else value.dtype != dtype:
             raise ValueError(f"tensor {name!r} has type {value.dtype}")
 
 
 def _training(settings: StructuredSettings, spec: Specification, tensors: Mapping[str, Tensor]) -> Training:
-    measurements, noise = [], []
+    measurements, parts = [], []
     for i, quantity in enumerate(settings.measured):
-        m = Measurement(quantity, **{name: tensors[f"data.{i}.{name}"] for name in _columns(spec)})
-        n, nq = len(m.values) if m.values.ndim == 2 else -1, spec.system.robot.nq
+        part = _below(tensors, f"data.{i}.")
+        m = Measurement(quantity, **{name: part[name] for name in _columns(spec)})
+        (n, d), nq = m.values.shape, spec.system.robot.nq
         shapes = {"q": (n, nq), "qd": (n, nq), "tau": (n, nq), "active": (n, len(spec.system.contacts))}
-        shapes |= {"segment": (n,), "t": (n,)}
+        shapes |= {"segment": (n,), "t": (n,), "weight": (n,), "slope": (n, d, 2 * nq)}
+        shapes["noise_std"] = (d,) if part["noise_std"].ndim == 1 else (n, d)
         for name, shape in shapes.items():
-            if getattr(m, name).shape != shape:
-                raise ValueError(f"tensor 'data.{i}.{name}' has shape {tuple(getattr(m, name).shape)}")
-        std = tensors[f"data.{i}.noise_std"]
-        if std.shape not in (m.values.shape, m.values.shape[-1:]) or not bool((std > 0.0).all()):
-            raise ValueError(f"noise of measurement {i} has shape {tuple(std.shape)}, or is not positive")
+            if name in part and part[name].shape != shape:
+                raise ValueError(f"tensor 'data.{i}.{name}' has shape {tuple(part[name].shape)}")
+        if "weight" in part and not bool((part["weight"] > 0.0).all()):
+            raise ValueError(f"tensor 'data.{i}.weight' is not positive")
         measurements.append(m)
-        noise.append(std)
+        parts.append(part)
     scales = tuple(
         Standardization(
             _below(tensors, f"scale.{prior.name}.mean."),
@@ -247,18 +240,10 @@ def _training(settings: StructuredSettings, spec: Specification, tensors: Mappin
         )
         for prior, constant in zip(spec.priors, settings.constant, strict=True)
     )
-    weights = None
-    if measurements and "data.0.weight" in tensors:
-        weights = tuple(tensors[f"data.{i}.weight"] for i in range(len(measurements)))
-        for i, (m, w) in enumerate(zip(measurements, weights, strict=True)):
-            if w.shape != m.t.shape or not bool((w > 0.0).all()):
-                raise ValueError(f"tensor 'data.{i}.weight' has shape {tuple(w.shape)}, or is not positive")
-    slopes = tuple(tensors.get(f"data.{i}.slope") for i in range(len(measurements)))
-    for i, (m, G) in enumerate(zip(measurements, slopes, strict=True)):
-        if G is not None and G.shape != (*m.values.shape, 2 * m.q.shape[-1]):
-            raise ValueError(f"tensor 'data.{i}.slope' has shape {tuple(G.shape)}")
-    kept = None if all(G is None for G in slopes) else slopes
-    return Training(tuple(measurements), tuple(noise), scales, weights=weights, slopes=kept)
+    weights = tuple(part["weight"] for part in parts) if parts and "weight" in parts[0] else None
+    slopes = tuple(part.get("slope") for part in parts) if any("slope" in part for part in parts) else None
+    noise = tuple(part["noise_std"] for part in parts)
+    return Training(tuple(measurements), noise, scales, weights=weights, slopes=slopes)
 
 
 def _check_hyperparameters(spec: Specification, training: Training, hyper: Mapping[str, Tensor]) -> None:
@@ -282,31 +267,20 @@ def _restored(
     system: ConstrainedSystem,
 ) -> Parts:
     """The fit with its weights as they were; the factorisation waits until a covariance is asked for."""
+    correlation = tensors.get("torque_correlation")
+    if correlation is None and settings.correlation_time > 0.0:  # older models have one for all joints
+        correlation = torch.full_like(system.robot.mass, settings.correlation_time)
     problem = dataclasses.replace(
         spec.problem(training),
         system=spec.system if spec.analytical_parameters is not None else system,
         power=settings.power,
-        correlation=_correlation(tensors, settings, system),
+        correlation=correlation,
         pinned=_below(tensors, "pinned."),
         torque_std=tensors.get("torque_std"),
     )
     posterior = _posterior(*problem.with_coulomb_errors(hyper), tensors)
-    constant = tuple(
-        f"{p.name}.{name}"
-        for p, scale in zip(spec.priors, training.scales, strict=True)
-        for name in scale.constant
-    )
-    result = dataclasses.replace(settings.result, constant_inputs=constant, history=())
+    result = dataclasses.replace(settings.result, constant_inputs=constant_inputs(problem), history=())
     return spec, problem, hyper, posterior, result, system, _below(tensors, "noise_std.")
-
-
-def _correlation(
-    tensors: Mapping[str, Tensor], settings: StructuredSettings, system: ConstrainedSystem
-) -> Tensor | None:
-    """How long torque noise is correlated; older models have one time for all joints."""
-    if "torque_correlation" in tensors or settings.correlation_time == 0.0:
-        return tensors.get("torque_correlation")
-    return torch.full_like(system.robot.mass, settings.correlation_time)
 
 
 def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -318,11 +292,8 @@ def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tens
     rest = torch.zeros(1, system.robot.nq, dtype=system.robot.dtype, device=system.robot.device)
     closed = torch.ones(1, len(system.contacts), dtype=torch.bool, device=rest.device)
     at = states(system, rest, rest, rest, closed)
-    named = [
-        f"{p}.inducing.{name}"
-        for p, prior in enumerate(problem.priors)
-        for name in prior.features(system, at)
-    ]
+    features = [prior.features(system, at) for prior in problem.priors]
+    named = [f"{p}.inducing.{name}" for p, inputs in enumerate(features) for name in inputs]
     return {name: tensors[name] for name in (*named, *tensors) if name in tensors}
 
 

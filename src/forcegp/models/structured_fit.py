@@ -13,6 +13,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
+from forcegp.files import Record
 from forcegp.forces.identifiability import doubts_of
 from forcegp.forces.inference import forces_and_constant, is_sparse, log_likelihood, lost_by_inducing
 from forcegp.forces.learn import Problem, typical
@@ -33,13 +34,14 @@ from forcegp.forces.quantities import AffineMap, affine_map, affine_maps, states
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.models.base import FittedModel, ForceField, Prediction
+from forcegp.models.base import FittedModel
 from forcegp.models.fit_result import FitResult
+from forcegp.models.prediction import Prediction
 from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import prepared, training_for
-from forcegp.models.structured_spec import Specification
+from forcegp.models.structured_spec import Specification, constant_inputs
+from forcegp.rollout.law import ForceField
 from forcegp.storage.model_file import ModelHeader
-from forcegp.storage.options import Settings
 
 KIND = "structured_gp"
 
@@ -244,7 +246,12 @@ class StructuredFit(FittedModel):
             UnknownNameError: no such prior.
             NumericalError: the samples to remove were not among those of the fit.
         """
-        latent = _sparse(self.posterior)
+        latent = self.posterior.latent
+        if not isinstance(latent, SparsePosterior):
+            raise ModelError(
+                "a fit with exact inference cannot forget",
+                hint='make the model with inference="sparse", or condition it on the data that count',
+            )
         if not isinstance(what, int | float):
             without, _ = training_for(self.specification, self.problem, what, learned=(), fewest=0)
             if not without.samples:
@@ -271,7 +278,7 @@ class StructuredFit(FittedModel):
     ) -> StructuredFit:
         return cls(*unpack(header, tensors, system, source))
 
-    def record(self) -> tuple[Settings, dict[str, Tensor]]:
+    def record(self) -> tuple[Record, dict[str, Tensor]]:
         settings, tensors = pack(
             self.specification, self.problem, self.hyperparameters, self.posterior, self.result
         )
@@ -344,15 +351,6 @@ def _carried(z: AffineMap, variance: Tensor) -> Tensor:
     return (z.B_Q * variance[..., None, :]) @ z.B_Q.mT
 
 
-def _sparse(posterior: ForcePosterior) -> SparsePosterior:
-    if not isinstance(posterior.latent, SparsePosterior):
-        raise ModelError(
-            "a fit with exact inference cannot forget",
-            hint='make the model with inference="sparse", or condition it on the data that count',
-        )
-    return posterior.latent
-
-
 @torch.no_grad()
 def conditioned(
     specification: Specification,
@@ -389,11 +387,7 @@ def conditioned(
         learned,
         log_marginal_likelihood=likelihood,
         jitter=jitter,
-        constant_inputs=tuple(
-            f"{prior.name}.{name}"
-            for prior, scale in zip(problem.priors, training.scales, strict=True)
-            for name in scale.constant
-        ),
+        constant_inputs=constant_inputs(problem),
         force_correlation=doubts.correlation,
         warnings=(*warnings, *learned.doubts, *doubts.warnings, *more_points),
         samples=training.all_samples,

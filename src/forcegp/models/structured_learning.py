@@ -40,8 +40,7 @@ from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.start import Search, initial
 from forcegp.gp.exact import require_exact_fits
-from forcegp.gp.optimise import Learned, LearningOptions, Progress
-from forcegp.models.base import FitProgress
+from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, Progress, reported
 from forcegp.models.structured_spec import Specification
 from forcegp.robot.model import RobotModel
 from forcegp.storage.checkpoint import Evaluations
@@ -260,12 +259,8 @@ def learned(
     if file is not None:
         saved = Evaluations.resumed(file, search.start, *_key(spec, problem, search, begin))
         search = dataclasses.replace(search, recorded=saved.recorded)
-
-    def report(evaluations: int, value: float, _: Mapping[str, Tensor]) -> None:
-        assert progress is not None
-        progress(evaluations, search.options.max_evaluations, value)
-
-    lesson = solve(spec, problem, search, report if progress else None, begin, neighbours)
+    report = reported(progress, search.options.max_evaluations)
+    lesson = solve(spec, problem, search, report, begin, neighbours)
     if saved is not None:
         saved.write()
     return lesson

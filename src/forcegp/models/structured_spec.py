@@ -122,3 +122,9 @@ class Specification:
             std = torch.as_tensor(noise.torque, dtype=robot.dtype, device=robot.device).expand(robot.nq)
         state_std, theta = state_std_of(noise.state, robot), self.analytical_parameters
         return Problem(self.system, self.priors, self.mean, training, theta, std, state_std=state_std)
+
+
+def constant_inputs(problem: Problem) -> tuple[str, ...]:
+    """Inputs of priors that do not vary in the training data."""
+    pairs = zip(problem.priors, problem.training.scales, strict=True)
+    return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)

@@ -26,10 +26,9 @@ from forcegp.forces.observations import Observation, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.distributed import share_basis
 from forcegp.gp.features import Standardization
 from forcegp.gp.kernels import sub
-from forcegp.gp.sums import Sums
+from forcegp.gp.sums import Sums, share_basis
 from forcegp.models.base import FitProgress
 from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, identity
 from forcegp.models.structured_spec import Specification

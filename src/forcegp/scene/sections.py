@@ -13,7 +13,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from forcegp.constraints import Baumgarte
 from forcegp.files import Record
 from forcegp.simulate.config import SimulationConfig
-from forcegp.storage.options import StructuredOptions
+from forcegp.storage.options import StructuredOptions, Window
 from forcegp.storage.system import ConnectionFields, ContactFields, Point
 
 
@@ -50,14 +50,6 @@ class LearningSection(Section):
     held_out: PositiveFloat = 0.1
 
 
-class WindowSection(Section):
-    """`[model.window]`: how far from the robot file the model `analytical` starts."""
-
-    relative: NonNegativeFloat = 0.0
-    length: NonNegativeFloat = 0.0
-    angle: NonNegativeFloat = 0.0
-
-
 class NoiseSection(Section):
     """`[model.noise]`: fields of `Noise`; `torque = "none"` for none."""
 
@@ -78,7 +70,7 @@ class ModelSection(Section, StructuredOptions):
     priors: str | tuple[dict[str, Any], ...] = ()
     analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = Field(default_factory=dict)
     hidden: tuple[PositiveInt, ...] = ()
-    window: WindowSection = WindowSection()
+    window: Window = Window()
     seed: NonNegativeInt | None = None
     learning: LearningSection = LearningSection()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -198,7 +198,7 @@ def _layout(tensors: Mapping[str, Tensor], growing: Container[str]) -> dict[str,
     return {name: (x.dtype, x.ndim, *x.shape[1 if name in growing else 0 :]) for name, x in tensors.items()}
 
 
-def _flat(tensors: list[Tensor]) -> Tensor:
+def _flat(tensors: Sequence[Tensor]) -> Tensor:
     return torch.cat([x.detach().to("cpu", torch.float64).reshape(-1) for x in tensors])
 
 
@@ -209,9 +209,9 @@ def _evaluated(
     leaves = {name: value.detach().requires_grad_() for name, value in tensors.items()}
     with torch.enable_grad():
         value = objective(leaves)
-        grads = torch.autograd.grad(value, [leaves[name] for name in names], allow_unused=True)
-    whole = [torch.zeros_like(leaves[n]) if g is None else g for n, g in zip(names, grads, strict=True)]
-    return value.detach().to("cpu", torch.float64), _flat(whole)
+        inputs = [leaves[name] for name in names]
+        grads = torch.autograd.grad(value, inputs, allow_unused=True, materialize_grads=True)
+    return value.detach().to("cpu", torch.float64), _flat(grads)
 
 
 class _StoredGradient(torch.autograd.Function):

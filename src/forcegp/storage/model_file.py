@@ -22,10 +22,9 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.destination import check_destination
 from forcegp.errors import ModelError
-from forcegp.files import Header, atomic_file, validated
+from forcegp.files import Header, M, Record, atomic_file, validated
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
 from forcegp.resources import announce_memory
-from forcegp.storage.options import Settings, SettingsT
 from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
 
 TYPES = (torch.float64, torch.float32, torch.int64, torch.bool)
@@ -80,6 +79,14 @@ class ModelHeader(Header):
     settings: dict[str, Any]
     system: dict[str, Any]
 
+    def settings_as(self, kind: type[M], source: str) -> M:
+        """The settings of a saved model, checked.
+
+        Raises:
+            ModelError: a field is missing, unknown or not valid; names file and field.
+        """
+        return validated(kind, self.settings, source, ModelError, ("settings",))
+
 
 def model_path(path: str | Path) -> Path:
     """The file of a model: the path, with the ending `.safetensors` if it has another or none."""
@@ -88,7 +95,7 @@ def model_path(path: str | Path) -> Path:
 
 
 def model_bytes(
-    kind: str, system: ConstrainedSystem, settings: Settings, tensors: Mapping[str, Tensor]
+    kind: str, system: ConstrainedSystem, settings: Record, tensors: Mapping[str, Tensor]
 ) -> bytes:
     """The content of the file of a model; no tensor has a name that begins with `system.`."""
     record, robot = pack_system(system)
@@ -102,7 +109,7 @@ def write_model(
     path: str | Path,
     kind: str,
     system: ConstrainedSystem,
-    settings: Settings,
+    settings: Record,
     tensors: Mapping[str, Tensor],
 ) -> None:
     """Write the file of a model, whole or not at all; see `model_bytes`.
@@ -204,12 +211,3 @@ def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:
 def model_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The tensors of the model itself, without its system's."""
     return {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}
-
-
-def settings_of(header: ModelHeader, kind: type[SettingsT], source: str) -> SettingsT:
-    """The settings of a saved model, checked.
-
-    Raises:
-        ModelError: a field is missing, unknown or not valid; names file and field.
-    """
-    return validated(kind, header.settings, source, ModelError, ("settings",))

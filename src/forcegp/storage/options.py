@@ -4,23 +4,45 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, PositiveInt, ValidationError
+from pydantic import Field, PositiveInt, ValidationError
 
 from forcegp.errors import ModelError, UnknownNameError
+from forcegp.files import Record
 from forcegp.gp.inducing import LIMIT
 
-SettingsT = TypeVar("SettingsT", bound="Settings")
+Width = Annotated[float, Field(ge=0.0, strict=True)]
+O = TypeVar("O", bound="KernelOptions")
 
 
-class Settings(BaseModel):
-    """Base of what a kind of models keeps in `ModelHeader.settings`: frozen, no unknown field."""
+class Window(Record):
+    """How far from the parameters of the robot file learning starts.
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    Attributes:
+        relative: half width for logarithms of masses, moments and friction; 0.5 is a factor of 0.37 to
+            2.7 for the mass of a link, and of 0.61 to 1.65 for friction.
+        length: half width for centres of mass and other lengths [m].
+        angle: half width for turns [rad].
+    """
+
+    relative: Width = 0.5
+    length: Width = 0.05
+    angle: Width = 0.1
+
+
+class KernelOptions(Record):
+    """Options of models with kernels on the states.
+
+    Attributes:
+        standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
+            in the paper.
+    """
+
+    standardize: bool = True
 
     @classmethod
-    def of(cls: type[SettingsT], values: Mapping[str, Any]) -> SettingsT:
+    def of(cls: type[O], values: Mapping[str, Any]) -> O:
         """The fields that are among named values, with their types checked.
 
         Raises:
@@ -37,17 +59,6 @@ class Settings(BaseModel):
                 names = re.findall(r"'([^']*)'", first["msg"])
                 raise UnknownNameError(name, values[name], names) from cause
             raise ModelError(f"invalid `{name}`", expected=first["msg"], got=values[name]) from cause
-
-
-class KernelOptions(Settings):
-    """Options of models with kernels on the states.
-
-    Attributes:
-        standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
-            in the paper.
-    """
-
-    standardize: bool = True
 
 
 class StructuredOptions(KernelOptions):
