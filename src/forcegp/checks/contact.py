@@ -13,11 +13,12 @@ import numpy as np
 import torch
 
 from forcegp import kinematics
-from forcegp.checks.finding import Finding, Intervals
+from forcegp.checks.finding import Finding
 from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors
-from forcegp.checks.log import Array, Log, Outcome, describe, evenly, intervals
+from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.robust import robust_std
+from forcegp.rows import Intervals, describe, intervals
 
 OFFSET = 5e-4
 """Displacement of a surface that is reported [m]."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, SupportsFloat
 
 from forcegp.errors import UnknownNameError
+from forcegp.rows import Intervals
 
 Severity = Literal["note", "warning", "error"]
 
@@ -120,8 +121,6 @@ KINDS: dict[str, Kind] = {
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """From the gravest to the lightest."""
-
-Intervals = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ import numpy as np
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
-from forcegp.checks.log import Array, Log, Outcome, any_row, describe, intervals
+from forcegp.checks.log import Array, Log, Outcome, any_row
 from forcegp.constraints import ConstrainedSystem
+from forcegp.rows import describe, intervals
 
 DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi

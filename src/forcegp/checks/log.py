@@ -29,25 +29,9 @@ from forcegp.data.table import read_table
 from forcegp.errors import DataError
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
+from forcegp.rows import intervals
 
 Array = NDArray[Any]
-
-
-def intervals(mask: NDArray[np.bool_], join: int = 0) -> tuple[tuple[int, int], ...]:
-    """Half-open runs of true rows; runs that are at most `join` rows apart become one.
-
-    >>> intervals(np.array([True, True, False, True]))
-    ((0, 2), (3, 4))
-    """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    runs = [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-    joined: list[tuple[int, int]] = []
-    for start, stop in runs:
-        if joined and start - joined[-1][1] <= join:
-            joined[-1] = (joined[-1][0], stop)
-        else:
-            joined.append((start, stop))
-    return tuple(joined)
 
 
 def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
@@ -58,14 +42,6 @@ def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 def any_row(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """`(n,)` bool, rows of `(n, d)` in which any column is true."""
     return np.asarray(mask.any(axis=1))
-
-
-def describe(spans: tuple[tuple[int, int], ...], most: int = 3) -> str:
-    """Rows in words, such as `row 4` or `rows 4 to 9, 20 to 31 and 5 more intervals`."""
-    texts = [f"{a}" if b - a == 1 else f"{a} to {b - 1}" for a, b in spans[:most]]
-    many = len(spans) > 1 or any(b - a > 1 for a, b in spans)
-    rest = f" and {len(spans) - most} more" if len(spans) > most else ""
-    return f"row{'s' * many} {', '.join(texts)}{rest}"
 
 
 OUTER = np.array([-10.0, 10.0, -5.0, 2.0]) / 3.0

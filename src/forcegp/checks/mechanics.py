@@ -17,10 +17,11 @@ from forcegp.checks.hypotheses import (
     robot_columns,
     sharper_friction_columns,
 )
-from forcegp.checks.log import Log, Outcome, any_row, describe, force_unit, intervals, position_unit, smoothed
+from forcegp.checks.log import Log, Outcome, any_row, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
+from forcegp.rows import describe, intervals
 
 LEAST_ROWS = 200
 """Rows from which dynamics are judged."""

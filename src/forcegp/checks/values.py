@@ -12,14 +12,15 @@ import torch
 from forcegp import dynamics
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import tensors
-from forcegp.checks.log import Array, Log, Outcome, any_row, describe, intervals, spikes
+from forcegp.checks.log import Array, Log, Outcome, any_row, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS
 from forcegp.robust import robust_std
+from forcegp.rows import Intervals, describe, intervals
 
 
-def _after(mask: np.ndarray) -> tuple[tuple[int, int], ...]:
+def _after(mask: np.ndarray) -> Intervals:
     """Rows at the end of the steps that a mask over steps picks."""
     return intervals(np.concatenate([[False], mask]))
 

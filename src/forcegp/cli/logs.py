@@ -213,7 +213,7 @@ def _print(report: Report) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from forcegp.checks.log import describe
+    from forcegp.rows import describe
 
     if report.findings:
         table = Table(box=None, pad_edge=False)

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.errors import DataError
-from forcegp.logs.signals import Array, ImportReport, Signals, listed
+from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.rows import describe, numbered
 
 RESTART_STEPS = 2.0
 """A clock that falls back to within so many steps of where its trajectory began, or before, has restarted."""
@@ -51,7 +52,7 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
     if len(different):
         rows = signals.row[different]
         raise DataError(
-            f"rows {listed(rows)} have the time stamp of the row before, with other values",
+            f"{describe(numbered(rows))}: the time stamp of the row before, with other values",
             expected="one row for each time",
             got=f"{len(rows)} such rows",
             hint="is this the right column of time? Its resolution may be too coarse",
@@ -84,7 +85,7 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
                 start = row
         if wrong:
             raise DataError(
-                f"time goes back in row{'s' * (len(wrong) > 1)} {listed(signals.row[wrong])}",
+                f"time goes back in {describe(numbered(signals.row[wrong]))}",
                 expected=f"more than {t[wrong[0] - 1]:.9g} s in row {signals.row[wrong[0]]}",
                 got=f"{t[wrong[0]]:.9g} s",
                 hint="sort the log by time, or take a column of time that increases within a trajectory",

@@ -25,9 +25,10 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
 from forcegp.logs.mapping import ContactStateSection, Mapping
-from forcegp.logs.signals import Array, ImportReport, Signals, runs
+from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
+from forcegp.rows import runs
 
 CHUNK = 1 << 12
 """Rows that are computed at a time."""

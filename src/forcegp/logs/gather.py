@@ -18,8 +18,9 @@ from forcegp.logs import units
 from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
 from forcegp.logs.mapping import Mapping
 from forcegp.logs.readers import read
-from forcegp.logs.signals import Array, ImportReport, Signals, listed
+from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.logs.table import LogTable, Progress, Stream
+from forcegp.rows import describe, numbered
 
 
 def joint_factors(mapping: Mapping, name: str, joints: Sequence[str]) -> tuple[Array, Array]:
@@ -189,8 +190,7 @@ class _Gathering:
         rows = signals.row[bad]
         if self.time.missing == "error":
             raise DataError(
-                f"{self.table.source}: values are missing or not finite in "
-                f"row{'s' * (len(rows) > 1)} {listed(rows)}",
+                f"{self.table.source}: values are missing or not finite in {describe(numbered(rows))}",
                 expected="a number in every mapped column",
                 got=f"{len(rows)} incomplete rows of {len(signals)}",
                 hint='missing = "drop" under [time] drops them',

@@ -5,11 +5,12 @@ Quantities are in SI units and in the robot's joint order, on one clock.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from forcegp.rows import numbered, runs
 
 Array = NDArray[np.float64]
 
@@ -59,20 +60,6 @@ class Signals:
         return runs(self.segment, *keys)
 
 
-def runs(*keys: NDArray[np.generic]) -> list[slice]:
-    """Stretches of rows on which none of the keys changes.
-
-    >>> runs(np.array([0, 0, 1, 1]), np.array([True, True, True, False]))
-    [slice(0, 2, None), slice(2, 3, None), slice(3, 4, None)]
-    """
-    n = len(keys[0])
-    cut = np.zeros(max(n - 1, 0), dtype=bool)
-    for key in keys:
-        cut |= key[1:] != key[:-1]
-    edges = [0, *(np.flatnonzero(cut) + 1).tolist(), n] if n else []
-    return [slice(a, b) for a, b in itertools.pairwise(edges)]
-
-
 MOST_INTERVALS = 20
 """Intervals of rows that a finding lists; its count covers all."""
 
@@ -113,32 +100,9 @@ class ImportReport:
     def find(self, kind: str, message: str, rows: NDArray[np.int64] | None = None) -> None:
         """Add a finding on some rows, given by their numbers in the log, increasing."""
         numbers = np.zeros(0, np.int64) if rows is None else rows
-        self.findings.append(ImportFinding(kind, message, len(numbers), intervals(numbers)))
+        first = tuple((a, b - 1) for a, b in numbered(numbers)[:MOST_INTERVALS])
+        self.findings.append(ImportFinding(kind, message, len(numbers), first))
 
     def did(self, step: str) -> None:
         """Add a step."""
         self.steps.append(step)
-
-
-def intervals(rows: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
-    """The first intervals of consecutive numbers, as (first, last).
-
-    >>> intervals(np.array([3, 4, 5, 9]))
-    ((3, 5), (9, 9))
-    """
-    if not len(rows):
-        return ()
-    cuts = np.flatnonzero(np.diff(rows) != 1)[:MOST_INTERVALS]
-    first = rows[np.concatenate([[0], cuts + 1])][:MOST_INTERVALS]
-    last = rows[np.concatenate([cuts, [len(rows) - 1]])][:MOST_INTERVALS]
-    return tuple((int(a), int(b)) for a, b in zip(first, last, strict=True))
-
-
-def listed(rows: NDArray[np.int64]) -> str:
-    """Rows as people write them: `3 to 5, 9`.
-
-    >>> listed(np.array([3, 4, 5, 9]))
-    '3 to 5, 9'
-    """
-    parts = [f"{a}" if a == b else f"{a} to {b}" for a, b in intervals(rows)[:4]]
-    return ", ".join(parts) + (", …" if len(intervals(rows)) > 4 else "")

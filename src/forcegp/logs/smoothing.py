@@ -22,7 +22,8 @@ from scipy.optimize import minimize_scalar
 from forcegp.data.derivative import SavitzkyGolay, differentiate
 from forcegp.errors import DataError
 from forcegp.logs.mapping import DerivativesSection
-from forcegp.logs.signals import Array, ImportReport, Signals, runs
+from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.rows import runs
 
 STATES = 4
 """Size of the state: position to jerk."""

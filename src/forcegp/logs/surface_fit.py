@@ -16,6 +16,7 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, Plane, Sphere, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
+from forcegp.forces.calibration import autocorrelation_time
 from forcegp.logs.signals import Array
 from forcegp.robust import robust_std
 
@@ -48,27 +49,12 @@ def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> So
     inside = np.abs(first - np.median(first)) <= OUTLIER_STD * max(float(robust_std(first)), ROUNDING)
     final = least_squares(lambda x: residual(x)[inside], robust, x_scale="jac")
     residuals = residual(final.x)[inside]
-    effective = len(residuals) / correlation_time(residuals)
+    centered = torch.from_numpy(residuals - residuals.mean())[:, None]
+    time = float(autocorrelation_time(centered, torch.zeros(len(residuals), dtype=torch.int64)))
+    effective = max(len(residuals) / time, min(LEAST_POINTS, len(residuals)))
     information = final.jac.T @ final.jac * (effective / len(residuals))
     scale = max(float(residuals.std()), ROUNDING)
     return Solution(final.x, scale**2 * np.linalg.pinv(information, hermitian=True), residuals, effective)
-
-
-def correlation_time(values: Array) -> float:
-    """1 + 2 Σ ρ_k up to the first negative ρ_k: the rows that count as one independent row (Sokal 1997).
-
-    >>> 0.8 < correlation_time(np.random.default_rng(0).standard_normal(4000)) < 1.2
-    True
-    """
-    x = values - values.mean()
-    n = len(x)
-    power = np.abs(np.fft.rfft(x, 2 * n)) ** 2
-    autocorrelation = np.fft.irfft(power)[:n]
-    if not autocorrelation[0] > 0.0:
-        return 1.0
-    rho = autocorrelation / autocorrelation[0]
-    first = int(np.argmax(rho < 0.0)) if (rho < 0.0).any() else n
-    return float(min(max(1.0 + 2.0 * rho[1:first].sum(), 1.0), n / LEAST_POINTS if n > LEAST_POINTS else n))
 
 
 LEAST_RADIUS_STD = 4.0
