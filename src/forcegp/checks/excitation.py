@@ -130,11 +130,10 @@ def _missing(system: ConstrainedSystem, log: Log, joints: list[int]) -> str:
 
 
 LARGEST = 1e3
-"""Sizes beyond this are not looked for."""
-MOST = {"encoder-offset": np.pi, "base-tilted": 180.0}
-"""Largest sizes that faults can have: half a turn, in rad and degrees."""
 SIZES = np.geomspace(1e-3, LARGEST, 200)
 """Sizes that are tried."""
+MOST = {"encoder-offset": np.pi, "base-tilted": 180.0}
+"""Largest sizes that faults can have: half a turn, in rad and degrees."""
 SPAN = 1
 """Rows on either side of which the rate of the torque is taken; fewer than the margin of `explain`."""
 HIDDEN = {

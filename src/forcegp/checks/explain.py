@@ -36,10 +36,9 @@ from forcegp.checks.log import Array, Log
 from forcegp.checks.placement import leaves_surface
 from forcegp.constraints import ConstrainedSystem
 
-ROWS = 1600
-"""Rows that hypotheses are tested on."""
-SCREENING = 4
-"""Share of these rows, as its inverse, on which hypotheses must do better first."""
+ROWS, SCREENING = 1600, 4
+"""Rows that hypotheses are tested on, and the share of them, as its inverse, on which they must do better
+first."""
 ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
@@ -50,11 +49,8 @@ SAME = 1e-3
 """Relative difference of errors that are equal."""
 DETERMINED = 3.0
 """A gain counts as known if it exceeds this many standard errors."""
-MATERIAL = 0.15
-"""Drop of Σ_j log error that matters: 14 % less error in one joint."""
-MATERIAL_EACH = 0.05
-"""Drop of log error per joint that matters where all joints are concerned."""
-
+MATERIAL, MATERIAL_EACH = 0.15, 0.05
+"""Drop of Σ_j log error that matters, 14 % less error in one joint; per joint where all are concerned."""
 
 Tried = tuple[Hypothesis, TorqueFit]
 
@@ -64,14 +60,10 @@ class Explanation:
     """What explains the torque: faults of the log, which are undone, and of the robot file.
 
     Attributes:
-        system: the robot with its contacts.
-        log: the log without the faults.
-        rows: rows that are looked at.
+        system, log, rows: robot and contacts, the log without the faults, and the rows that are looked at.
         problem: the torques that remain, over `rows`.
-        columns, prior: columns of the accepted hypotheses on the robot, and the sizes of their parameters.
-        robot: names of these hypotheses, which stay in the model.
-        findings: faults found, the most telling first.
-        repairs: what takes the faults out of a log, in order.
+        columns, prior, robot: of the accepted hypotheses on the robot, which stay in the model, with names.
+        findings, repairs: faults found, and what takes them out of a log, in order.
         taken: names and joints of the accepted hypotheses.
     """
 
@@ -131,25 +123,24 @@ def _round(model: Explanation) -> Explanation | None:
     """Accept the simplest hypothesis within one standard error of the best, if it explains enough."""
     system, log = model.system, model.log
     tried = [
-        (hypothesis, fit)
-        for hypothesis, fit in _fits(model)
-        if (hypothesis.name, hypothesis.joints) not in model.taken
-        and plausible(system, hypothesis, fit)
-        and not leaves_surface(system, log, corrected(log, hypothesis, fit.theta))
+        (h, fit)
+        for h, fit in _fits(model)
+        if (h.name, h.joints) not in model.taken
+        and plausible(system, h, fit)
+        and not leaves_surface(system, log, corrected(log, h, fit.theta))
     ]
-    good = [
-        (hypothesis, fit)
-        for hypothesis, fit in tried
-        if significant(fit.shares, model.fit.shares, len(hypothesis.joints) or log.nq)
-    ]
+    null = model.fit
+    good = [(h, fit) for h, fit in tried if significant(fit.shares, null.shares, len(h.joints) or log.nq)]
     if not good:
         return None
     best = min((fit for _, fit in good), key=lambda fit: fit.score.mean())
-    most, near = gain_of(best.score, model.fit.score)[0], []
-    for hypothesis, fit in good:
-        loss, error = gain_of(best.score, fit.score)
-        if loss <= max(error, SHARE * most) + 1e-9:
-            near.append((hypothesis, fit))
+    most = gain_of(best.score, null.score)[0]
+    losses = [gain_of(best.score, fit.score) for _, fit in good]
+    near = [
+        one
+        for one, (loss, error) in zip(good, losses, strict=True)
+        if loss <= max(error, SHARE * most) + 1e-9
+    ]
     chosen, fit = min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
     # The errors of an arm and of its mirror image are equal but for rounding.
     alike = [
@@ -159,7 +150,7 @@ def _round(model: Explanation) -> Explanation | None:
         for joint in other.joints
     ]
     finding = finding_of(system, log, chosen, fit, tuple(dict.fromkeys(alike)))
-    alternatives = alternatives_of(system, (chosen, fit), tried, model.fit)
+    alternatives = alternatives_of(system, (chosen, fit), tried, null)
     finding = with_alternatives(finding, [finding_of(system, log, *pair) for pair in alternatives])
     return _accepted(model, chosen, fit.theta, finding)
 
@@ -234,9 +225,7 @@ def _promising(model: Explanation) -> Iterator[Hypothesis]:
 def significant(better: Array, worse: Array, concerned: int) -> bool:
     """Whether a drop of the score matters for the number of joints concerned, and is not due to chance.
 
-    Args:
-        better, worse: `(blocks, nq)` errors as shares of the torque.
-        concerned: number of joints.
+    The errors are shares of the torque `(blocks, nq)`.
     """
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
@@ -248,10 +237,8 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
 SMALL_MASS = 1e-6
 """Share of the robot's mass below which a mass is zero."""
 ALONE = 2.0
-"""Standard errors by which an alternative must lower the held-out error on its own.
-
-The threshold is low (chance exceeds it in 4 % of cases), since it is already known that something is wrong.
-"""
+"""Standard errors by which an alternative must lower the held-out error on its own, which chance exceeds in 4
+% of cases: it is already known that something is wrong."""
 TESTS = {
     "torque-gain": "hang a known weight from the tip: its torque shows the gain, whatever the masses",
     "torque-current": "hang a known weight from the tip: its torque shows the gains, whatever the masses",
@@ -273,10 +260,9 @@ TESTS = {
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
-    """The hypotheses that the held-out blocks cannot distinguish from the chosen one.
+    """The hypotheses that the held-out blocks cannot distinguish from the chosen one, the best first.
 
-    The best comes first. Each lowers the error significantly, and by as much as the chosen one to within one
-    standard error of the difference over blocks.
+    Each lowers the error as much as it, to within one standard error of the difference over blocks.
     """
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
         if _says_the_same(chosen[0], hypothesis):

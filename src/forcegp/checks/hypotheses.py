@@ -30,10 +30,8 @@ from forcegp.robot.model import RobotModel
 
 LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
 """Delays between torque and motion that are tried, in samples either way."""
-MASS_SHARE = 0.3
-"""How far the masses of a robot file may be off, as a share."""
-MOMENT_ARM = 0.1
-"""How far centres of mass may be off [m]."""
+MASS_SHARE, MOMENT_ARM = 0.3, 0.1
+"""How far masses of a robot file may be off, as a share, and centres of mass [m]."""
 TOOL_MASS = 5.0
 """How heavy a tool may be that the robot file lacks [kg]."""
 SHARPER = (2.0, 10.0)
@@ -52,8 +50,7 @@ class Hypothesis:
         name: what is wrong: a kind of finding, or a family of kinds.
         size: number of parameters, discrete choices counted as none.
         change: makes the log as it would be, were the hypothesis right; parameters come on top.
-        columns: `(n, nq, p)` torque that the parameters add to r, if there are any.
-        prior: `(p,)` how large the parameters may be.
+        columns, prior: `(n, nq, p)` torque that the parameters add to r, and how large these may be `(p,)`.
         joints: indices of the joints concerned.
         shift: delay of the torque in samples.
         instruments: `(n, nq, p)` in place of least squares on columns that hold errors.
@@ -186,8 +183,7 @@ def current_hypothesis(
 ) -> Hypothesis:
     """Gains of joints by instrumental variables; the instrument is the torque that the motion needs.
 
-    The logged torque of a light joint is mostly friction that the robot file does not describe. Used as a
-    regressor, it contains errors, which bias its gain towards zero (errors in variables).
+    Errors in a logged torque, mostly friction of a light joint, would bias its gain towards zero.
     """
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)
@@ -252,10 +248,17 @@ SMALL_GAIN = 0.2
 """Gains closer to 1 than this may as well be errors of the masses of a robot file."""
 EXPLAINED = 0.5
 """Share of the torque that a gain may leave unexplained, as any useful model may."""
-SMALL_TILT = 1.0
-"""Bases are levelled to better than this [degrees]."""
-SMALL_GRAVITY = 0.05
-"""Share of gravity below which a change of its size is an error of the masses."""
+SMALL_TILT, SMALL_GRAVITY = 1.0, 0.05
+"""Bases are levelled to better than this [degrees]; smaller changes of the size of gravity, as a share, are
+errors of the masses."""
+
+
+DISCRETE = {
+    "torque-sign": "the torque of {} fits the motion with the opposite sign",
+    "joint-sign": "{} fits the robot file when it turns the other way",
+    "torque-order": "the torques of {} fit when exchanged",
+    "joint-order": "{} fit the robot file when exchanged",
+}
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
@@ -304,14 +307,8 @@ def finding_of(
         return _gains(log, names, 1.0 + theta[: len(names)])
     if name == "gravity":
         return _gravity(system, log, theta[:3])
-    if name == "torque-sign":
-        text = f"the torque of {listed} fits the motion with the opposite sign"
-    elif name == "joint-sign":
-        text = f"{listed} fits the robot file when it turns the other way"
-    elif name == "torque-order":
-        text = f"the torques of {listed} fit when exchanged"
-    elif name == "joint-order":
-        text = f"{listed} fit the robot file when exchanged"
+    if name in DISCRETE:
+        text = DISCRETE[name].format(listed)
     elif name == "torque-delay":
         rows, seconds = abs(hypothesis.shift), abs(hypothesis.shift) * log.dt
         word = "after" if hypothesis.shift > 0 else "before"

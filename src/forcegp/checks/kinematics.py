@@ -11,14 +11,15 @@ any motion. White noise shows alike at k = 1 and k = 3; filtered noise does not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from forcegp import dynamics
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import residual, tensors
+from forcegp.checks.fit import cross_validate, tensors
+from forcegp.checks.hypotheses import problem_of
 from forcegp.checks.limits import DEGREE
 from forcegp.checks.log import Array, Log, Outcome
 from forcegp.constraints import ConstrainedSystem
@@ -26,10 +27,9 @@ from forcegp.robust import robust_std
 
 WINDOW = 0.05
 """Length of a window [s]; long enough that noise averages out, short against the motion."""
-TOLERANCE = 0.05
-"""A slope within this of 1 is right: filters and uneven clocks cost a few percent."""
-INSTANT = 0.15
-"""The same for accelerations, which change within a period."""
+TOLERANCE, INSTANT = 0.05, 0.15
+"""A slope within this of 1 is right, as filters and uneven clocks cost a few percent; for accelerations,
+which change within a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
 EXCHANGED = 0.9
@@ -40,12 +40,8 @@ JUMPS = 0.05
 """Largest share of windows that impacts cross: the velocity jumps there, which no acceleration holds."""
 INERTIA_ROWS = 200
 """Rows at which inertias are computed."""
-FRICTION_ROWS = 4000
-"""Rows from which viscous friction is estimated."""
-LEVER = 1e-6
-"""A contact without this lever arm does not act on a joint [m]."""
-AUTOCORRELATED = 20
-"""Neighbouring rows that are counted as one."""
+FRICTION_ROWS, LEAST_ROWS = 4000, 20
+"""Rows from which viscous friction is estimated, at most and at least."""
 ALIKE = 0.02
 """Slopes of all joints within this of one factor have one cause: the clock."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
@@ -58,10 +54,8 @@ class Match:
     """Changes and integrals of one level, and the slopes between them.
 
     Attributes:
-        change, integral: `(w, nq)` over windows, zero where an impact crosses one.
-        whole: both as they are.
-        low, high: `(nq,)` bounds of the slope.
-        correlation: `(nq,)`.
+        change, integral: `(w, nq)` over windows, zero where an impact crosses one; `whole`, both as they are.
+        low, high, correlation: `(nq,)` bounds of the slope, and correlation.
         moving: `(nq,)` bool, joints whose change stands out from noise.
     """
 
@@ -120,12 +114,20 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
     """One factor between changes and integrals of all joints and both levels: the clock is at fault."""
     if not log.stretches:
         return [], log
-    if log.derived:
-        return _check_long_step(log)
-    first, second = match(log, "q", "qd"), match(log, "qd", "qdd")
-    if first is None or second is None or not (first.moving & second.moving).any():
+    if "qd" in log.derived:  # only the length of a step says anything
+        step = f"{log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
+        long = Finding("time-unit", f"rows are {step}", log.all_rows, evidence={"period": log.dt})
+        return [long] if log.dt >= 1.0 else [], log
+    first = match(log, "q", "qd")
+    if first is None or not first.moving.any():
         return [], log
     factor = float(np.median(first.low[first.moving]))
+    if log.derived:
+        near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
+        return _clock_finding(log, factor) if near or _one_factor(first, factor) else ([], log)
+    second = match(log, "qd", "qdd")
+    if second is None or not (first.moving & second.moving).any():
+        return [], log
     if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or not first.right(factor)[first.moving].all():
         return [], log
     both = first.moving & second.moving
@@ -144,20 +146,6 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
         return [finding], log.replace(t=log.t * near[0])
     text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
     return [Finding("time-scale", text, log.all_rows, evidence=evidence)], log.replace(t=log.t * factor)
-
-
-def _check_long_step(log: Log) -> Outcome:
-    """Without logged velocities and accelerations only the length of a step tells the unit of time."""
-    if "qd" not in log.derived:
-        first = match(log, "q", "qd")
-        factor = float(np.median(first.low[first.moving])) if first is not None else 1.0
-        near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
-        alike = first is not None and _one_factor(first, factor)
-        return _clock_finding(log, factor) if near or alike else ([], log)
-    if log.dt < 1.0:
-        return [], log
-    text = f"rows are {log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
-    return [Finding("time-unit", text, log.all_rows, evidence={"period": log.dt})], log
 
 
 def _one_factor(level: Match, factor: float) -> bool:
@@ -275,21 +263,13 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
 
 def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
     """`(nq,)` viscous friction that the robot file lacks, 0 where the torques do not show it [N m s/rad]."""
-    rows = log.rows(FRICTION_ROWS)
-    damping = np.zeros(log.nq)
-    torque, J = residual(system, log, rows)
-    for j in range(log.nq):
-        free = np.linalg.norm(J[:, :, j], axis=1) < LEVER
-        qd, r = log.qd[rows, j][free], torque[free, j]
-        if len(r) < 20:
-            continue
-        X = -np.stack([qd, np.sign(qd), np.ones_like(qd)], axis=1)
-        w, *_ = np.linalg.lstsq(X, r, rcond=None)
-        variance = ((r - X @ w) ** 2).sum() / (len(r) - 3) * np.linalg.pinv(X.T @ X)[0, 0]
-        # Neighbouring rows err alike, so only clear cases count.
-        if w[0] > CLEARLY * np.sqrt(AUTOCORRELATED * variance):
-            damping[j] = w[0]
-    return damping
+    rows, nq = log.rows(FRICTION_ROWS), log.nq
+    if len(rows) < LEAST_ROWS:
+        return np.zeros(nq)
+    problem = problem_of(system, log, rows)
+    viscous, others = problem.nuisance[..., :nq], problem.nuisance[..., nq:]
+    fit = cross_validate(replace(problem, nuisance=others), viscous)
+    return np.where(-fit.theta > CLEARLY * fit.spread, -fit.theta, 0.0)
 
 
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -313,10 +293,9 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     return [finding], log.replace(qdd=qdd, derived=log.derived | {"qdd"})
 
 
-DEPARTURE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
-"""The departure, with signs: it vanishes on cubics."""
-DEPARTURE_STRIDE = 3
-"""Distance of neighbours that shows noise below the corner of a filter."""
+DEPARTURE, DEPARTURE_STRIDE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, 3
+"""The departure, with signs: it vanishes on cubics. At this distance of neighbours it shows noise below the
+corner of a filter."""
 NOISE_FACTOR = 2.0
 """Ratio of noise found to noise stated that is reported."""
 FILTERED = 0.4

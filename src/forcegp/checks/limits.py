@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.checks.finding import Finding
+from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
-from forcegp.checks.log import Array, Log, Outcome, any_row
+from forcegp.checks.log import Array, Log, Outcome
 from forcegp.constraints import ConstrainedSystem
-from forcegp.rows import describe, intervals
+from forcegp.rows import intervals
 
 DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi
@@ -91,11 +91,9 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
         slack = SLACK * np.where(np.isfinite(high - low), high - low, 0.0)
         with np.errstate(invalid="ignore"):
             beyond = ((value < low - slack) | (value > high + slack)) & log.usable[:, None]
-        if beyond.any():
-            hit, joints = any_row(beyond), log.named(beyond.any(axis=0))
-            rows = intervals(hit)
-            text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in {describe(rows)}"
-            findings.append(Finding(kinds[name], text, rows, joints, evidence={"rows": hit.sum()}))
+        hit, joints = beyond.any(axis=1), log.named(beyond.any(axis=0))
+        text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in"
+        findings += at_rows(hit, kinds[name], text, joints, rows=hit.sum())
     return findings, log
 
 
@@ -116,9 +114,6 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
             if runs and at.sum() > OFTENER * max(others, 1.0) and extreme != 0.0:
                 for a, b in runs:
                     clipped[a:b, j] = True
-    if not clipped.any():
-        return [], log
-    rows = intervals(any_row(clipped))
     joints = log.named(clipped.any(axis=0))
-    text = f"the torque of {', '.join(joints)} stays at its largest value in {describe(rows)}"
-    return [Finding("torque-saturated", text, rows, joints)], log
+    text = f"the torque of {', '.join(joints)} stays at its largest value in"
+    return at_rows(clipped.any(axis=1), "torque-saturated", text, joints), log

@@ -17,7 +17,7 @@ from forcegp.checks.hypotheses import (
     robot_columns,
     sharper_friction_columns,
 )
-from forcegp.checks.log import Log, Outcome, any_row, force_unit, position_unit, smoothed
+from forcegp.checks.log import Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
@@ -25,10 +25,9 @@ from forcegp.rows import describe, intervals
 
 LEAST_ROWS = 200
 """Rows from which dynamics are judged."""
-SIGNIFICANT = 3.0
-"""Standard errors over blocks from which a part of the torque is there."""
-MATERIAL = 0.1
-"""Drop of the log error of a joint that makes friction or an offset worth reporting."""
+SIGNIFICANT, MATERIAL = 3.0, 0.1
+"""Standard errors over blocks from which friction or an offset is there, and drop of the log error of a joint
+that makes it worth reporting."""
 SPEEDS = (25.0, 95.0)
 """Percentiles of a joint's speed between which friction resists."""
 UNEXPLAINED = 0.5
@@ -37,10 +36,9 @@ TRACE_ROWS = 20_000
 """Rows at which the residual is looked at over time."""
 DISTURBANCE_SECONDS = 0.1
 """Length over which the residual is averaged [s]."""
-DISTURBANCE = 5.0
-"""Robust standard deviations of the log residual from which a stretch of time stands out."""
-LOUD = 4.0
-"""Factor over the residual of the worst tenth of the motion from which it stands out as well."""
+DISTURBANCE, LOUD = 5.0, 4.0
+"""A stretch of time stands out by so many robust standard deviations of the log residual, or by this factor
+over the residual of the worst tenth of the motion."""
 MOVING = 0.05
 """Share of the largest speed from which an arm moves."""
 VISIBLE = 0.1
@@ -189,7 +187,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
     friction = _dry_friction(system.robot, explanation, rows, width)
-    visible = any_row(np.abs(trace) > VISIBLE * explanation.problem.size + friction)
+    visible = (np.abs(trace) > VISIBLE * explanation.problem.size + friction).any(axis=1)
     bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)

@@ -42,13 +42,7 @@ NUMBERS = 16
 
 @dataclass(frozen=True)
 class Imported:
-    """A log that has been imported.
-
-    Attributes:
-        data: the data set.
-        report: what was found and done.
-        contacts: the evidence for each contact that was detected.
-    """
+    """A data set, what was found in the log and done to it, and the evidence for each detected contact."""
 
     data: Dataset
     report: ImportReport
@@ -102,14 +96,9 @@ def import_log(
     mapping: Mapping | str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Imported:
-    """Read a log, and say what was found in it and done to it.
+    """Read a log as `read_log` does, and say what was found in it and done to it.
 
-    Args:
-        path, scene, mapping: see `read_log`.
-        progress: called while the file is read, with the work done and the total.
-
-    Raises:
-        DataError, MappingError, MissingDependencyError: see `read_log`.
+    `progress` is called while the file is read, with the work done and the total.
     """
     system = system_of(scene)
     robot = system.robot
@@ -118,7 +107,7 @@ def import_log(
     else:
         log_mapping = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
     report = ImportReport(str(path))
-    report.did(f"read {Path(path).name} by mapping {Path(log_mapping.source).name}")
+    report.steps.append(f"read {Path(path).name} by mapping {Path(log_mapping.document.source).name}")
     try:
         signals = gather(path, log_mapping, robot.joint_names, report, progress)
         numbers = NUMBERS * len(signals.joint_names) * len(signals)
@@ -201,7 +190,7 @@ def _contact_extras(
     if "wrench" in signals.vectors and signals.contact:
         sensed = per_contact(signals, system, mapping)
         extras |= {name: {key: _tensor(x) for key, x in group.items()} for name, group in sensed.items()}
-        report.did("took the tool's weight off the wrench and carried it to the contact")
+        report.steps.append("took the tool's weight off the wrench and carried it to the contact")
     return extras
 
 

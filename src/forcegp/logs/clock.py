@@ -20,11 +20,7 @@ GAP_STEPS = 5.0
 
 
 def usual_step(t: Array) -> float:
-    """The median of the positive time steps [s].
-
-    Raises:
-        DataError: time never increases.
-    """
+    """The median of the positive time steps [s]; `DataError` where time never increases."""
     steps = np.diff(t)
     steps = steps[steps > 0.0]
     if not len(steps):
@@ -37,11 +33,7 @@ def usual_step(t: Array) -> float:
 
 
 def drop_repeated(signals: Signals, report: ImportReport) -> None:
-    """Drop rows that repeat the one before, stamp and values.
-
-    Raises:
-        DataError: rows with the same stamp hold different values.
-    """
+    """Drop rows that repeat the one before; `DataError` where only the stamp is the same."""
     same = np.concatenate([[False], np.diff(signals.t) == 0.0])
     if not same.any():
         return
@@ -64,10 +56,8 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
 def split_trajectories(signals: Signals, gap: float | None, report: ImportReport) -> None:
     """Number the trajectories: a new one begins where the clock restarts and after a gap.
 
-    Args:
-        signals: the log; its `segment` holds what the log itself says.
-        gap: longest step within a trajectory [s], or `None` for `GAP_STEPS` usual steps.
-        report: gets what was found.
+    A step longer than `gap` [s], by default `GAP_STEPS` usual ones, is a gap. `signals.segment` holds the
+    numbers that the log itself gives.
 
     Raises:
         DataError: time steps back without restarting; the message has the rows.
@@ -123,15 +113,8 @@ def join_stream(
 ) -> None:
     """Add a vector of a stream with a clock of its own, interpolated at the times of the log.
 
-    Rows of the log that the stream does not cover are dropped: before its first stamp, after its last, and
-    within its gaps.
-
-    Args:
-        signals: the log.
-        name: under which the vector is added.
-        t, values: the stream, `(k,)` and `(k, d)`.
-        gap: longest step of the stream that is interpolated over [s], or `None` for `GAP_STEPS` usual steps.
-        report: gets what was dropped.
+    Rows of the log that the stream, with stamps t `(k,)`, does not cover are dropped: before its first stamp,
+    after its last, and within its gaps.
 
     Raises:
         DataError: the stream's clock does not increase, or the streams do not overlap.
@@ -159,7 +142,9 @@ def join_stream(
         report.find("uncovered", message, signals.row[~covered])
         signals.keep(covered, split=True)
     signals.vectors[name] = onto(t, values, signals.t)
-    report.did(f"interpolated {name} from {1.0 / usual_step(t):.4g} Hz onto the clock of the positions")
+    report.steps.append(
+        f"interpolated {name} from {1.0 / usual_step(t):.4g} Hz onto the clock of the positions"
+    )
 
 
 UNEVEN = 0.02
@@ -181,21 +166,18 @@ def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
 def even_clock(signals: Signals, period: float | None, report: ImportReport) -> None:
     """Put every trajectory on an evenly spaced clock of its own start, if its own is uneven.
 
-    Args:
-        signals: the log.
-        period: the time step [s], or `None` for the log's usual step.
-        report: gets the step, and how uneven the clock was.
+    The step is `period` [s], by default the log's usual one.
     """
-    steps = [np.diff(signals.t[rows]) for rows in signals.runs() if rows.stop - rows.start > 1]
-    worst = max((float(np.abs(s - np.median(s)).max() / np.median(s)) for s in steps), default=0.0)
+    stretches = [rows for rows in signals.runs() if rows.stop - rows.start > 1]
+    if not stretches:
+        raise DataError("the log has no trajectory of two rows or more")
+    steps = [np.diff(signals.t[rows]) for rows in stretches]
+    worst = max(float(np.abs(s - np.median(s)).max() / np.median(s)) for s in steps)
     if worst > UNEVEN:
         report.find("uneven", f"time steps depart by up to {100.0 * worst:.3g} % from the usual step")
     elif period is None:
         return
     step = period if period is not None else usual_step(signals.t)
-    stretches = [rows for rows in signals.runs() if rows.stop - rows.start > 1]
-    if not stretches:
-        raise DataError("the log has no trajectory of two rows or more")
     grids, nearest = [], []
     for rows in stretches:
         t = signals.t[rows]
@@ -209,9 +191,6 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
         signals.vectors[name] = np.concatenate(parts)
     index: NDArray[np.int64] = np.concatenate(nearest)
     signals.contact = {name: value[index] for name, value in signals.contact.items()}
-    signals.t, signals.row, signals.segment = (
-        np.concatenate(grids),
-        signals.row[index],
-        signals.segment[index],
-    )
-    report.did(f"resampled to steps of {step:.9g} s (positions by cubic splines, torques linearly)")
+    signals.t, signals.row = np.concatenate(grids), signals.row[index]
+    signals.segment = signals.segment[index]
+    report.steps.append(f"resampled to steps of {step:.9g} s (positions by cubic splines, torques linearly)")

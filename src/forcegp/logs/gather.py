@@ -24,11 +24,7 @@ from forcegp.rows import describe, numbered
 
 
 def joint_factors(mapping: Mapping, name: str, joints: Sequence[str]) -> tuple[Array, Array]:
-    """Factors s k to SI on the joint side, and offsets o in the unit of the column, `(nq,)` each.
-
-    Raises:
-        MappingError: a joint has no number.
-    """
+    """Factors s k to SI on the joint side, and offsets o in the unit of the column, `(nq,)` each."""
     section = mapping.quantity(name)
     assert section is not None
     scale = mapping.per_joint(name, "sign", joints) * units.QUANTITY[name][section.unit]
@@ -84,10 +80,8 @@ class _Gathering:
         self, table: LogTable, mapping: Mapping, joints: tuple[str, ...], report: ImportReport
     ) -> None:
         self.table, self.mapping, self.joints, self.report = table, mapping, joints, report
-        self.time = mapping.sections.time
-        position = mapping.columns_of("position", joints)
-        section = mapping.sections.position
-        self.reference = table.stream_of(position[0], section.stream)
+        self.time, position = mapping.sections.time, mapping.columns_of("position", joints)
+        self.reference = table.stream_of(position[0], mapping.sections.position.stream)
 
     def run(self) -> Signals:
         """The quantities, those of the reference stream first."""
@@ -154,8 +148,8 @@ class _Gathering:
 
     def _stamps(self, stream: Stream) -> Array:
         """Time stamps of a stream [s]."""
-        holder = stream if self.time.column in stream.columns else None
-        if holder is None:
+        holder = stream
+        if self.time.column not in stream.columns:
             if len(self.table.streams) > 1 and stream is not self.reference:
                 raise DataError(
                     f"{self.table.source}: stream {stream.name!r} has no column {self.time.column!r}",
@@ -206,5 +200,5 @@ class _Gathering:
             span = f"{signals.t.min():.6g} to {signals.t.max():.6g} s" if len(signals) else "no complete row"
             raise DataError(f"{self.table.source}: no row between start and stop", expected=span)
         if not inside.all():
-            self.report.did(f"kept the {inside.sum()} rows from {start:g} to {stop:g} s")
+            self.report.steps.append(f"kept the {inside.sum()} rows from {start:g} to {stop:g} s")
             signals.keep(inside)

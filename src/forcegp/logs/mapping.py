@@ -7,7 +7,6 @@ file.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -22,7 +21,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data.checks import lock_hint
 from forcegp.errors import MappingError, did_you_mean
 from forcegp.logs import units
-from forcegp.logs.draft import Draft, Family
+from forcegp.logs.draft import Draft, Family, quoted
 from forcegp.logs.readers import read
 from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
@@ -123,20 +122,10 @@ BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "
 
 @dataclass(frozen=True)
 class Mapping:
-    """A mapping file that has been read and checked.
-
-    Attributes:
-        sections: the tables.
-        document: the file, for messages.
-    """
+    """A mapping file that has been read and checked: its tables, and the document for messages."""
 
     sections: MappingSections
     document: Document
-
-    @property
-    def source(self) -> str:
-        """Name of the file."""
-        return self.document.source
 
     def quantity(self, name: str) -> QuantitySection | None:
         """The table of a joint vector: `position`, `velocity`, `acceleration` or `torque`."""
@@ -144,10 +133,6 @@ class Mapping:
 
     def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
         """The log's column of a quantity for each joint of the robot.
-
-        Args:
-            name: the quantity.
-            joints: the robot's joints.
 
         Raises:
             MappingError: a joint has no column, or a name is not a joint of the robot.
@@ -176,11 +161,7 @@ class Mapping:
         return columns
 
     def per_joint(self, name: str, key: str, joints: Sequence[str]) -> NDArray[np.float64]:
-        """The numbers `(nq,)` of a key that holds one for all joints or one for each.
-
-        Raises:
-            MappingError: a joint is missing or unknown.
-        """
+        """The numbers `(nq,)` of a key that holds one for all joints or one for each."""
         value: PerJoint = getattr(self.quantity(name), key)
         if not isinstance(value, dict):
             return np.full(len(joints), float(value))
@@ -297,22 +278,21 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
 
 
 def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
-    """The mapping of a log whose names leave no doubt.
-
-    Raises:
-        MappingError: they do; the hint says how to write a mapping.
-    """
+    """The mapping of a log whose names leave no doubt; otherwise `MappingError`, with a hint."""
     table, robot = read(path, rows=1), system.robot
     names, joints = set(table.names), robot.joint_names
     symbols = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
     logged = {n: s for n, s in symbols.items() if names >= {f"{s}.{joint}" for joint in joints}}
     if {"position", "torque"} <= set(logged) and "t" in names:
-        draft = Draft(str(path), "t", segment="segment" if "segment" in names else None)
+        draft = Draft(str(path), {"column": "t", "segment": "segment" if "segment" in names else None})
         for name, symbol in logged.items():
             draft.families[name] = Family(f"{symbol}.{{joint}}", {}, unit=units.SI[name])
-        for name in {f"contact.{contact}" for contact in system.contact_names} & names:
-            column = f"column = {json.dumps(name)}"
-            draft.contacts[name.removeprefix("contact.")] = ['source = "column"', column]
+        for contact in system.contact_names:
+            if f"contact.{contact}" in names:
+                draft.further[f"contact.{quoted(contact)}"] = {
+                    "source": "column",
+                    "column": f"contact.{contact}",
+                }
         return parse_mapping(draft.toml().encode(), "columns named as in a data set")
     if "header" in names and names >= {f"{n}.{joint}" for n in ("position", "effort") for joint in joints}:
         return load_mapping("ros_joint_states")

@@ -102,7 +102,3 @@ class ImportReport:
         numbers = np.zeros(0, np.int64) if rows is None else rows
         first = tuple((a, b - 1) for a, b in numbered(numbers)[:MOST_INTERVALS])
         self.findings.append(ImportFinding(kind, message, len(numbers), first))
-
-    def did(self, step: str) -> None:
-        """Add a step."""
-        self.steps.append(step)

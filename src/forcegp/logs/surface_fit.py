@@ -63,17 +63,15 @@ LEAST_RADIUS_STD = 4.0
 
 @dataclass(frozen=True)
 class Tip:
-    """A rounded tip: a ball that ends at the path's points, or has its centre there.
+    """A ball of radius r [m], to be fitted if `None`, that ends at the path's points or has its centre there.
 
-    Attributes:
-        axes: `(n, 3)` unit vectors from the ball's centre to the path's points; zero where these are centres.
-        radius: r of the ball; `None` to fit it [m].
+    `axes` are unit vectors `(n, 3)` from its centre to the path's points; zero where these are centres.
     """
 
     axes: Array
     radius: float | None
 
-    def start(self, x: list[float]) -> Array:
+    def start(self, *x: float) -> Array:
         """Initial parameters, with those of a surface first."""
         return np.array([*x, 0.0] if self.radius is None else x)
 
@@ -82,11 +80,7 @@ class Tip:
         return float(x[-1]) if self.radius is None else self.radius
 
     def std(self, solution: Solution) -> dict[str, float]:
-        """Error bar of a fitted radius.
-
-        Raises:
-            DataError: the orientation of the tip does not show it.
-        """
+        """Error bar of a fitted radius; `DataError` where the tip's orientation does not show it."""
         if self.radius is not None:
             return {}
         radius, std = self.of(solution.x), float(np.sqrt(solution.covariance[-1, -1]))
@@ -103,11 +97,7 @@ class Tip:
 def tip_of(
     system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor, radius: float | Literal["fit"] | None
 ) -> Tip:
-    """The tip that touched at positions `(n, nq)`: that of the scene, or a ball that ends at its point.
-
-    Raises:
-        DataError: the scene's tip has a radius of its own, or the point is the origin of its frame.
-    """
+    """The tip that touched at positions `(n, nq)`: that of the scene, or a ball that ends at its point."""
     if radius is None:
         return Tip(np.zeros((len(q), 3)), contact.radius)
     point = torch.tensor(tuple(contact.point), dtype=q.dtype)
@@ -135,14 +125,11 @@ class SurfaceFit:
     """A fitted surface.
 
     Attributes:
-        contact: name of the contact.
-        surface: the plane or sphere.
         std: standard deviations: `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane;
             `center` [m] (the largest of its three) and `radius` [m] of a sphere; `tip_radius` [m] if fitted.
         residual: deviation of the path from the surface [m].
         points, outliers: rows that were fitted, and rows too far off to be on the surface.
         effective_points: how many independent rows the fitted ones are worth.
-        tip_radius: of the tip that touched [m].
     """
 
     contact: str
@@ -231,7 +218,7 @@ def _plane(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
         n = normal(x)
         return centered @ n - tip.of(x) * (tip.axes @ n + 1.0) - x[2]
 
-    solution = robust_least_squares(residual, tip.start([0.0, 0.0, 0.0]))
+    solution = robust_least_squares(residual, tip.start(0.0, 0.0, 0.0))
     x, cov, across = solution.x, solution.covariance, float((centered @ v).std())
     tilt = float(np.sqrt(max(cov[0, 0], cov[1, 1])))
     if not (tilt < LARGEST_TILT and across > LEAST_WIDTH * solution.residuals.std()):
@@ -263,7 +250,7 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit
         r = tip.of(x)
         return np.linalg.norm(centered - r * tip.axes - x[:3], axis=1) - r - x[3]
 
-    solution = robust_least_squares(residual, tip.start([*start[:3], np.sqrt(squared)]))
+    solution = robust_least_squares(residual, tip.start(*start[:3], np.sqrt(squared)))
     x, cov = solution.x, solution.covariance
     center, radius = x[:3] + middle, float(x[3])
     std = {"center": float(np.sqrt(np.diag(cov)[:3].max())), "radius": float(np.sqrt(cov[3, 3]))}

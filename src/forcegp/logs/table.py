@@ -92,11 +92,7 @@ class LogTable:
         return [name for stream in self.streams for name in stream.columns]
 
     def stream_of(self, column: str, stream: str | None = None) -> Stream:
-        """The stream that holds a column.
-
-        Raises:
-            DataError: no such stream or column, or several streams hold it and none is named.
-        """
+        """The stream that holds a column; `DataError` where none does, or several and none is named."""
         among = [s for s in self.streams if stream is None or s.name == stream]
         if not among:
             raise missing(self.source, "stream", stream or "", [s.name for s in self.streams])
@@ -159,12 +155,8 @@ def arrays_to_streams(
     """Streams of the arrays of a file, one for each number of rows.
 
     A matrix `(n, d)` becomes the columns `name[0]` to `name[d-1]`. Rows run along the axis whose length
-    most arrays share; `(d, n)` is transposed. Arrays of another length are streams of their own.
-
-    Args:
-        source: name of the file, for messages.
-        arrays: numeric arrays of one or two dimensions.
-        remarks: gets a sentence for each array that was transposed or left out.
+    most arrays share; `(d, n)` is transposed. Arrays of another length are streams of their own. `remarks`
+    gets a sentence for each array that was transposed or left out.
     """
     usable = {}
     for name, array in arrays.items():

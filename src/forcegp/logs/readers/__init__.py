@@ -72,11 +72,7 @@ def read(
 
 
 def format_of(path: Path) -> str:
-    """The key in `FORMATS` of a log.
-
-    Raises:
-        DataError: no such file, or a format that is not read or not safe to read.
-    """
+    """The key in `FORMATS` of a log."""
     if path.is_dir():
         return _format_of_folder(path)
     if not path.is_file():

@@ -48,11 +48,7 @@ def canonical(kind: str) -> str:
 
 
 def decoder(kind: str, encoding: str) -> Decode:
-    """Decodes messages of a type in `KINDS`, in the encoding `ros1` or `cdr`.
-
-    Raises:
-        MissingDependencyError: `rosbags` is not installed.
-    """
+    """Decodes messages of a type in `KINDS`, in the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
     stores = typesys.Stores
     store = typesys.get_typestore(stores.ROS1_NOETIC if encoding == "ros1" else stores.ROS2_HUMBLE)
@@ -62,16 +58,12 @@ def decoder(kind: str, encoding: str) -> Decode:
 
 @dataclass
 class Messages:
-    """Messages of one topic about one set of joints, in the order of the first message.
+    """Messages of one topic about one set of joints, none for a wrench, in the order of the first message.
 
-    Attributes:
-        names: the joints; none for a wrench.
-        rows: the numbers of each message.
-        stamps: stamp of the header and time of recording [ns].
+    `rows` has the numbers of each message, `stamps` that of its header and the time of recording [ns].
     """
 
     topic: str
-    kind: str
     names: tuple[str, ...]
     rows: list[list[float]] = field(default_factory=list)
     stamps: list[tuple[int, int]] = field(default_factory=list)
@@ -91,26 +83,18 @@ class Messages:
 
 @dataclass
 class Collector:
-    """Gathers the messages of a bag, one stream for each topic and set of joints.
-
-    Args:
-        source: name of the bag, for messages.
-    """
+    """Gathers the messages of a bag, one stream for each topic and set of joints."""
 
     source: str
     _streams: dict[tuple[str, tuple[str, ...]], Messages] = field(default_factory=dict)
     _numbers: int = 0
 
     def add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
-        """Take one message.
-
-        Raises:
-            DataError: it is too large, or its arrays do not fit its joint names.
-        """
+        """Take one message; `DataError` if it is too large, or its arrays do not fit its joint names."""
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
         names, values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
-        stream = self._streams.setdefault((topic, tuple(sorted(names))), Messages(topic, kind, names))
+        stream = self._streams.setdefault((topic, tuple(sorted(names))), Messages(topic, names))
         if stream.names != names:
             order = [names.index(name) for name in stream.names]
             blocks = range(0, len(values), len(names))
@@ -128,11 +112,7 @@ class Collector:
         return max((len(stream.rows) for stream in self._streams.values()), default=0)
 
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
-        """The log, with the columns that are wanted; `topics` are all topics of the bag with their types.
-
-        Raises:
-            DataError: no topic has a message type that is read.
-        """
+        """The log, with the columns that are wanted; `topics` are all topics of the bag with their types."""
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             raise DataError(

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
@@ -52,12 +52,10 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a text table is written.
+    """How a text table is written, after `first_line` lines without numbers.
 
-    Attributes:
-        first_line: number of lines before the first line of numbers.
-        kinds: `number`, `bool`, `date`, `text` or `empty`, one per column.
-        units: name → unit, where a line below the heading declares units.
+    Each column is a `number`, `bool`, `date`, `text` or `empty`; `units` are those that a line below the
+    heading declares.
     """
 
     encoding: str
@@ -70,11 +68,7 @@ class Dialect:
 
 
 def sniff(path: Path) -> Dialect:
-    """Find out how a text table is written, from its first lines.
-
-    Raises:
-        DataError: the file is empty, binary, or has no two lines with equally many numbers.
-    """
+    """Find out how a text table is written, from its first lines."""
     with path.open("rb") as file:
         head = file.read(SAMPLE_BYTES)
     text, encoding = _decode(path, head)
@@ -232,7 +226,6 @@ def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterat
     from pyarrow import csv
 
     types = {"number": pa.float64(), "bool": pa.bool_(), "date": pa.timestamp("ns")}
-    options: dict[str, Any] = {"decimal_point": dialect.decimal, "null_values": list(MISSING)}
     yield from csv.open_csv(
         pa.PythonFile(source, mode="r"),
         read_options=csv.ReadOptions(
@@ -244,7 +237,10 @@ def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterat
         ),
         parse_options=csv.ParseOptions(delimiter=dialect.separator, ignore_empty_lines=True),
         convert_options=csv.ConvertOptions(
-            include_columns=list(kinds), column_types={n: types[kind] for n, kind in kinds.items()}, **options
+            include_columns=list(kinds),
+            column_types={n: types[kind] for n, kind in kinds.items()},
+            decimal_point=dialect.decimal,
+            null_values=list(MISSING),
         ),
     )
 
