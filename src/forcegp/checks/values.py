@@ -1,5 +1,4 @@
-"""Each column by itself: a clock that runs evenly, numbers that a sensor can have meant, steps of the
-state."""
+"""Each column by itself: an even clock, numbers that a sensor can have meant, steps of the state."""
 
 from __future__ import annotations
 
@@ -301,8 +300,8 @@ def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 JUMP, FASTEST = 30.0, 2.0
-"""A jump exceeds so many robust standard deviations of the steps, fifteen at each of two rows, and the change of
-the fastest joint within a step by this factor."""
+"""A jump exceeds so many robust standard deviations of the steps, fifteen at each of two rows, and the change
+of the fastest joint within a step by this factor."""
 
 
 def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:

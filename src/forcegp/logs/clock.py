@@ -115,9 +115,6 @@ def join_stream(
 
     Rows of the log that the stream, with stamps t `(k,)`, does not cover are dropped: before its first stamp,
     after its last, and within its gaps.
-
-    Raises:
-        DataError: the stream's clock does not increase, or the streams do not overlap.
     """
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):

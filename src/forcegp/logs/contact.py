@@ -173,10 +173,6 @@ def detect(
     """Set `signals.contact` for every contact of the scene, and return the evidence for those detected.
 
     Contacts found from λ need `qd` and `qdd`.
-
-    Raises:
-        DataError: the evidence does not separate two states.
-        MappingError: the mapping does not say how a contact is known, or names one that the scene lacks.
     """
     sections = mapping.sections.contact
     for name in sections:

@@ -47,12 +47,7 @@ def gather(
     progress: Progress | None = None,
     rows: int | None = None,
 ) -> Signals:
-    """Read the mapped columns of a log onto one clock, at most `rows` rows where the format allows it.
-
-    Raises:
-        DataError: the log cannot be read, or a value or a time stamp is not usable; names the rows.
-        MappingError: the mapping does not fit the robot.
-    """
+    """Read the mapped columns of a log onto one clock, at most `rows` rows where the format allows it."""
     needed = _needed(mapping, joints)
     table = read(path, wanted=needed.__contains__, rows=rows, progress=progress)
     report.format = table.format

@@ -132,11 +132,7 @@ class Mapping:
         return getattr(self.sections, name)
 
     def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
-        """The log's column of a quantity for each joint of the robot.
-
-        Raises:
-            MappingError: a joint has no column, or a name is not a joint of the robot.
-        """
+        """The log's column of a quantity for each joint of the robot."""
         section = self.quantity(name)
         assert section is not None
         self._check_joints(("joints",), self.sections.joints, joints)

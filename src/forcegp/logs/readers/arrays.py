@@ -34,11 +34,7 @@ MAX_ARRAYS = 4096
 
 
 def read_numpy(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the numeric arrays of an `.npz` archive, or the array of an `.npy` file.
-
-    Raises:
-        DataError: an array holds Python objects, the file is damaged, or it is too large.
-    """
+    """Read the numeric arrays of an `.npz` archive, or the array of an `.npy` file."""
     del wanted, rows, progress
     arrays: Arrays = {}
     remarks: list[str] = []
@@ -87,12 +83,7 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
 
 
 def read_hdf5(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the numeric data sets of an HDF5 file; one in a group is `group/name`.
-
-    Raises:
-        DataError: the file is damaged or too large.
-        MissingDependencyError: `h5py` is not installed.
-    """
+    """Read the numeric data sets of an HDF5 file; one in a group is `group/name`."""
     del wanted, rows, progress
     remarks: list[str] = []
     streams = arrays_to_streams(str(path), _hdf5_arrays(path, "/", remarks), remarks)
@@ -153,10 +144,6 @@ def read_matlab(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
     """Read the numeric arrays of a MATLAB file; fields of a struct are `struct.field`.
 
     Cells, objects, sparse matrices and function handles are left out with a remark.
-
-    Raises:
-        DataError: the file is damaged or too large.
-        MissingDependencyError: a file of version 7.3, and `h5py` is not installed.
     """
     del wanted, rows, progress
     with path.open("rb") as file:

@@ -158,12 +158,7 @@ def _wrench(message: Any) -> tuple[tuple[str, ...], list[float]]:
 
 
 def read_rosbag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2.
-
-    Raises:
-        DataError: the bag is damaged, compressed or too large, or has no message of these types.
-        MissingDependencyError: `rosbags` is not installed.
-    """
+    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2."""
     with (path if path.is_file() else path / "metadata.yaml").open("rb") as file:
         first = file.read(12) == b"#ROSBAG V2.0"
     number, encoding = (1, "ros1") if first else (2, "cdr")
@@ -209,12 +204,7 @@ RECORD_BYTES = 256 << 20
 
 
 def read_mcap(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of an MCAP file, also of one that was cut off and has no index.
-
-    Raises:
-        DataError: the file is damaged or too large, or has no message of these types.
-        MissingDependencyError: `mcap` or `rosbags` is not installed.
-    """
+    """Read the joint states and wrenches of an MCAP file, also of one that was cut off and has no index."""
     package = optional_module("mcap.reader", "Reading MCAP files", "import")
     collector = Collector(str(path))
     decoders: dict[int, Decode | None] = {}

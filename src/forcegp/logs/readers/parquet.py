@@ -35,11 +35,7 @@ BATCH_ROWS = 1 << 16
 
 
 def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the columns of numbers, flags and times; a list column becomes `name[0]`, `name[1]`, …
-
-    Raises:
-        DataError: the file is damaged or too large, or a list column has lists of different length.
-    """
+    """Read the columns of numbers, flags and times; a list column becomes `name[0]`, `name[1]`, …"""
     remarks: list[str] = []
     with foreign(str(path), "Parquet"):
         columns = read_columns([path], wanted, rows, remarks, progress)
@@ -152,9 +148,6 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 
     The columns are named as in `meta/info.json`: `observation.state.<motor>`, or `observation.state[i]`
     where the motors have no names. Images and videos are not read.
-
-    Raises:
-        DataError: the folder is not a LeRobot data set, or is damaged or too large.
     """
     features = _features(path / "meta" / "info.json")
     files = sorted((path / "data").rglob("*.parquet"))

@@ -193,11 +193,7 @@ _EDGES = re.compile(rb"(?m)^ | (?=\r?$)")
 
 
 def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read a text table; columns of text are left out with a remark.
-
-    Raises:
-        DataError: not a table, a line with another number of fields, or a field that is not a number.
-    """
+    """Read a text table; columns of text are left out with a remark."""
     dialect = sniff(path)
     kinds = {n: kind for n, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(n)}
     remarks = [f"column {n!r} holds text and was left out" for n, kind in kinds.items() if kind == "text"]
@@ -296,9 +292,6 @@ def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
     """Read the tables of a folder; a column is `file[i]`, or `file.heading` where the file has headings.
 
     Files with the same number of rows share a clock and make one stream.
-
-    Raises:
-        DataError: a file is not a table of numbers, or the folder is too large.
     """
 
     def in_file(file: Path, column: str) -> str:
