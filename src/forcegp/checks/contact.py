@@ -95,17 +95,16 @@ def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
             text = f"the scene has a contact {contact.name!r}, and the log does not say when it is closed"
             findings.append(Finding("contact-unlabelled", text, log.all_rows, contact=contact.name))
         elif isinstance(contact, SurfaceContact):
-            findings += _check_surface(contact, tip_path(system, contact, log), log)
+            path = tip_path(system, contact, log)
+            usable = np.isfinite(path.c) & log.usable
+            closed = log.contact[contact.name] & usable
+            if closed.sum() >= LEAST_ROWS:
+                placement, distance = _placement(contact, path, closed, log)
+                findings += [*placement, *_labels(contact, path, closed, usable, distance, log)]
+            else:
+                slides = usable & ~closed & (path.approach <= CREEP)
+                findings += _missed(contact, path, slides, path.c, TOUCH, log)
     return findings, log
-
-
-def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Finding]:
-    usable = np.isfinite(path.c) & log.usable
-    closed = log.contact[contact.name] & usable
-    if closed.sum() < LEAST_ROWS:
-        return _missed(contact, path, usable & ~closed & (path.approach <= CREEP), path.c, TOUCH, log)
-    findings, distance = _placement(contact, path, closed, log)
-    return [*findings, *_labels(contact, path, closed, usable, distance, log)]
 
 
 def _placement(

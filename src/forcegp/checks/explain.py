@@ -14,24 +14,10 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from forcegp.checks import hypotheses
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import TorqueFit, TorqueProblem, cross_validate, gain_of, pooled_gain_of, score_of
-from forcegp.checks.hypotheses import (
-    LAGS,
-    ROBOT,
-    Hypothesis,
-    continuous,
-    corrected,
-    current_hypothesis,
-    delays,
-    discrete,
-    encoder_hypothesis,
-    finding_of,
-    gain_hypothesis,
-    plausible,
-    problem_of,
-    robot_hypotheses,
-)
+from forcegp.checks.hypotheses import Hypothesis, corrected
 from forcegp.checks.log import Array, Log
 from forcegp.checks.placement import leaves_surface
 from forcegp.constraints import ConstrainedSystem
@@ -85,7 +71,9 @@ class Explanation:
 
     def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
         """The problem on a log that a hypothesis has changed, with the present weights of the joints."""
-        return problem_of(self.system, log, self.rows if rows is None else rows, self.problem.scale)
+        return hypotheses.problem_of(
+            self.system, log, self.rows if rows is None else rows, self.problem.scale
+        )
 
     def weighed(self) -> Explanation:
         """The same with joints weighed by the noise that it leaves."""
@@ -108,8 +96,8 @@ class Explanation:
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     """Find the faults that explain the torque that the robot file leaves."""
-    rows = log.rows(ROWS, margin=max(LAGS))
-    problem = problem_of(system, log, rows)
+    rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
+    problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
     for _ in range(ROUNDS):
         accepted = _round(model)
@@ -126,7 +114,7 @@ def _round(model: Explanation) -> Explanation | None:
         (h, fit)
         for h, fit in _fits(model)
         if (h.name, h.joints) not in model.taken
-        and plausible(system, h, fit)
+        and hypotheses.plausible(system, h, fit)
         and not leaves_surface(system, log, corrected(log, h, fit.theta))
     ]
     null = model.fit
@@ -149,9 +137,9 @@ def _round(model: Explanation) -> Explanation | None:
         if other.name == chosen.name and np.allclose(its.error, fit.error, rtol=SAME, atol=0.0)
         for joint in other.joints
     ]
-    finding = finding_of(system, log, chosen, fit, tuple(dict.fromkeys(alike)))
+    finding = hypotheses.finding_of(system, log, chosen, fit, tuple(dict.fromkeys(alike)))
     alternatives = alternatives_of(system, (chosen, fit), tried, null)
-    finding = with_alternatives(finding, [finding_of(system, log, *pair) for pair in alternatives])
+    finding = with_alternatives(finding, [hypotheses.finding_of(system, log, *pair) for pair in alternatives])
     return _accepted(model, chosen, fit.theta, finding)
 
 
@@ -159,7 +147,7 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
     """The explanation with one hypothesis more: its fault undone, or its parameters in the model."""
     taken = model.taken | {(hypothesis.name, hypothesis.joints)}
     model = replace(model, findings=(*model.findings, finding), taken=taken)
-    if hypothesis.name in ROBOT:
+    if hypothesis.name in hypotheses.ROBOT:
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, model.columns], axis=-1)
         prior = np.concatenate([hypothesis.prior, model.prior])
@@ -168,11 +156,11 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
         theta = theta[:1]
         for _ in range(2):  # Gauss-Newton steps, as the effect of an offset on the torque is not linear
             moved = corrected(model.log, hypothesis, theta)
-            refined = encoder_hypothesis(model.system, moved, model.rows, hypothesis.joints[0])
+            refined = hypotheses.encoder_hypothesis(model.system, moved, model.rows, hypothesis.joints[0])
             theta = theta + cross_validate(model.on(moved), refined.columns).theta
     repair = partial(corrected, hypothesis=hypothesis, theta=theta)
     log = repair(model.log)
-    problem = problem_of(model.system, log, model.rows)
+    problem = hypotheses.problem_of(model.system, log, model.rows)
     return replace(model, log=log, problem=problem, repairs=(*model.repairs, repair)).weighed()
 
 
@@ -181,13 +169,13 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     if len(model.prior):
         # Once the robot is at fault and its parameters are free, they bend to any sign and order. A delay
         # leaves the motion, and with it the columns of the robot's parameters, as they are.
-        for hypothesis in delays(log):
+        for hypothesis in hypotheses.delays(log):
             yield hypothesis, cross_validate(model.on(hypothesis.change(log)), model.columns, model.prior)
-        tried = robot_hypotheses(system, log, rows)
+        tried = hypotheses.robot_hypotheses(system, log, rows)
     else:
         for hypothesis in _promising(model):
             yield hypothesis, cross_validate(model.on(hypothesis.change(log)))
-        tried = continuous(system, log, rows)
+        tried = hypotheses.continuous(system, log, rows)
     off = []
     for hypothesis in tried:
         fit = model.with_(hypothesis)
@@ -195,7 +183,7 @@ def _fits(model: Explanation) -> Iterator[Tried]:
         if hypothesis.name == "gains" and significant(fit.shares, model.fit.shares, 1):
             off += hypothesis.joints
     if len(off) > 1:
-        together = gain_hypothesis(log, rows, tuple(off))
+        together = hypotheses.gain_hypothesis(log, rows, tuple(off))
         yield together, model.with_(together)
     if 2 * len(off) > log.nq > 1:
         yield from _currents(model)
@@ -204,12 +192,14 @@ def _fits(model: Explanation) -> Iterator[Tried]:
 def _currents(model: Explanation) -> Iterator[Tried]:
     """Gains of all joints that the log determines, tried where most torques are scaled wrongly."""
     log, rows, nq = model.log, model.rows, model.log.nq
-    fit = model.with_(current_hypothesis(log, rows, model.problem, tuple(range(nq))))
+    fit = model.with_(hypotheses.current_hypothesis(log, rows, model.problem, tuple(range(nq))))
     gains = 1.0 + fit.theta[:nq]
     determined = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[:nq])
     # A current has the sign of its torque, so gains of both signs have another cause.
     if 2 * len(determined) > nq and (gains[determined] > 0.0).all():
-        hypothesis = current_hypothesis(log, rows, model.problem, tuple(int(j) for j in determined))
+        hypothesis = hypotheses.current_hypothesis(
+            log, rows, model.problem, tuple(int(j) for j in determined)
+        )
         yield hypothesis, model.with_(hypothesis)
 
 
@@ -217,7 +207,7 @@ def _promising(model: Explanation) -> Iterator[Hypothesis]:
     """Hypotheses without parameters that lower the error on a part of the rows."""
     few = model.rows[::SCREENING]
     null = cross_validate(model.on(model.log, few)).score.mean()
-    for hypothesis in discrete(model.log):
+    for hypothesis in hypotheses.discrete(model.log):
         if cross_validate(model.on(hypothesis.change(model.log), few)).score.mean() < null:
             yield hypothesis
 

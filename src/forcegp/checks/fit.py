@@ -119,8 +119,7 @@ class TorqueFit:
         theta: `(p,)` parameters of the hypothesis, from all blocks.
         spread: `(p,)` their standard deviation, by the jackknife over blocks.
         nuisance: parameters of the nuisance columns.
-        relative: `(nq,)` held-out error of the typical block over the size of the torque.
-        shares: `(blocks, nq)` the same block by block.
+        shares: `(blocks, nq)` held-out error over the size of the torque.
         score: `(blocks,)` Σ_j log(error_j / size_j), with a floor where errors do not matter.
     """
 
@@ -128,7 +127,6 @@ class TorqueFit:
     theta: Array
     spread: Array
     nuisance: Array
-    relative: Array
     shares: Array
     score: Array
 
@@ -165,8 +163,7 @@ def cross_validate(
     factor = np.ones(len(problem.size))
     factor[list(gains)] += theta[: len(gains)]
     shares = error * problem.scale / (problem.size * np.abs(factor) + 1e-12)
-    typical, score = np.median(shares, axis=0), score_of(shares)
-    return TorqueFit(error, theta, (spread / unit)[:p], (whole / unit)[p:], typical, shares, score)
+    return TorqueFit(error, theta, (spread / unit)[:p], (whole / unit)[p:], shares, score_of(shares))
 
 
 def _equations(

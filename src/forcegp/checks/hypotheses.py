@@ -268,7 +268,7 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
     if hypothesis.name == "gains":
         joints = list(hypothesis.joints)
         # A gain that only makes the torque larger than its error explains nothing.
-        explained = float(np.median(fit.relative[joints])) < EXPLAINED
+        explained = float(np.median(np.median(fit.shares[:, joints], axis=0))) < EXPLAINED
         return explained and bool((np.abs(fit.theta[: len(joints)]) > SMALL_GAIN).any())
     if hypothesis.name == "gravity":
         assumed = system.robot.gravity.numpy()
@@ -327,7 +327,7 @@ def finding_of(
         worst = int(np.argmax(np.abs(theta[: 10 * log.nq : 10])))
         name, names = "masses-mismatch", (log.joint_names[worst],)
         evidence = {"largest_mass_change_kg": theta[10 * worst]}
-    return Finding(name, text, log.all_rows, names, evidence=evidence)
+    return log.finding(name, text, names, **evidence)
 
 
 def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
@@ -342,7 +342,7 @@ def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
     elif 2 * len(names) > log.nq > 1 and np.median(factor) > CURRENT:
         kind, among, text = "torque-current", gains > 0.0, f"{text}: currents, or torques on the motor side"
     joints = tuple(name for name, hit in zip(names, among, strict=True) if hit) or names
-    return Finding(kind, text, log.all_rows, joints, evidence=evidence)
+    return log.finding(kind, text, joints, **evidence)
 
 
 def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
@@ -355,10 +355,10 @@ def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
     vector = ", ".join(f"{value:.3g}" for value in fitted)
     if strength > 0.0 and size < WEIGHTLESS:
         text = "the torque contains no gravity: gravity compensation was subtracted"
-        return Finding("torque-without-gravity", text, log.all_rows, log.joint_names, evidence=evidence)
+        return log.finding("torque-without-gravity", text, log.joint_names, **evidence)
     tilted = strength > 0.0 and angle <= TILT
     text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"
-    return Finding("base-tilted" if tilted else "gravity-direction", text, log.all_rows, evidence=evidence)
+    return log.finding("base-tilted" if tilted else "gravity-direction", text, **evidence)
 
 
 def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:

@@ -1,12 +1,9 @@
 """Is qd the derivative of q, and qdd that of qd? Units of time and angle, signs, order, and noise of columns.
 
-Over short windows the change of x is compared with the integral I of its logged rate. Noise in either
-flattens one of the two regression lines, so the slope of Δx over I lies between cov/var(I) and
-var(Δx)/cov: a rate is at fault where both bounds are.
-
-Is the noise on the acceleration white, and as large as the header says? The departure of a sample from the
-cubic through its neighbours at distances k and 2k shows the noise around the frequency 1/(2 k dt), and hardly
-any motion. White noise shows alike at k = 1 and k = 3; filtered noise does not.
+A rate is at fault where both bounds of its slope are: noise in either flattens one of the two regression
+lines of the change of x over short windows on the integral of its logged rate. Is the noise on the
+acceleration white, and as large as the header says? White noise shows alike in the departures of samples from
+the cubic through their neighbours at distances of one and of three samples; filtered noise does not.
 """
 
 from __future__ import annotations
@@ -116,7 +113,7 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     if "qd" in log.derived:  # only the length of a step says anything
         step = f"{log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
-        long = Finding("time-unit", f"rows are {step}", log.all_rows, evidence={"period": log.dt})
+        long = log.finding("time-unit", f"rows are {step}", period=log.dt)
         return [long] if log.dt >= 1.0 else [], log
     first = match(log, "q", "qd")
     if first is None or not first.moving.any():
@@ -139,13 +136,13 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def _clock_finding(log: Log, factor: float) -> Outcome:
     near = [unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE]
-    evidence = {"seconds_per_unit": factor, "period": log.dt}
     if near:
+        kind, repaired = "time-unit", log.t * near[0]
         text = f"time advances by {log.dt:.4g} per row, and the motion says {factor * log.dt:.4g} s"
-        finding = Finding("time-unit", text, log.all_rows, evidence=evidence)
-        return [finding], log.replace(t=log.t * near[0])
-    text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
-    return [Finding("time-scale", text, log.all_rows, evidence=evidence)], log.replace(t=log.t * factor)
+    else:
+        kind, repaired = "time-scale", log.t * factor
+        text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
+    return [log.finding(kind, text, seconds_per_unit=factor, period=log.dt)], log.replace(t=repaired)
 
 
 def _one_factor(level: Match, factor: float) -> bool:
@@ -171,7 +168,7 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
     if permutation is not None:
         names = log.named(permutation != np.arange(log.nq))
         text = f"the velocities of {', '.join(names)} belong to each other's positions"
-        finding = Finding("velocity-order", text, log.all_rows, names)
+        finding = log.finding("velocity-order", text, names)
         return [finding], log.replace(qd=log.qd[:, permutation], qdd=_follow(log, permutation))
     findings, factor = _velocity_findings(log, level, wrong)
     return findings, log.replace(qd=log.qd * factor)
@@ -188,9 +185,9 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
     for kind, slope, what in causes:
         hit = unexplained & level.right(slope) & (np.abs(level.correlation) >= RELATED)
         if hit.any():
-            joints, evidence = log.named(hit), {"slope": float(np.median(level.low[hit]))}
+            joints, slopes = log.named(hit), level.low[hit]
             text = f"qd of {', '.join(joints)} {what} the rate of change of q"
-            findings.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
+            findings.append(log.finding(kind, text, joints, slope=float(np.median(slopes))))
             factor[hit], unexplained = slope, unexplained & ~hit
     if unexplained.any():
         findings.append(_mismatch("velocity-mismatch", log, level, unexplained, "qd", "q"))
@@ -200,12 +197,10 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
 def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, value: str) -> Finding:
     """A rate without relation to its value."""
     joints, j = log.named(wrong), int(np.flatnonzero(wrong)[0])
-    evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
-    text = (
-        f"{rate} of {', '.join(joints)} is not the rate of change of {value}: slope {level.low[j]:.3g}, "
-        f"correlation {level.correlation[j]:.3g}"
-    )
-    return Finding(kind, text, log.all_rows, joints, evidence=evidence)
+    slope, correlation = level.low[j], level.correlation[j]
+    shown = f"slope {slope:.3g}, correlation {correlation:.3g}"
+    text = f"{rate} of {', '.join(joints)} is not the rate of change of {value}: {shown}"
+    return log.finding(kind, text, joints, slope=slope, correlation=correlation)
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
@@ -264,7 +259,7 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
 def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
     """`(nq,)` viscous friction that the robot file lacks, 0 where the torques do not show it [N m s/rad]."""
     rows, nq = log.rows(FRICTION_ROWS), log.nq
-    if len(rows) < LEAST_ROWS:
+    if len(rows) < LEAST_ROWS or not log.tau[rows].any():
         return np.zeros(nq)
     problem = problem_of(system, log, rows)
     viscous, others = problem.nuisance[..., :nq], problem.nuisance[..., nq:]
@@ -332,27 +327,24 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
         evidence["stated_std"] = stated
         filtered &= top < stated / NOISE_FACTOR
     if filtered.mean() > 0.5 and not log.header.filtered:
-        joints = log.named(filtered)
+        share = f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them"
+        text = (
+            f"the acceleration is filtered: at the highest frequencies it holds {share}, so it is not white"
+        )
         # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
         weight = "note" if stated is None else "warning"
-        text = (
-            f"the acceleration is filtered: at the highest frequencies it holds "
-            f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them, "
-            "so its noise is not white"
-        )
-        return [Finding("noise-filtered", text, log.all_rows, joints, evidence=evidence, weight=weight)], log
-    return (_stated(log, top, stated, evidence) if stated is not None else []), log
-
-
-def _stated(log: Log, noise: Array, stated: float, evidence: dict[str, float]) -> list[Finding]:
-    kinds = [("noise-understated", noise > NOISE_FACTOR * stated, np.max)]
+        return [
+            replace(log.finding("noise-filtered", text, log.named(filtered), **evidence), weight=weight)
+        ], log
+    if stated is None:
+        return [], log
+    kinds = [("noise-understated", top > NOISE_FACTOR * stated, np.max)]
     if not log.header.filtered:  # the highest frequencies show little of what a filter lets through
-        kinds.append(("noise-overstated", noise < stated / NOISE_FACTOR, np.min))
+        kinds.append(("noise-overstated", top < stated / NOISE_FACTOR, np.min))
     result = []
-    for kind, wrong, worst in kinds:
-        if wrong.any():
-            joints = log.named(wrong)
-            place = f"{worst(noise[wrong]):.3g} rad/s² at {', '.join(joints)}"
-            text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
-            result.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
-    return result
+    for kind, wrong, worst in (one for one in kinds if one[1].any()):
+        joints = log.named(wrong)
+        place = f"{worst(top[wrong]):.3g} rad/s² at {', '.join(joints)}"
+        text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
+        result.append(log.finding(kind, text, joints, **evidence))
+    return result, log

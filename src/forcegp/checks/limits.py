@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.checks.finding import Finding, at_rows
+from forcegp.checks.finding import at_rows
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
 from forcegp.checks.log import Array, Log, Outcome
@@ -57,8 +57,8 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
     if _misfit(system, radians) > _misfit(system, log):
         return [], log
     beyond = f"beyond the joint limits in {100 * outside:.0f} % of the rows"
-    text, evidence = f"angles reach {largest:.4g}, {beyond}: degrees", {"largest": largest}
-    return [Finding("degrees", text, log.all_rows, log.named(turning), evidence=evidence)], radians
+    text = f"angles reach {largest:.4g}, {beyond}: degrees"
+    return [log.finding("degrees", text, log.named(turning), largest=largest)], radians
 
 
 def _misfit(system: ConstrainedSystem, log: Log) -> float:

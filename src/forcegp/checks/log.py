@@ -119,6 +119,10 @@ class Log:
         """The whole log as one interval."""
         return ((0, len(self)),)
 
+    def finding(self, kind: str, text: str, joints: tuple[str, ...] = (), **evidence: Any) -> Finding:
+        """A finding on the whole log."""
+        return Finding(kind, text, self.all_rows, joints, evidence=evidence)
+
     def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
         """Names of the joints that a mask picks."""
         return tuple(self.joint_names[j] for j in np.flatnonzero(joints))

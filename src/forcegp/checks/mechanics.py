@@ -6,17 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError
 from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of, projector, residual, robust_parameters
-from forcegp.checks.hypotheses import (
-    LAGS,
-    contact_friction_columns,
-    friction_columns,
-    robot_columns,
-    sharper_friction_columns,
-)
 from forcegp.checks.log import Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
@@ -56,7 +50,9 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         return passive, log
     smooth = smoothed(log)
     if not _enough(smooth):
-        raise NotJudgedError(f"fewer than {LEAST_ROWS} rows that lie {max(LAGS)} from the ends of a stretch")
+        raise NotJudgedError(
+            f"fewer than {LEAST_ROWS} rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
+        )
     explanation = explain(system, smooth)
     disturbed, rows = [], np.zeros(len(log), bool)
     if log.header.ordered:
@@ -78,7 +74,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _enough(log: Log) -> bool:
-    return len(log.rows(LEAST_ROWS, margin=max(LAGS))) == LEAST_ROWS
+    return len(log.rows(LEAST_ROWS, margin=max(hypotheses.LAGS))) == LEAST_ROWS
 
 
 def _without_torque(log: Log) -> list[Finding]:
@@ -109,7 +105,7 @@ def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
 
 def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) -> Explanation:
     """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
-    functions = (contact_friction_columns, sharper_friction_columns)
+    functions = (hypotheses.contact_friction_columns, hypotheses.sharper_friction_columns)
     columns = [columns(system, explanation.log, explanation.rows) for columns in functions]
     nuisance = np.concatenate([explanation.problem.nuisance, *columns], axis=-1)
     return replace(explanation, problem=replace(explanation.problem, nuisance=nuisance))
@@ -151,7 +147,7 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
         text = f"joints show {word} friction than the robot file declares (viscous, Coulomb): {listed}"
         evidence = dict(zip((f"viscous {joint}" for joint in joints), viscous[hit], strict=True))
         evidence |= dict(zip((f"coulomb {joint}" for joint in joints), coulomb[hit], strict=True))
-        findings.append(Finding("friction-undeclared", text, log.all_rows, joints, evidence=evidence))
+        findings.append(log.finding("friction-undeclared", text, joints, **evidence))
     return findings
 
 
@@ -165,7 +161,7 @@ def _offsets(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(robot, j)}" for j, joint in off.items())
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
     text = f"the logged torque is off by a constant: {listed}"
-    return [Finding("torque-offset", text, log.all_rows, joints, evidence=evidence)]
+    return [log.finding("torque-offset", text, joints, **evidence)]
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:
@@ -174,7 +170,7 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
     if share <= UNEXPLAINED:
         return []
     text = f"robot file, friction and offsets leave {100 * share:.0f} % of the torque unexplained"
-    return [Finding("torque-unexplained", text, explanation.log.all_rows, evidence={"share": share})]
+    return [explanation.log.finding("torque-unexplained", text, share=share)]
 
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
@@ -251,8 +247,8 @@ def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
         r, J = residual(system, log, index)
-        columns = [robot_columns(system, log, index, name)[0] for name in explanation.robot]
-        columns = np.concatenate([*columns, friction_columns(system, log, index)], axis=-1)
+        columns = [hypotheses.robot_columns(system, log, index, name)[0] for name in explanation.robot]
+        columns = np.concatenate([*columns, hypotheses.friction_columns(system, log, index)], axis=-1)
         r = r - columns @ coefficients
         parts.append((projector(J, scale) @ (r / scale)[..., None])[..., 0] * scale)
     return np.concatenate(parts)

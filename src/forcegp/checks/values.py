@@ -52,8 +52,7 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
     if spread <= UNIFORM_TOLERANCE:
         return [], log
     text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
-    evidence = {"relative_spread": spread, "period_s": log.dt}
-    return [Finding("time-jitter", text, log.all_rows, evidence=evidence)], log
+    return [log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)], log
 
 
 def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -62,8 +61,7 @@ def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
     if stated is None or not abs(log.dt / stated - 1.0) > UNIFORM_TOLERANCE:
         return [], log
     text = f"the header states a period of {stated:.4g} s, and the rows are {log.dt:.4g} s apart"
-    evidence = {"stated_s": stated, "period_s": log.dt}
-    return [Finding("period-header", text, log.all_rows, evidence=evidence)], log
+    return [log.finding("period-header", text, stated_s=stated, period_s=log.dt)], log
 
 
 HELD_RUN = 2
@@ -268,8 +266,7 @@ def _within_two(x: Array) -> Array:
 def resolution(x: Array) -> Array:
     """Step between the values that a column takes, where it takes few; else zero."""
     steps = np.zeros(x.shape[1])
-    for j in range(x.shape[1]):
-        levels = np.unique(x[:, j])
+    for j, levels in enumerate(map(np.unique, x.T)):
         if 2 < len(levels) < 0.75 * len(x):
             gaps = np.diff(levels)
             # Rounding in the last digit makes two levels of one; those gaps are not steps.
@@ -296,7 +293,7 @@ def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
         f"positions come in steps of {step[worst]:.3g} rad ({log.joint_names[worst]}), which add noise of "
         f"{noise[worst]:.3g} rad/s to a velocity from neighbouring samples"
     )
-    return [Finding("quantised", text, log.all_rows, joints, evidence={"step": step[worst]})], log
+    return [log.finding("quantised", text, joints, step=step[worst])], log
 
 
 JUMP, FASTEST = 30.0, 2.0

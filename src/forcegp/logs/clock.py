@@ -11,10 +11,9 @@ from forcegp.errors import DataError
 from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.rows import describe, numbered
 
-RESTART_STEPS = 2.0
-"""A clock that falls back to within so many steps of where its trajectory began, or before, has restarted."""
-SHORTEST_TRAJECTORY = 10
-"""Rows before a restart; fewer are stamps out of order."""
+RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
+"""A clock that falls back to within so many steps of where its trajectory began, or before, has restarted,
+after so many rows at least; fewer are stamps out of order."""
 GAP_STEPS = 5.0
 """A step longer than so many usual ones is a gap."""
 

@@ -117,16 +117,12 @@ def _evidence(
     return multiplier(signals, system, contact)
 
 
-SEPARATION = 6.0
-"""Least distance between the two levels of force, in standard deviations of the open one."""
-RELEASE_STD = 4.0
-"""A contact counts as closed from where the force leaves the open level by so many of its deviations."""
-TOUCHING = 1e-3
-"""How near the surface the touching point is in contact at most, unless the mapping says otherwise [m]."""
-DISTANCE_STD = 6.0
-"""A contact is closed up to so many deviations of the distances of the closed contact above their median."""
-SMALLEST_DISTANCE = 1e-6
-"""Least such distance [m]: rounding of a log of an exact simulation."""
+SEPARATION, RELEASE_STD = 6.0, 4.0
+"""Least distance between the two levels of force, in standard deviations of the open one; a contact counts as
+closed from where the force leaves the open level by so many of them."""
+TOUCHING, DISTANCE_STD, SMALLEST_DISTANCE = 1e-3, 6.0, 1e-6
+"""A contact is closed up to so many deviations of the distances of the closed contact above their median, at
+least for rounding and at most [m], unless the mapping says otherwise."""
 BINS = 512
 """Bins of the histogram that the two levels are told apart in."""
 
@@ -194,10 +190,8 @@ def detect(
         elif source == "column":
             states[name] = signals.contact[name]
         elif not isinstance(contact, SurfaceContact):
-            key = ("contact", name, "source")
-            raise mapping.error(
-                key, "only a contact with a surface can be detected", "column, always or never"
-            )
+            text = "only a contact with a surface can be detected"
+            raise mapping.error(("contact", name, "source"), text, "column, always or never")
         else:
             values = _evidence(signals, system, mapping, contact, source)
             states[name], detection = _detect(signals, values, name, sections[name])

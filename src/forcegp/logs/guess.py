@@ -38,6 +38,8 @@ CLEARER = 1.5
 """A unit is certain if the torque fits so much better than in the other one."""
 NEAR = 1.3
 """A ratio is that of a unit if it is within this factor."""
+LEAST_FORCE = 1.0
+"""A contact that is always closed presses with more than this [N]."""
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
@@ -185,10 +187,6 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
             product = float(remainder[:, 0] @ remainder[:, 1])
             slopes[i], correlation[i] = product / power[0], product / float(np.sqrt(power[0] * power[1]))
     return slopes, correlation
-
-
-LEAST_FORCE = 1.0
-"""A contact that is always closed presses with more than this [N]."""
 
 
 def propose_contacts(

@@ -25,10 +25,8 @@ from forcegp.logs.mapping import DerivativesSection
 from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.rows import runs
 
-STATES = 4
-"""Size of the state: position to jerk."""
-SHORTEST = 8
-"""Rows that a piece needs: twice the size of the state."""
+STATES, SHORTEST = 4, 8
+"""Size of the state, position to jerk, and rows that a piece needs."""
 LEARNED_ROWS = 2000
 """Rows from which ρ is learned: the longest pieces, up to so many."""
 LOG_RHO = (-30.0, 8.0)

@@ -20,10 +20,8 @@ from forcegp.forces.calibration import autocorrelation_time
 from forcegp.logs.signals import Array
 from forcegp.robust import robust_std
 
-LEAST_POINTS = 20
-"""Points that a fit needs."""
-ROUNDING = 1e-9
-"""Smallest scale of the residuals, in their unit, so that an exact fit has one."""
+LEAST_POINTS, ROUNDING = 20, 1e-9
+"""Points that a fit needs, and the smallest scale of their residuals, so that an exact fit has one."""
 OUTLIER_STD = 4.0
 """Rows with residuals beyond so many deviations are outliers."""
 
@@ -114,10 +112,9 @@ def tip_of(
 
 MOST_POINTS = 20_000
 """Points that are fitted; of a longer path, every k-th."""
-LEAST_WIDTH = 10.0
-"""Least width of a path that determines a plane, in deviations of its residuals."""
-LARGEST_TILT = 0.2
-"""Standard deviation of the tilt [rad] beyond which the path does not determine a plane."""
+LEAST_WIDTH, LARGEST_TILT = 10.0, 0.2
+"""Least width of a path that determines a plane, in deviations of its residuals, and largest standard
+deviation of its tilt [rad]."""
 
 
 @dataclass(frozen=True)
