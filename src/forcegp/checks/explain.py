@@ -173,8 +173,12 @@ def _fits(model: Explanation) -> Iterator[Tried]:
             yield hypothesis, cross_validate(model.on(hypothesis.change(log)), model.columns, model.prior)
         tried = hypotheses.robot_hypotheses(system, log, rows)
     else:
-        for hypothesis in _promising(model):
-            yield hypothesis, cross_validate(model.on(hypothesis.change(log)))
+        few = model.rows[::SCREENING]
+        null = cross_validate(model.on(log, few)).score.mean()
+        for hypothesis in hypotheses.discrete(log):
+            changed = hypothesis.change(log)
+            if cross_validate(model.on(changed, few)).score.mean() < null:
+                yield hypothesis, cross_validate(model.on(changed))
         tried = hypotheses.continuous(system, log, rows)
     off = []
     for hypothesis in tried:
@@ -201,15 +205,6 @@ def _currents(model: Explanation) -> Iterator[Tried]:
             log, rows, model.problem, tuple(int(j) for j in determined)
         )
         yield hypothesis, model.with_(hypothesis)
-
-
-def _promising(model: Explanation) -> Iterator[Hypothesis]:
-    """Hypotheses without parameters that lower the error on a part of the rows."""
-    few = model.rows[::SCREENING]
-    null = cross_validate(model.on(model.log, few)).score.mean()
-    for hypothesis in hypotheses.discrete(model.log):
-        if cross_validate(model.on(hypothesis.change(model.log), few)).score.mean() < null:
-            yield hypothesis
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:

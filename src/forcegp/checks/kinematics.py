@@ -206,10 +206,9 @@ def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, v
 def _coarse(log: Log, level: Match) -> np.ndarray:
     """Joints whose changes are of the size of encoder steps, so that nothing can be told of their rate."""
     size = np.sqrt((level.change**2).mean(axis=0))
-    steps = np.array(
-        [np.median(np.abs(x[x != 0.0])) if (x != 0.0).any() else 0.0 for x in np.diff(log.q, axis=0).T]
-    )
-    return size <= 3.0 * np.where((np.diff(log.q, axis=0) == 0.0).mean(axis=0) > 0.3, steps, 0.0)
+    moves = np.abs(np.diff(log.q, axis=0))
+    steps = np.nanmedian(np.where(moves > 0.0, moves, np.nan), axis=0)
+    return (size <= 3.0 * steps) & ((moves == 0.0).mean(axis=0) > 0.3)
 
 
 def _permutation(level: Match) -> np.ndarray | None:

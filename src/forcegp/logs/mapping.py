@@ -137,20 +137,15 @@ class Mapping:
         assert section is not None
         self._check_joints(("joints",), self.sections.joints, joints)
         self._check_joints((name, "columns"), section.columns, joints)
-        columns = []
-        for joint in joints:
-            if joint in section.columns:
-                columns.append(section.columns[joint])
-            elif section.column is not None and (joint in self.sections.joints or not self.sections.joints):
-                columns.append(section.column.replace("{joint}", self.sections.joints.get(joint, joint)))
-            else:
-                missing = [j for j in joints if j not in section.columns and j not in self.sections.joints]
-                raise self.error(
-                    (name,),
-                    f"joint {joint!r} has no column",
-                    expected=f"{joint} = under columns",
-                    hint=lock_hint(missing),
-                )
+        called = self.sections.joints or dict(zip(joints, joints, strict=True))
+        pattern = section.column
+        named = {} if pattern is None else {j: pattern.replace("{joint}", n) for j, n in called.items()}
+        named |= section.columns
+        lacking = [joint for joint in joints if joint not in named]
+        if lacking:
+            text, expected = f"joint {lacking[0]!r} has no column", f"{lacking[0]} = under columns"
+            raise self.error((name,), text, expected=expected, hint=lock_hint(lacking))
+        columns = [named[joint] for joint in joints]
         if len(set(columns)) < len(columns):
             twice = next(c for c in columns if columns.count(c) > 1)
             raise self.error((name,), f"column {twice!r} is given for two joints", expected="'{joint}' in it")
