@@ -108,7 +108,7 @@ def test_from_a_log_to_a_line_of_the_scene() -> None:
     )  # fmt: skip
     fit = surface_fit.fit_surface(data, system, "table")
     assert fit.toml().startswith('surface = { type = "plane", normal = [') and "± " in fit.toml()
-    assert isinstance(fit.surface, Plane) and fit.points + fit.outliers == 200
+    assert isinstance(fit.surface, Plane) and len(fit.solution.residuals) + fit.solution.outliers == 200
     np.testing.assert_allclose(fit.surface.normal, (0.0, 0.0, 1.0), atol=1e-8)
     assert fit.surface.offset == pytest.approx(0.3, abs=1e-8)
     with pytest.raises(DataError, match="closed in too few rows"):

@@ -1,9 +1,8 @@
 """What the motion lets one learn: joints that move, changes of direction, parameters that are identified, and
 how large a fault must be to be seen in this log.
 
-The last is the power of the tests of `explain`. A fault of size θ adds θ φ to the unexplained torque r. The
-held-out residual is linear in it, e(r + θ φ) = e(r) + θ e(φ), and contains what friction, offsets and the
-parameters accepted so far cannot imitate. The fault is seen where `significant` accepts the rise of its size.
+A fault of size θ adds θ φ to the unexplained torque r, and the held-out residual is linear in it,
+e(r + θ φ) = e(r) + θ e(φ). The fault is seen where `explain.significant` accepts the rise of its size.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
 
 Round by round the simplest hypothesis within one standard error of the best is taken (Breiman, Friedman,
-Olshen, Stone, *Classification and Regression Trees*, 1984, sec. 3.4.3), as long as it lowers the held-out
-error by more than chance and more than matters. The log is then corrected, and the next round looks for a
-second fault, so that one fault does not show as several.
+Olshen, Stone, *Classification and Regression Trees*, 1984, sec. 3.4.3), and the log corrected for the next
+one.
 """
 
 from __future__ import annotations

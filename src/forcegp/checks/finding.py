@@ -1,7 +1,4 @@
-"""What a check says about a log: findings with rows, severity and remedy, and the report of them all.
-
-`KINDS` holds every kind of finding: how grave it is, what it means and what to do about it.
-"""
+"""Findings with rows, severity and remedy, their report, and `KINDS` of them with meaning and remedy."""
 
 from __future__ import annotations
 

@@ -112,15 +112,13 @@ class TorqueProblem:
 
 @dataclass(frozen=True)
 class TorqueFit:
-    """A hypothesis fitted to a log.
+    """A hypothesis fitted to a log, and tested on its blocks.
 
     Attributes:
-        error: `(blocks, nq)` root mean square of the held-out residual, over `scale`.
-        theta: `(p,)` parameters of the hypothesis, from all blocks.
-        spread: `(p,)` their standard deviation, by the jackknife over blocks.
+        error, shares: `(blocks, nq)` root mean square of the held-out residual, over `scale` and over `size`.
+        theta, spread: `(p,)` parameters of the hypothesis, and their deviation by the jackknife over blocks.
         nuisance: parameters of the nuisance columns.
-        shares: `(blocks, nq)` held-out error over the size of the torque.
-        score: `(blocks,)` Σ_j log(error_j / size_j), with a floor where errors do not matter.
+        score: `(blocks,)` Σ_j log of the shares, with a floor where errors do not matter.
     """
 
     error: Array

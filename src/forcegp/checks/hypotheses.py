@@ -4,7 +4,7 @@ and the log without the fault.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -119,18 +119,11 @@ def unchanged(log: Log) -> Log:
     return log
 
 
-def flipped(log: Log, j: int | slice, names: tuple[str, ...]) -> Log:
-    """The log with the sign of some columns changed."""
-    sign = np.ones(log.nq)
-    sign[j] = -1.0
-    return log.replace(**{name: getattr(log, name) * sign for name in names})
-
-
-def swapped(log: Log, i: int, j: int, names: tuple[str, ...]) -> Log:
-    """The log with two joints exchanged in some columns."""
-    order = np.arange(log.nq)
-    order[[i, j]] = j, i
-    return log.replace(**{name: getattr(log, name)[:, order] for name in names})
+def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip: Sequence[int] = ()) -> Log:
+    """The log with two joints exchanged, or the sign of some joints changed, in some columns."""
+    index, sign = np.arange(log.nq), np.ones(log.nq)
+    index[list(order)], sign[list(flip)] = order[::-1], -1.0
+    return log.replace(**{name: getattr(log, name)[:, index] * sign for name in names})
 
 
 def delayed(log: Log, shift: int) -> Log:
@@ -147,14 +140,14 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
     """Signs, orders and delays: explanations without a parameter to fit."""
     every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
-        yield Hypothesis("torque-sign", 0, partial(flipped, j=slice(None), names=("tau",)), joints=every)
+        yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=every), joints=every)
     for j in every:
-        yield Hypothesis("torque-sign", 0, partial(flipped, j=j, names=("tau",)), joints=(j,))
-        yield Hypothesis("joint-sign", 0, partial(flipped, j=j, names=(*motion, "tau")), joints=(j,))
-        yield Hypothesis("joint-sign", 0, partial(flipped, j=j, names=motion), joints=(j,))
-    for i, j in combinations(every, 2):
-        yield Hypothesis("torque-order", 0, partial(swapped, i=i, j=j, names=("tau",)), joints=(i, j))
-        yield Hypothesis("joint-order", 0, partial(swapped, i=i, j=j, names=(*motion, "tau")), joints=(i, j))
+        yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=(j,)), joints=(j,))
+        yield Hypothesis("joint-sign", 0, partial(changed, names=(*motion, "tau"), flip=(j,)), joints=(j,))
+        yield Hypothesis("joint-sign", 0, partial(changed, names=motion, flip=(j,)), joints=(j,))
+    for pair in combinations(every, 2):
+        yield Hypothesis("torque-order", 0, partial(changed, names=("tau",), order=pair), joints=pair)
+        yield Hypothesis("joint-order", 0, partial(changed, names=(*motion, "tau"), order=pair), joints=pair)
     yield from delays(log)
 
 

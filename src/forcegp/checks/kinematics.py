@@ -169,7 +169,10 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
         names = log.named(permutation != np.arange(log.nq))
         text = f"the velocities of {', '.join(names)} belong to each other's positions"
         finding = log.finding("velocity-order", text, names)
-        return [finding], log.replace(qd=log.qd[:, permutation], qdd=_follow(log, permutation))
+        rates, moved = match(log, "qd", "qdd"), permutation != np.arange(log.nq)
+        follows = rates is not None and np.median(rates.correlation[moved]) > RELATED
+        qdd = log.qdd[:, permutation] if follows else log.qdd  # where they had the order of the wrong ones
+        return [finding], log.replace(qd=log.qd[:, permutation], qdd=qdd)
     findings, factor = _velocity_findings(log, level, wrong)
     return findings, log.replace(qd=log.qd * factor)
 
@@ -230,14 +233,6 @@ def _permutation(level: Match) -> np.ndarray | None:
     return order if fits.min() >= EXCHANGED and better.all() else None
 
 
-def _follow(log: Log, permutation: np.ndarray) -> Array:
-    """Accelerations in the order of the velocities, where they had the order of the wrong ones."""
-    level = match(log, "qd", "qdd")
-    moved = permutation != np.arange(log.nq)
-    together = level is not None and np.median(level.correlation[moved]) > RELATED
-    return log.qdd[:, permutation] if together else log.qdd
-
-
 def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
     """`(nq,)` mean acceleration over a period in which the torque is held, over that at its start.
 
@@ -250,20 +245,15 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
         return np.ones(log.nq)
     with torch.no_grad():
         inverse = torch.linalg.inv(dynamics.mass_matrix(system.robot, q)).diagonal(dim1=-2, dim2=-1)
-    damping = system.robot.damping.numpy() + _undeclared_damping(system, log)
+    damping, rows, nq = system.robot.damping.numpy(), log.rows(FRICTION_ROWS), log.nq
+    if len(rows) >= LEAST_ROWS and log.tau[rows].any():
+        problem = problem_of(system, log, rows)
+        viscous, others = problem.nuisance[..., :nq], problem.nuisance[..., nq:]
+        fit = cross_validate(replace(problem, nuisance=others), viscous)
+        # Friction that the robot file lacks slows a joint as well.
+        damping = damping - np.where(-fit.theta > CLEARLY * fit.spread, fit.theta, 0.0)
     x = np.maximum(damping * log.dt * inverse.median(dim=0).values.numpy(), 1e-6)
     return -np.expm1(-x) / x
-
-
-def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
-    """`(nq,)` viscous friction that the robot file lacks, 0 where the torques do not show it [N m s/rad]."""
-    rows, nq = log.rows(FRICTION_ROWS), log.nq
-    if len(rows) < LEAST_ROWS or not log.tau[rows].any():
-        return np.zeros(nq)
-    problem = problem_of(system, log, rows)
-    viscous, others = problem.nuisance[..., :nq], problem.nuisance[..., nq:]
-    fit = cross_validate(replace(problem, nuisance=others), viscous)
-    return np.where(-fit.theta > CLEARLY * fit.spread, -fit.theta, 0.0)
 
 
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:

@@ -129,16 +129,11 @@ BINS = 512
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a contact's state was read from.
+    """What a contact's state was read from: `wrench`, `multiplier` or `distance`, in N or m.
 
-    Attributes:
-        contact: its name.
-        source: `wrench`, `multiplier` or `distance`.
-        threshold, release: closed from `threshold` on, and then up to `release` on either side [N] or [m].
-        closed_level, closed_spread, open_level, open_spread: median and deviation of the evidence in each
-            state; NaN where the state does not occur.
-        intervals: first and last time of each closed interval [s].
-        merged: intervals that were too short and got their neighbours' state.
+    Closed from `threshold` on, and then up to `release` on either side; median and deviation of the evidence
+    in each state, NaN where it does not occur; first and last time of each closed interval [s]; and how many
+    intervals were too short and got their neighbours' state.
     """
 
     contact: str

@@ -14,12 +14,9 @@ CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
 class Family:
     """Columns of one quantity, one for each joint.
 
-    Attributes:
-        pattern: their common name, with `{joint}` where they differ.
-        columns: what stands for `{joint}` → column.
-        declared: whether the log declares the unit.
-        sign: +1, −1, or one of them for each joint of the robot.
-        by_joint: joint of the robot → column, where `columns` does not name the joints as the positions do.
+    `columns` has what stands for `{joint}` in the common pattern → column; `by_joint` joint of the robot →
+    column, where that does not name the joints as the positions do. `declared` is the unit if the log says
+    so.
     """
 
     pattern: str
@@ -40,15 +37,10 @@ class Family:
 
 @dataclass
 class Draft:
-    """A proposed mapping.
+    """A proposed mapping of a log: its tables, in which a key that is `None` is left out.
 
-    Attributes:
-        source: the log.
-        time, joints: tables of the mapping; a key that is `None` is left out.
-        families: quantity → its columns.
-        further: name → further tables.
-        comments: table → sentences above it.
-        doubts: what the user must check.
+    `families` has the columns by quantity, `comments` the sentences above each table, and `doubts` what the
+    user must check.
     """
 
     source: str

@@ -1,8 +1,7 @@
 """Mapping files: which column of a log is which quantity of which joint, in TOML (docs/import.md).
 
-Joints are matched by name. `[joints]` says what the log calls each joint of the robot, and a column such as
-`"q_{joint}"` is filled in with that name. A data set, and ROS joint states with the robot's names, need no
-file.
+`[joints]` says what the log calls each joint of the robot, and a column such as `"q_{joint}"` is filled in
+with that name. A data set, and ROS joint states with the robot's names, need no file.
 """
 
 from __future__ import annotations

@@ -19,13 +19,8 @@ Array = NDArray[np.float64]
 class Signals:
     """Quantities of a log; each step of the import takes them and leaves them valid.
 
-    Attributes:
-        joint_names: the robot's joints.
-        t: `(n,)` time [s].
-        row: `(n,)` number of each row in the log.
-        segment: `(n,)` number of the trajectory.
-        vectors: `q`, `qd`, `qdd`, `tau` as far as they are logged, `(n, nq)` each; `wrench` `(n, 6)`.
-        contact: name → `(n,)` bool.
+    Time [s], number in the log and trajectory of each row, `(n,)`; `q`, `qd`, `qdd`, `tau` as far as they are
+    logged, `(n, nq)` each, and `wrench` `(n, 6)`; name of each contact → `(n,)` bool.
     """
 
     joint_names: tuple[str, ...]
@@ -40,11 +35,9 @@ class Signals:
         return len(self.t)
 
     def keep(self, mask: NDArray[np.bool_], split: bool = False) -> None:
-        """Keep only some rows, one column after another, so that memory holds one copy.
+        """Keep only some rows `(n,)`, one column after another, so that memory holds one copy.
 
-        Args:
-            mask: `(n,)` the rows to keep.
-            split: what lies on two sides of dropped rows is not one trajectory.
+        With `split`, what lies on two sides of dropped rows is not one trajectory.
         """
         if mask.all():
             return
@@ -66,13 +59,10 @@ MOST_INTERVALS = 20
 
 @dataclass(frozen=True)
 class ImportFinding:
-    """Something that the import found in a log.
+    """Something that the import found in a log: its kind in a word, and a sentence with what was done about
+    it.
 
-    Attributes:
-        kind: a word for it: `held`, `repeated`, `gap`, `restart`, …
-        message: one sentence, with what was done about it.
-        count: rows concerned.
-        rows: the first intervals of rows, first and last, as they are numbered in the log.
+    `count` rows are concerned; `rows` has the first intervals, first and last, as numbered in the log.
     """
 
     kind: str
@@ -83,12 +73,9 @@ class ImportFinding:
 
 @dataclass
 class ImportReport:
-    """What was found and done, in order.
+    """What was found and done, in order; `steps` are lines of provenance.
 
-    Attributes:
-        rows_read: rows of the stream that sets the clock.
-        findings: what is unusual in the log.
-        steps: what was done to it, as lines of provenance.
+    `rows_read` counts the rows of the stream that sets the clock.
     """
 
     source: str

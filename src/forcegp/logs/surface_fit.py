@@ -28,12 +28,14 @@ OUTLIER_STD = 4.0
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters, their covariance, residuals of the rows used, and how many of these are independent."""
+    """Parameters, their covariance, residuals of the rows used, how many of these are independent, and how
+    many rows are too far off to be on the surface."""
 
     x: Array
     covariance: Array
     residuals: Array
     effective: float
+    outliers: int
 
 
 def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> Solution:
@@ -52,7 +54,8 @@ def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> So
     effective = max(len(residuals) / time, min(LEAST_POINTS, len(residuals)))
     information = final.jac.T @ final.jac * (effective / len(residuals))
     scale = max(float(residuals.std()), ROUNDING)
-    return Solution(final.x, scale**2 * np.linalg.pinv(information, hermitian=True), residuals, effective)
+    covariance = scale**2 * np.linalg.pinv(information, hermitian=True)
+    return Solution(final.x, covariance, residuals, effective, int((~inside).sum()))
 
 
 LEAST_RADIUS_STD = 4.0
@@ -119,23 +122,19 @@ deviation of its tilt [rad]."""
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """A fitted surface.
+    """A fitted surface of a contact.
 
     Attributes:
         std: standard deviations: `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane;
             `center` [m] (the largest of its three) and `radius` [m] of a sphere; `tip_radius` [m] if fitted.
-        residual: deviation of the path from the surface [m].
-        points, outliers: rows that were fitted, and rows too far off to be on the surface.
-        effective_points: how many independent rows the fitted ones are worth.
+        solution: the least squares that it comes from.
+        tip_radius: of the tip that touched [m].
     """
 
     contact: str
     surface: Plane | Sphere
     std: dict[str, float]
-    residual: float
-    points: int
-    outliers: int
-    effective_points: float
+    solution: Solution
     tip_radius: float = 0.0
 
     def toml(self) -> str:
@@ -228,7 +227,7 @@ def _plane(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
     n = normal(x)
     plane = Plane(tuple(float(c) for c in n), float(n @ middle + x[2]))
     std = {"offset": float(np.sqrt(cov[2, 2])), "tilt": tilt} | tip.std(solution)
-    return _result(contact, plane, std, solution, len(points), tip.of(x))
+    return SurfaceFit(contact, plane, std, solution, tip.of(x))
 
 
 def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
@@ -259,11 +258,4 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit
             hint="fit a plane, or slide over a larger part of the sphere",
         )
     sphere = Sphere(tuple(float(c) for c in center), radius)
-    return _result(contact, sphere, std, solution, len(points), tip.of(x))
-
-
-def _result(
-    contact: str, surface: Plane | Sphere, std: dict[str, float], solution: Solution, points: int, tip: float
-) -> SurfaceFit:
-    used, residual = len(solution.residuals), float(solution.residuals.std())
-    return SurfaceFit(contact, surface, std, residual, used, points - used, solution.effective, tip)
+    return SurfaceFit(contact, sphere, std, solution, tip.of(x))

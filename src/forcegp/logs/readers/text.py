@@ -1,7 +1,6 @@
 """CSV and text columns with any separator, decimal mark and heading, read in blocks; folders of such files.
 
-How a table is written is found from its first lines: encoding, separator, decimal mark, heading, first line
-of numbers. In a folder each file holds one quantity: `q.txt`, `tau.txt`, …
+How a table is written is found from its first lines. In a folder each file holds one quantity: `q.txt`, …
 """
 
 from __future__ import annotations
