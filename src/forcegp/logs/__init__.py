@@ -156,7 +156,12 @@ def _dataset(
     settings = mapping.sections.derivatives
     dt = usual_step(signals.t)
     margin = settings.impact_margin if settings.impact_margin is not None else 0.5 * settings.window * dt
-    contact_extras = _contact_extras(signals, margin, mapping, system, report)
+    impact = {name: _tensor(mask.astype(np.float64)) for name, mask in impact_mask(signals, margin).items()}
+    of_contacts = {"impact": impact} if impact else {}
+    if "wrench" in signals.vectors and signals.contact:
+        sensed = per_contact(signals, system, mapping)
+        of_contacts |= {name: {key: _tensor(x) for key, x in group.items()} for name, group in sensed.items()}
+        report.steps.append("took the tool's weight off the wrench and carried it to the contact")
     vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
     header = DataHeader(
         dt=dt,
@@ -175,23 +180,10 @@ def _dataset(
         joint_names=robot.joint_names,
         contact={name: torch.from_numpy(value) for name, value in signals.contact.items()},
         extras={} if std is None else {"qdd_std": _tensor(std)},
-        contact_extras=contact_extras,
+        contact_extras=of_contacts,
         segment=torch.from_numpy(signals.segment),
         header=header,
     )
-
-
-def _contact_extras(
-    signals: Signals, margin: float, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
-) -> dict[str, dict[str, torch.Tensor]]:
-    """Rows at impacts of each contact, and the forces that a sensor measured there."""
-    impact = {name: _tensor(mask.astype(np.float64)) for name, mask in impact_mask(signals, margin).items()}
-    extras = {"impact": impact} if impact else {}
-    if "wrench" in signals.vectors and signals.contact:
-        sensed = per_contact(signals, system, mapping)
-        extras |= {name: {key: _tensor(x) for key, x in group.items()} for name, group in sensed.items()}
-        report.steps.append("took the tool's weight off the wrench and carried it to the contact")
-    return extras
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:

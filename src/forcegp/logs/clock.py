@@ -150,10 +150,8 @@ SMOOTH = ("q", "qd")
 
 
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
-    """Values `(n, d)` of a stream with increasing stamps t, at other times within its own `(k, d)`.
-
-    The interpolation is linear, or by a cubic spline (not-a-knot) where there are four rows.
-    """
+    """Values `(n, d)` of a stream with stamps t at times within its own: linear, or by a cubic spline from
+    four rows on."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)

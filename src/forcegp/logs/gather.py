@@ -22,19 +22,6 @@ from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.logs.table import LogTable, Progress, Stream
 from forcegp.rows import describe, numbered
 
-
-def joint_factors(mapping: Mapping, name: str, joints: Sequence[str]) -> tuple[Array, Array]:
-    """Factors s k to SI on the joint side, and offsets o in the unit of the column, `(nq,)` each."""
-    section = mapping.quantity(name)
-    assert section is not None
-    scale = mapping.per_joint(name, "sign", joints) * units.QUANTITY[name][section.unit]
-    if section.side == "motor":
-        scale *= mapping.per_joint(name, "gear_ratio", joints) ** (1.0 if name == "torque" else -1.0)
-    if name == "torque" and mapping.sections.torque.torque_constant is not None:
-        scale *= mapping.per_joint(name, "torque_constant", joints)
-    return scale, mapping.per_joint(name, "offset", joints)
-
-
 SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
 """Quantity of a mapping → name in a data set."""
 
@@ -101,11 +88,20 @@ class _Gathering:
 
     def _vector(self, name: str) -> tuple[Stream, Array]:
         """A joint vector in SI units on the joint side."""
+
+        def numbers(key: str) -> Array:
+            return self.mapping.per_joint(name, key, self.joints)
+
         section = self.mapping.quantity(name)
         assert section is not None
         columns = self.mapping.columns_of(name, self.joints)
         stream = self.table.stream_of(columns[0], section.stream)
-        scale, offset = joint_factors(self.mapping, name, self.joints)
+        # s k, to SI on the joint side, and o in the unit of the column.
+        scale, offset = numbers("sign") * units.QUANTITY[name][section.unit], numbers("offset")
+        if section.side == "motor":
+            scale *= numbers("gear_ratio") ** (1.0 if name == "torque" else -1.0)
+        if name == "torque" and self.mapping.sections.torque.torque_constant is not None:
+            scale *= numbers("torque_constant")
         result = np.empty((len(stream), len(self.joints)))
         for i, column in enumerate(columns):
             np.subtract(self._take(stream, column), offset[i], out=result[:, i])

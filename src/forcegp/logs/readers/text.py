@@ -16,18 +16,8 @@ import numpy as np
 
 from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs.table import (
-    Column,
-    LogTable,
-    Progress,
-    Stream,
-    Wanted,
-    check_count,
-    check_values,
-    foreign,
-    joined,
-    streams_by_length,
-)
+from forcegp.logs import table
+from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -151,7 +141,7 @@ def _dialect(
 ) -> Dialect:
     rows = [split(line, separator) for line in lines[first : first + SAMPLE_LINES] if line.strip()]
     width = len(rows[0])
-    check_count(str(path), "columns", width, limits.COLUMNS)
+    table.check_count(str(path), "columns", width, limits.COLUMNS)
     above = [split(line.lstrip("#%/ \t"), separator) for line in lines[:first] if line.strip()]
     widths = (width, width if rows[0][-1] else width - 1)
     above = [fields for fields in above if len(fields) in widths]
@@ -199,16 +189,16 @@ def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
     kinds = {name: kind for name, kind in kinds.items() if kind not in ("text", "empty")}
     chunks: dict[str, list[Column]] = {name: [] for name in kinds}
     done = 0
-    with foreign(str(path), "a table of text"), path.open("rb") as file:
+    with table.foreign(str(path), "a table of text"), path.open("rb") as file:
         source = _Blocks(file, dialect, path.stat().st_size, progress)
         for batch in _batches(source, dialect, kinds) if kinds else ():
             done += len(batch)
-            check_values(str(path), done, len(kinds))
+            table.check_values(str(path), done, len(kinds))
             for name, kind in kinds.items():
                 chunks[name].append(_numbers(batch.column(name), kind))
             if rows is not None and done >= rows:
                 break
-        values = joined(chunks, rows)
+        values = table.joined(chunks, rows)
     if dialect.encoding == "cp1252":
         remarks.append("the file is not UTF-8 and was read as Windows-1252")
     units = {name: unit for name, unit in dialect.units.items() if name in values}
@@ -278,7 +268,7 @@ class _Blocks(io.RawIOBase):
         # Blanks at the edges of a line are only known once the line is complete.
         end = text.rfind(b"\n") + 1 if block else len(text)
         self._rest, text = text[end:], text[:end]
-        check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)
+        table.check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)
         result = _EDGES.sub(b"", _BLANKS.sub(b" ", text))
         return result if result or not block else self.read(size)
 
@@ -297,23 +287,23 @@ def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"
 
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
-    check_count(str(path), "files", len(files), limits.LOG_FILES)
+    table.check_count(str(path), "files", len(files), limits.LOG_FILES)
     groups: dict[int, dict[str, Column]] = {}
     remarks: list[str] = []
     for number, file in enumerate(files):
         try:
-            table = read_text(file, wanted=lambda n, f=file: wanted(in_file(f, n)), rows=rows, progress=None)
+            part = read_text(file, wanted=lambda n, f=file: wanted(in_file(f, n)), rows=rows, progress=None)
         except DataError as error:
             if "no table of numbers" not in error.message:
                 raise
             remarks.append(f"{file.name} holds no table of numbers and was left out")
             continue
-        remarks += [f"{file.name}: {remark}" for remark in table.remarks]
-        columns = {in_file(file, name): values for name, values in table.streams[0].columns.items()}
+        remarks += [f"{file.name}: {remark}" for remark in part.remarks]
+        columns = {in_file(file, name): values for name, values in part.streams[0].columns.items()}
         if columns:
             groups.setdefault(len(next(iter(columns.values()))), {}).update(columns)
-            check_values(str(path), 1, sum(map(len, groups.values())))
+            table.check_values(str(path), 1, sum(map(len, groups.values())))
         if progress is not None:
             progress(number + 1, len(files))
     most = max(groups, key=lambda length: (len(groups[length]), length), default=0)
-    return LogTable(str(path), "text folder", streams_by_length(groups, most), tuple(remarks))
+    return LogTable(str(path), "text folder", table.streams_by_length(groups, most), tuple(remarks))
