@@ -185,8 +185,7 @@ def _runs_off(
 ) -> dict[str, list[tuple[int, int]]]:
     """Runs of rows labelled closed off the surface, by kind of finding.
 
-    A run reaches to the row at which the tip moves along the normal no faster than in the rest of the
-    contact.
+    A run reaches to the row at which the tip moves along the normal as slowly as in the rest of the contact.
     """
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2

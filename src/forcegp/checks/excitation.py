@@ -143,8 +143,7 @@ HIDDEN = {
     "torque-delay": (0.04, "torque delay", "{size:.2g} s"),
     "masses-mismatch": (0.5, "error of the masses", "{size:.0%}"),
 }
-"""Size that a user expects a check to see [share, rad, degrees, s, share of the inertial parameters], what is
-hidden, and its size in words."""
+"""Size that a user expects to be seen [share, rad, degrees, s, share], what is hidden, its size in words."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
 
-Round by round the simplest hypothesis within one standard error of the best is taken (Breiman, Friedman,
-Olshen, Stone, *Classification and Regression Trees*, 1984, sec. 3.4.3), and the log corrected for the next
-one.
+The simplest hypothesis within one standard error of the best is taken (Breiman, Friedman, Olshen, Stone,
+*Classification and Regression Trees*, 1984, sec. 3.4.3), the log corrected, and a further one looked for.
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ from forcegp.checks.placement import leaves_surface
 from forcegp.constraints import ConstrainedSystem
 
 ROWS, SCREENING = 1600, 4
-"""Rows that hypotheses are tested on, and the share of them, as its inverse, on which they must do better
-first."""
+"""Rows that hypotheses are tested on; on one in so many they must do better first."""
 ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0

@@ -94,8 +94,7 @@ class TorqueProblem:
     Attributes:
         r, J: `(n, nq)` unexplained torque [N m, N], and Jacobian of the touching points `(n, k, nq)`.
         nuisance: `(n, nq, p)` columns that every hypothesis may use: friction and offset.
-        size, scale: `(nq,)` of the logged torque, which errors are compared with, and of its noise, which
-            weighs the joints.
+        size, scale: `(nq,)` of the logged torque, for comparison, and of its noise, which weighs the joints.
     """
 
     r: Array

@@ -1,6 +1,4 @@
-"""What may be wrong with a log or a robot file, one hypothesis each; the finding that an accepted one makes,
-and the log without the fault.
-"""
+"""What may be wrong with a log or a robot file, the finding that it makes, and the log without the fault."""
 
 from __future__ import annotations
 
@@ -242,8 +240,7 @@ SMALL_GAIN = 0.2
 EXPLAINED = 0.5
 """Share of the torque that a gain may leave unexplained, as any useful model may."""
 SMALL_TILT, SMALL_GRAVITY = 1.0, 0.05
-"""Bases are levelled to better than this [degrees]; smaller changes of the size of gravity, as a share, are
-errors of the masses."""
+"""Tilts [degrees] and changes of the size of gravity, as a share, that are errors of the masses."""
 
 
 DISCRETE = {

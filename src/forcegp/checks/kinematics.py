@@ -25,8 +25,7 @@ from forcegp.robust import robust_std
 WINDOW = 0.05
 """Length of a window [s]; long enough that noise averages out, short against the motion."""
 TOLERANCE, INSTANT = 0.05, 0.15
-"""A slope within this of 1 is right, as filters and uneven clocks cost a few percent; for accelerations,
-which change within a period."""
+"""A slope within this of 1 is right: filters cost a few percent, and accelerations change within a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
 EXCHANGED = 0.9
@@ -278,8 +277,7 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 DEPARTURE, DEPARTURE_STRIDE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, 3
-"""The departure, with signs: it vanishes on cubics. At this distance of neighbours it shows noise below the
-corner of a filter."""
+"""The departure, zero on cubics; at this stride it shows noise below the corner of a filter."""
 NOISE_FACTOR = 2.0
 """Ratio of noise found to noise stated that is reported."""
 FILTERED = 0.4

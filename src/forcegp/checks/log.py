@@ -2,8 +2,7 @@
 
 Noise ε on q̈ enters the explained torque as M ε, and a fit gains by shrinking the inertia, as any regression
 on noisy columns does. The same filter of a tenth of a second on positions, velocities, accelerations and
-torques takes that away, and leaves M q̈ = Q true up to the change of M and of the bias force within the
-window.
+torques takes that away, and leaves M q̈ = Q true up to changes of M and of the bias force within it.
 """
 
 from __future__ import annotations
@@ -206,8 +205,7 @@ def log_of(data: Dataset) -> Log:
 def read_log(path: str | Path) -> Log:
     """Read a log from Parquet or CSV without refusing NaN, empty values or time that runs backward.
 
-    The columns are those of docs/formats.md. Velocities and accelerations that the file lacks are derived by
-    a Savitzky-Golay filter.
+    The columns are those of docs/formats.md; q̇ and q̈ that it lacks are derived by a Savitzky-Golay filter.
 
     Raises:
         DataError: the file is damaged, or a column is missing.

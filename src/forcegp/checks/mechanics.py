@@ -20,8 +20,7 @@ from forcegp.rows import describe, intervals
 LEAST_ROWS = 200
 """Rows from which dynamics are judged."""
 SIGNIFICANT, MATERIAL = 3.0, 0.1
-"""Standard errors over blocks from which friction or an offset is there, and drop of the log error of a joint
-that makes it worth reporting."""
+"""Standard errors over blocks, and drop of a joint's log error, from which friction or offsets count."""
 SPEEDS = (25.0, 95.0)
 """Percentiles of a joint's speed between which friction resists."""
 UNEXPLAINED = 0.5

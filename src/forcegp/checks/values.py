@@ -67,15 +67,13 @@ def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
 HELD_RUN = 2
 """A logger that fails to update repeats a row at least this often before it is reported as held."""
 STUCK_SECONDS, STUCK_VISIBLE = 0.05, 0.02
-"""A channel stands still when it repeats one value for this long [s] while it should have moved by this share
-of its range."""
+"""A channel that repeats one value for so long [s] should have moved by this share of its range."""
 SPIKE = 12.0
 """Robust standard deviations beyond which a single value is a spike: never reached by normal noise."""
 SPIKE_ALONE = 4.0
 """Factor by which a spike stands out from the misfit of its neighbours."""
 SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
-"""Departures of the neighbours may differ from those of one wrong value by this share of it, and by this many
-robust standard deviations."""
+"""Share of a wrong value, and robust deviations, by which departures of its neighbours may differ."""
 SPIKE_SHARED = 0.05
 """A departure of another channel by this share of a value's own says that the motion jumped."""
 DRIVEN = 0.5
@@ -202,8 +200,7 @@ def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
 def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
     """`(n, nq)` bool, values that depart as others do, of which each is compared with its column's range.
 
-    A shock moves several joints, or shows in torque and acceleration; a sensor errs in one channel. No shock
-    moves the position.
+    A shock moves several joints, or shows in torque and acceleration, and never in the position.
     """
     departure = departures[name][0]
     if name == "q":

@@ -96,10 +96,7 @@ def import_log(
     mapping: Mapping | str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Imported:
-    """Read a log as `read_log` does, and say what was found in it and done to it.
-
-    `progress` is called while the file is read, with the work done and the total.
-    """
+    """Read a log as `read_log` does, and say what was found and done; `progress` gets work done and total."""
     system = system_of(scene)
     robot = system.robot
     if mapping is None:

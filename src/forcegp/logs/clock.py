@@ -89,10 +89,9 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
 
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
-    """Find, and if asked drop, rows whose positions and torques are those of the row before, to the last bit.
+    """Find, and if asked drop, rows with the positions and torques of the row before, to the last bit.
 
-    A logger that is faster than its source writes such rows; they flatten derivatives. At rest, an
-    encoder's position stays the same, so only rows in which the torque stays too are counted.
+    A logger that is faster than its source writes them; they flatten derivatives. At rest the torque changes.
     """
     held = np.zeros(len(signals), dtype=bool)
     held[1:] = signals.segment[1:] == signals.segment[:-1]
@@ -150,8 +149,7 @@ SMOOTH = ("q", "qd")
 
 
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
-    """Values `(n, d)` of a stream with stamps t at times within its own: linear, or by a cubic spline from
-    four rows on."""
+    """Values `(n, d)` of a stream with stamps t at other times, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)

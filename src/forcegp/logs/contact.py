@@ -1,6 +1,4 @@
-"""Intervals in which a contact is closed, with the evidence for them.
-
-The evidence is the distance to the surface, a measured force, or λ of the rigid body.
+"""Intervals in which a contact is closed, from its distance, a measured force or λ.
 
 A force-torque sensor's reading becomes force and moment of the environment at the contact, in the world. The
 sensor sits in a frame of the robot, at p_S with rotation R. With f and m its reading as the environment and

@@ -12,11 +12,10 @@ CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
 
 @dataclass
 class Family:
-    """Columns of one quantity, one for each joint.
+    """Columns of one quantity, one for each joint; `declared`, if the log says their unit.
 
     `columns` has what stands for `{joint}` in the common pattern → column; `by_joint` joint of the robot →
-    column, where that does not name the joints as the positions do. `declared` is the unit if the log says
-    so.
+    column, where that does not name the joints as the positions do.
     """
 
     pattern: str
@@ -37,11 +36,8 @@ class Family:
 
 @dataclass
 class Draft:
-    """A proposed mapping of a log: its tables, in which a key that is `None` is left out.
-
-    `families` has the columns by quantity, `comments` the sentences above each table, and `doubts` what the
-    user must check.
-    """
+    """A proposed mapping: tables, in which a key that is `None` is left out, families of columns by quantity,
+    comments above each table, and what the user must check."""
 
     source: str
     time: dict[str, Any] = field(default_factory=dict)

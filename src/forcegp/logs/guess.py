@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -43,19 +44,14 @@ LEAST_FORCE = 1.0
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
-    """Propose a mapping for a log.
-
-    Raises:
-        DataError: the log cannot be read.
-        MappingError: time, positions or torques are not recognised.
-    """
+    """Propose a mapping for a log; `MappingError` where time, positions or torques are not recognised."""
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
     stream = find_time(table, draft)
     find_families(stream, system.robot, draft)
     find_wrench(table, system.robot, draft)
     _try(path, draft, system, _possible_units(draft, stream))
-    propose_contacts(table, draft, system, lambda: _signals(path, draft, system))
+    propose_contacts(table, draft, system, cache(lambda: _signals(path, draft, system)))
     return draft
 
 
@@ -193,7 +189,6 @@ def propose_contacts(
     log: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
 ) -> None:
     """Write into a draft how the state of each contact of the scene may be known; `signals` reads the log."""
-    trial: Signals | None = None
     for contact in system.contacts:
         name, table = contact.name, f"contact.{quoted(contact.name)}"
         named = (c for c in log.names if "contact" in c.lower() and (name in c or system.m == 1))
@@ -203,8 +198,7 @@ def propose_contacts(
         elif "wrench" in draft.further or not isinstance(contact, SurfaceContact):
             draft.further[table] = {"source": "wrench" if "wrench" in draft.further else "always"}
         else:
-            trial = signals() if trial is None else trial
-            source, reason = _state(multiplier(trial, system, contact), name)
+            source, reason = _state(multiplier(signals(), system, contact), name)
             draft.further[table] = {"source": source}
             draft.say(table, f"no contact column; {reason}", doubt=True)
             draft.say(table, "source may also be multiplier, distance, always or never")

@@ -235,10 +235,9 @@ RELATED = 0.95
 
 
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
-    """Propose families of a log whose columns have numbers for names.
+    """Propose families of a log whose columns have numbers for names, in blocks of one per joint.
 
-    The columns beside time come in blocks of one per joint, from base to tip. Positions and velocities are
-    two blocks of which one is the rate of change of the other; the block that is left is the torque.
+    Positions and velocities are blocks of which one is the rate of the other; the one left is the torque.
     """
     nq = len(joints)
     names = [name for name in stream.columns if name != draft.time["column"]]

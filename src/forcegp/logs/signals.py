@@ -1,7 +1,5 @@
-"""What the steps of an import hand on: the quantities of a log, and the report of what was found and done.
-
-Quantities are in SI units and in the robot's joint order, on one clock.
-"""
+"""What the steps of an import hand on: the quantities of a log, in SI units and in the robot's joint order on
+one clock, and the report of what was found and done."""
 
 from __future__ import annotations
 
@@ -59,8 +57,7 @@ MOST_INTERVALS = 20
 
 @dataclass(frozen=True)
 class ImportFinding:
-    """Something that the import found in a log: its kind in a word, and a sentence with what was done about
-    it.
+    """Something that was found in a log: its kind in a word, and a sentence with what was done about it.
 
     `count` rows are concerned; `rows` has the first intervals, first and last, as numbered in the log.
     """

@@ -28,8 +28,7 @@ OUTLIER_STD = 4.0
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters, their covariance, residuals of the rows used, how many of these are independent, and how
-    many rows are too far off to be on the surface."""
+    """Parameters, covariance, residuals of the rows used, how many of these are independent, and outliers."""
 
     x: Array
     covariance: Array
@@ -116,8 +115,7 @@ def tip_of(
 MOST_POINTS = 20_000
 """Points that are fitted; of a longer path, every k-th."""
 LEAST_WIDTH, LARGEST_TILT = 10.0, 0.2
-"""Least width of a path that determines a plane, in deviations of its residuals, and largest standard
-deviation of its tilt [rad]."""
+"""Least width of a path in deviations of its residuals, and largest deviation of a tilt [rad], of a plane."""
 
 
 @dataclass(frozen=True)

@@ -47,18 +47,15 @@ def canonical(kind: str) -> str:
 def decoder(kind: str, encoding: str) -> Decode:
     """Decodes messages of a type in `KINDS`, in the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
-    stores = typesys.Stores
-    store = typesys.get_typestore(stores.ROS1_NOETIC if encoding == "ros1" else stores.ROS2_HUMBLE)
-    deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
+    first = encoding == "ros1"
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
+    deserialize = store.deserialize_ros1 if first else store.deserialize_cdr
     return lambda raw: deserialize(raw, kind)
 
 
 @dataclass
 class Messages:
-    """Messages of one topic with the same columns, in the order of the first message.
-
-    `rows` has the numbers of each message, `stamps` that of its header and the time of recording [ns].
-    """
+    """Messages of one topic with the same columns, their stamps and the times of recording [ns]."""
 
     topic: str
     columns: tuple[str, ...]

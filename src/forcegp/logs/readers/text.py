@@ -43,8 +43,7 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 class Dialect:
     """How a text table is written, after `first_line` lines without numbers.
 
-    Each column is a `number`, `bool`, `date`, `text` or `empty`; `units` are those that a line below the
-    heading declares.
+    Each column is a `number`, `bool`, `date`, `text` or `empty`; a line below the heading may declare units.
     """
 
     encoding: str
