@@ -116,4 +116,4 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
                     clipped[a:b, j] = True
     joints = log.named(clipped.any(axis=0))
     text = f"the torque of {', '.join(joints)} stays at its largest value in"
-    return at_rows(clipped.any(axis=1), "torque-saturated", text, joints), log
+    return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log

@@ -182,7 +182,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
     friction = _dry_friction(system.robot, explanation, rows, width)
-    visible = (np.abs(trace) > VISIBLE * explanation.problem.size + friction).any(axis=1)
+    visible = np.asarray((np.abs(trace) > VISIBLE * explanation.problem.size + friction).any(axis=1))
     bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)

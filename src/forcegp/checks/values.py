@@ -320,7 +320,7 @@ def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
     if "qd" in log.derived:
         return [], log
     jumps = _jumps(log.q, log.qd, log)
-    at, joints = jumps.any(axis=1), log.named(jumps.any(axis=0))
+    at, joints = np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
     findings = at_rows(at, "position-jump", f"the position of {', '.join(joints)} jumps at", joints)
     return findings, log.replace(segment=log.segment + np.cumsum(at))
 
@@ -330,7 +330,7 @@ def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
     if log.derived:
         return [], log
     jumps = _jumps(log.qd, log.qdd, log)
-    around, joints = jumps.any(axis=1), log.named(jumps.any(axis=0))
+    around, joints = np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
     findings = at_rows(around, "impact", "the velocity jumps, as at an impact, at", joints)
     around[:-1] |= around[1:]
     return findings, log.mask(around)
