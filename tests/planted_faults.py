@@ -14,10 +14,11 @@ import torch
 import forcegp
 from forcegp import dynamics
 from forcegp.checks import Finding, Log, Report
-from forcegp.checks.log import derive, intervals
+from forcegp.checks.log import derive
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.data import DataHeader
 from forcegp.errors import RobotFileWarning
+from forcegp.rows import intervals
 
 REAL = Path(__file__).parents[1] / "../shared/real"
 Case = tuple[ConstrainedSystem, Log]

@@ -27,6 +27,7 @@ LAYERS = (
         "destination",
         "resources",
         "robust",
+        "rows",
         "batchlast",
         "native",
         "notebook",

@@ -6,8 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from forcegp.checks.log import describe, intervals, spikes
+from forcegp.checks.log import spikes
 from forcegp.robust import robust_std
+from forcegp.rows import describe, intervals
 
 
 @given(st.lists(st.booleans(), max_size=40))

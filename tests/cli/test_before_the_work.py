@@ -17,7 +17,7 @@ from forcegp import resources
 from forcegp.cli import app
 from forcegp.data import Dataset
 from forcegp.errors import DataError, DestinationError, ForceGPError, MemoryLimitError
-from forcegp.gp import likelihood
+from forcegp.gp import exact
 from forcegp.resources import MemoryNeedWarning
 from reproduction.__main__ import app as study
 from slow import slow_except
@@ -176,7 +176,7 @@ def test_work_that_takes_most_of_the_memory_is_announced(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(resources, "LARGE", 0.0)
-    for module in (resources, likelihood):
+    for module in (resources, exact):
         monkeypatch.setattr(module, "free_memory", lambda: PLENTY)
     sentences = " ".join(said(command, made, tmp_path))
     for sentence in WORK[command].split("|"):
@@ -187,7 +187,7 @@ def test_work_that_takes_most_of_the_memory_is_announced(
 def test_work_that_cannot_fit_is_refused(
     command: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (resources, likelihood):
+    for module in (resources, exact):
         monkeypatch.setattr(module, "free_memory", lambda: 1)
     if command != "select":
         monkeypatch.setattr("forcegp.data.table.announce_memory", lambda *_, **__: None)

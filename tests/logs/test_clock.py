@@ -59,7 +59,7 @@ def test_repeated_rows_are_dropped_and_conflicting_ones_refused() -> None:
     assert len(s) == 20 and report.findings[0].rows == ((6, 6), (11, 11))
     wrong = signals(t)
     wrong.vectors["tau"][6] += 1.0
-    with pytest.raises(DataError, match="rows 6 have the time stamp"):
+    with pytest.raises(DataError, match="row 6: the time stamp of the row before"):
         drop_repeated(wrong, report)
 
 

@@ -10,7 +10,8 @@ import torch
 
 import forcegp
 from forcegp.errors import MappingError
-from forcegp.logs import guess, read_log
+from forcegp.logs import Mapping, guess, parse_mapping, read_log
+from forcegp.logs.draft import Draft
 from forcegp.logs.headings import declared_unit
 from log_files import REAL, WRITERS, motion, real_logs
 from robots import ARMS
@@ -44,6 +45,10 @@ def written(folder: Path, columns: dict[str, np.ndarray], separator: str, decima
     return folder / "run.csv"
 
 
+def mapping_of(proposal: Draft) -> Mapping:
+    return parse_mapping(proposal.toml().encode(), "proposed mapping")
+
+
 @pytest.mark.parametrize(
     ("angle", "speed", "sign"), [("deg", "deg/s", 1.0), ("rad", "rad/s", -1.0), ("deg", "rpm", -1.0)]
 )
@@ -60,14 +65,14 @@ def test_units_and_signs_are_found_from_the_values(
         columns[f"Achse{i + 1}_Temp"] = np.full(ROWS, 30.0 + i)
     path = written(tmp_path, columns, ";", ",")
     proposal = guess.guess_mapping(path, system)
-    sections = proposal.mapping().sections
+    sections = mapping_of(proposal).sections
     assert sections.time.unit == "ms" and sections.position.unit == angle
     assert sections.velocity is not None and sections.velocity.unit == speed
     assert sections.torque.sign == sign and sections.torque.unit == "Nm"
     assert any("base to tip" in doubt for doubt in proposal.doubts), "numbers are no names"
     # Friction of half a newton metre per joint hides nothing: 20 N show as one state.
     assert sections.contact["table"].source == "always"
-    data = read_log(path, system, proposal.mapping())
+    data = read_log(path, system, mapping_of(proposal))
     np.testing.assert_allclose(data.q.numpy(), log["q"], atol=1e-12)
     np.testing.assert_allclose(data.qd.numpy(), log["qd"], atol=1e-12)
 
@@ -77,7 +82,7 @@ def test_formats_with_names_leave_no_doubt_about_joints(kind: str, tmp_path: Pat
     path, _ = WRITERS[kind](tmp_path, motion())
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
     proposal = guess.guess_mapping(path, system)
-    mapping = proposal.mapping()
+    mapping = mapping_of(proposal)
     numbered = kind in ("npz", "lerobot")
     assert any("base to tip" in doubt for doubt in proposal.doubts) == numbered
     if not numbered:
@@ -107,7 +112,7 @@ def test_logs_whose_columns_say_nothing(tmp_path: Path) -> None:
 def test_the_sign_of_a_real_arms_torque() -> None:
     robot = forcegp.load_robot(REAL / "kuka_iiwa14" / "iiwa14.urdf")
     system = forcegp.ConstrainedSystem(robot)
-    sections = guess.guess_mapping(REAL / "kuka_iiwa14" / "motion_b", system).mapping().sections
+    sections = mapping_of(guess.guess_mapping(REAL / "kuka_iiwa14" / "motion_b", system)).sections
     assert sections.torque.sign == -1.0 and sections.position.unit == "rad" and sections.time.unit == "s"
 
 
@@ -115,7 +120,7 @@ def test_the_sign_of_a_real_arms_torque() -> None:
 def test_names_that_are_only_alike_are_matched_and_doubted() -> None:
     robot = next(arm for arm in ARMS if arm.name == "ur3").load()
     proposal = guess.guess_mapping(REAL / "ur3" / "id1.bag", forcegp.ConstrainedSystem(robot))
-    joints = proposal.mapping().sections.joints
+    joints = mapping_of(proposal).sections.joints
     assert list(joints.values()) == ["Base", "Shoulder", "Elbow", "Wrist 1", "Wrist 2", "Wrist 3"]
     assert any("likeness" in doubt for doubt in proposal.doubts)
-    assert proposal.mapping().sections.torque.sign == -1.0
+    assert mapping_of(proposal).sections.torque.sign == -1.0

@@ -10,7 +10,7 @@ import forcegp
 from forcegp.constraints import Plane, Sphere
 from forcegp.errors import DataError
 from forcegp.logs import surface_fit
-from forcegp.logs.surface_fit import Tip, correlation_time, tip_of
+from forcegp.logs.surface_fit import Tip, robust_least_squares, tip_of
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -84,8 +84,9 @@ def test_correlated_residuals_count_as_fewer() -> None:
     x = np.zeros(20_000)
     for k in range(1, len(x)):
         x[k] = 0.9 * x[k - 1] + random.standard_normal()
+    solution = robust_least_squares(lambda mean: x - mean[0], np.zeros(1))
     # (1 + φ)/(1 − φ) = 19 of a first-order process.
-    assert correlation_time(x) == pytest.approx(19.0, rel=0.2)
+    assert len(solution.residuals) / solution.effective == pytest.approx(19.0, rel=0.2)
 
 
 def test_from_a_log_to_a_line_of_the_scene() -> None:
@@ -107,7 +108,7 @@ def test_from_a_log_to_a_line_of_the_scene() -> None:
     )  # fmt: skip
     fit = surface_fit.fit_surface(data, system, "table")
     assert fit.toml().startswith('surface = { type = "plane", normal = [') and "± " in fit.toml()
-    assert isinstance(fit.surface, Plane) and fit.points + fit.outliers == 200
+    assert isinstance(fit.surface, Plane) and len(fit.solution.residuals) + fit.solution.outliers == 200
     np.testing.assert_allclose(fit.surface.normal, (0.0, 0.0, 1.0), atol=1e-8)
     assert fit.surface.offset == pytest.approx(0.3, abs=1e-8)
     with pytest.raises(DataError, match="closed in too few rows"):

@@ -34,7 +34,7 @@ def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
     if logged is None or logged == system.robot.fingerprint:
         return [], log
     text = f"logged on robot {log.header.robot!r} ({logged}), and the scene has {system.robot.name!r}"
-    return [Finding("robot-mismatch", text, log.all_rows)], log
+    return [log.finding("robot-mismatch", text)], log
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (

@@ -13,48 +13,37 @@ import numpy as np
 import torch
 
 from forcegp import kinematics
-from forcegp.checks.finding import Finding, Intervals
+from forcegp.checks.finding import Finding
 from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors
-from forcegp.checks.log import Array, Log, Outcome, describe, evenly, intervals
+from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.robust import robust_std
+from forcegp.rows import Intervals, describe, intervals
 
-OFFSET = 5e-4
-"""Displacement of a surface that is reported [m]."""
-TILT = np.radians(0.2)
-"""Tilt of a surface that is reported [rad]."""
+OFFSET, TILT = 5e-4, np.radians(0.2)
+"""Displacement [m] and tilt [rad] of a surface that are reported."""
 FAR = 0.01
 """Displacement of all contact rows that no calibration explains: another surface, point or label [m]."""
-TOUCH = 2e-4
-"""Distance within which a tip touches, at least: surfaces and arms are no stiffer [m]."""
-ROUGH = 8.0
-"""Robust standard deviations of the distance in contact within which a tip touches."""
-LANDING = 5
-"""Rows within which a tip that lands stops."""
+TOUCH, ROUGH = 2e-4, 8.0
+"""A tip touches within this distance [m], as surfaces and arms are no stiffer, or within so many robust
+standard deviations of the distance in contact."""
 CREEP = 1e-3
 """Speed along the normal that a touching tip may have, at least [m/s]."""
-STOPS = 2.0
-"""Factor by which a landing tip is faster than one that rests."""
+LANDING, STOPS = 5, 2.0
+"""Rows within which a tip that lands stops, and the factor by which it is faster than one that rests."""
 DRIFT = 2e-3
 """Distance that a tip may gain and lose while it touches: soft ground, a bent arm, a drift [m]."""
 RUN_SECONDS = 0.02
 """Shortest run of rows that a wrong label is reported for [s]."""
-MISSED_SECONDS = 0.1
-"""Shortest time along the surface that counts as a contact that was not labelled [s]."""
-MISSED_DISTANCE = 2e-3
-"""The tip must slide this far along the surface to count as in contact [m]."""
+MISSED_SECONDS, MISSED_DISTANCE = 0.1, 2e-3
+"""Shortest time [s] and way [m] along the surface that count as a contact that was not labelled."""
 LEAST_ROWS = 20
 
 
 @dataclass(frozen=True)
 class Path:
-    """Motion of the touching point of one contact.
-
-    Attributes:
-        c: `(n,)` distance from the surface of the scene [m].
-        p, v: `(n, 3)` position and velocity in the world [m], [m/s].
-        normal: `(n, 3)` out of the solid.
-    """
+    """Distance `(n,)` of a touching point from the surface of the scene [m]; its position and velocity in the
+    world and the normal out of the solid, `(n, 3)` each [m], [m/s]."""
 
     c: Array
     p: Array
@@ -106,17 +95,16 @@ def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
             text = f"the scene has a contact {contact.name!r}, and the log does not say when it is closed"
             findings.append(Finding("contact-unlabelled", text, log.all_rows, contact=contact.name))
         elif isinstance(contact, SurfaceContact):
-            findings += _check_surface(contact, tip_path(system, contact, log), log)
+            path = tip_path(system, contact, log)
+            usable = np.isfinite(path.c) & log.usable
+            closed = log.contact[contact.name] & usable
+            if closed.sum() >= LEAST_ROWS:
+                placement, distance = _placement(contact, path, closed, log)
+                findings += [*placement, *_labels(contact, path, closed, usable, distance, log)]
+            else:
+                slides = usable & ~closed & (path.approach <= CREEP)
+                findings += _missed(contact, path, slides, path.c, TOUCH, log)
     return findings, log
-
-
-def _check_surface(contact: SurfaceContact, path: Path, log: Log) -> list[Finding]:
-    usable = np.isfinite(path.c) & log.usable
-    closed = log.contact[contact.name] & usable
-    if closed.sum() < LEAST_ROWS:
-        return _missed(contact, path, usable & ~closed & (path.approach <= CREEP), path.c, TOUCH, log)
-    findings, distance = _placement(contact, path, closed, log)
-    return [*findings, *_labels(contact, path, closed, usable, distance, log)]
 
 
 def _placement(
@@ -197,8 +185,7 @@ def _runs_off(
 ) -> dict[str, list[tuple[int, int]]]:
     """Runs of rows labelled closed off the surface, by kind of finding.
 
-    A run is found where the tip is farther off than surfaces and arms give way. It reaches to the row
-    at which the tip moves along the normal no faster than in the rest of the contact.
+    A run reaches to the row at which the tip moves along the normal as slowly as in the rest of the contact.
     """
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
@@ -206,18 +193,15 @@ def _runs_off(
     runs: dict[str, list[tuple[int, int]]] = {"contact-early": [], "contact-late": [], "contact-far": []}
     for start, stop in intervals(closed):
         for a, b in intervals(off[start:stop], join=least):
-            if b - a >= least:
-                kind = "contact-early" if a == 0 and b < stop - start else "contact-late"
-                inside = (a > 0 and b < stop - start) or (a == 0 and b == stop - start)
-                if inside and float(np.abs(c[start + a : start + b]).max()) <= max(DRIFT, touch):
-                    continue
-                if not inside:
-                    a, b = _until_settled(a, b, settled[start:stop])
-                far = float(np.abs(c[start + a : start + b]).max()) > max(DRIFT, touch)
-                # A tip that lands stops at once; a constraint missed by a little is approached slowly.
-                landing = approach[start + max(a, b - LANDING) : start + b].max()
-                if kind == "contact-early" and not far and landing <= STOPS * slow:
-                    continue
+            if b - a < least:
+                continue
+            kind = "contact-early" if a == 0 and b < stop - start else "contact-late"
+            inside = (a > 0) == (b < stop - start)
+            a, b = (a, b) if inside else _until_settled(a, b, settled[start:stop])
+            far = float(np.abs(c[start + a : start + b]).max()) > max(DRIFT, touch)
+            # A tip that lands stops at once; a constraint missed by a little is approached slowly.
+            landing = approach[start + max(a, b - LANDING) : start + b].max() > STOPS * slow
+            if far or not (inside or (kind == "contact-early" and not landing)):
                 runs["contact-far" if inside else kind].append((start + a, start + b))
     return runs
 

@@ -1,9 +1,8 @@
 """What the motion lets one learn: joints that move, changes of direction, parameters that are identified, and
 how large a fault must be to be seen in this log.
 
-The last is the power of the tests of `explain`. A fault of size θ adds θ φ to the unexplained torque r. The
-held-out residual is linear in it, e(r + θ φ) = e(r) + θ e(φ), and contains what friction, offsets and the
-parameters accepted so far cannot imitate. The fault is seen where `significant` accepts the rise of its size.
+A fault of size θ adds θ φ to the unexplained torque r, and the held-out residual is linear in it,
+e(r + θ φ) = e(r) + θ e(φ). The fault is seen where `explain.significant` accepts the rise of its size.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
     if not log.header.ordered or seconds >= SHORT_SECONDS:
         return [], log
     text = f"{seconds:.3g} s of the log can be used"
-    return [Finding("log-short", text, log.all_rows, evidence={"seconds": seconds})], log
+    return [log.finding("log-short", text, seconds=seconds)], log
 
 
 def still_joints(log: Log) -> np.ndarray:
@@ -57,11 +56,9 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     still, findings = still_joints(log), []
     if still.any():
         joints = log.named(still)
-        verb, whose = ("moves", "its") if len(joints) == 1 else ("move", "their")
         unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
-        least = f"{', '.join(joints)} {verb} by less than {STILL} {unit}"
-        text = f"{least}: {whose} friction and inertia are not seen"
-        findings.append(Finding("joint-still", text, log.all_rows, joints))
+        text = f"range of {', '.join(joints)} below {STILL} {unit}: friction and inertia are not seen"
+        findings.append(log.finding("joint-still", text, joints))
     if not log.header.ordered:
         return findings, log
     turns = np.zeros(log.nq, int)
@@ -71,9 +68,10 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     few = (turns < REVERSALS) & ~still
     if few.any():
         joints = log.named(few)
-        changes = f"{', '.join(joints)} {'changes' if len(joints) == 1 else 'change'} direction"
-        text = f"{changes} fewer than {REVERSALS} times: friction looks like an offset"
-        findings.append(Finding("few-reversals", text, log.all_rows, joints))
+        text = (
+            f"{', '.join(joints)}: fewer than {REVERSALS} changes of direction: friction looks like an offset"
+        )
+        findings.append(log.finding("few-reversals", text, joints))
     return findings, log
 
 
@@ -92,9 +90,11 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
     missing = _missing(system, log, joints)
     count = f"{weak.sum()} of {len(weak)} base parameters are not identified"
     text = f"{count}: {listed}{more}; missing: {missing}"
-    evidence = {"identified": int((~weak).sum()), "base_parameters": len(weak)}
-    named = tuple(log.joint_names[j] for j in joints)
-    return [Finding("poor-excitation", text, log.all_rows, named, evidence=evidence)], log
+    concerned, identified = tuple(log.joint_names[j] for j in joints), int((~weak).sum())
+    finding = log.finding(
+        "poor-excitation", text, concerned, identified=identified, base_parameters=len(weak)
+    )
+    return [finding], log
 
 
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
@@ -130,26 +130,20 @@ def _missing(system: ConstrainedSystem, log: Log, joints: list[int]) -> str:
 
 
 LARGEST = 1e3
-"""Sizes beyond this are not looked for."""
-MOST = {"encoder-offset": np.pi, "base-tilted": 180.0}
-"""Largest sizes that faults can have: half a turn, in rad and degrees."""
 SIZES = np.geomspace(1e-3, LARGEST, 200)
 """Sizes that are tried."""
+MOST = {"encoder-offset": np.pi, "base-tilted": 180.0}
+"""Largest sizes that faults can have: half a turn, in rad and degrees."""
 SPAN = 1
 """Rows on either side of which the rate of the torque is taken; fewer than the margin of `explain`."""
 HIDDEN = {
-    "torque-gain": (0.5, "a gain of {joint} wrong by less than {size:.0%}", "any wrong gain of {joint}"),
-    "encoder-offset": (
-        0.1,
-        "an encoder offset of {joint} under {size:.2g} {unit}",
-        "any encoder offset of {joint}",
-    ),
-    "base-tilted": (6.0, "a base tilted by less than {size:.2g}°", "any tilt of the base"),
-    "torque-delay": (0.04, "a torque delay under {size:.2g} s", "any torque delay"),
-    "masses-mismatch": (0.5, "masses wrong by less than {size:.0%}", "any error of the masses"),
+    "torque-gain": (0.5, "wrong gain of {joint}", "{size:.0%}"),
+    "encoder-offset": (0.1, "encoder offset of {joint}", "{size:.2g} {unit}"),
+    "base-tilted": (6.0, "tilt of the base", "{size:.2g}°"),
+    "torque-delay": (0.04, "torque delay", "{size:.2g} s"),
+    "masses-mismatch": (0.5, "error of the masses", "{size:.0%}"),
 }
-"""Size that a user expects a check to see [share, rad, degrees, s, share of the inertial parameters], and
-what is hidden if only larger faults show, or none."""
+"""Size that a user expects to be seen [share, rad, degrees, s, share], what is hidden, its size in words."""
 
 
 @dataclass(frozen=True)
@@ -175,14 +169,14 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
     units = {name: position_unit(robot, j) for j, name in enumerate(robot.joint_names)}
     texts = []
     for (kind, joint), size in hidden.items():
-        _, below, never = HIDDEN[kind]
-        text = never if size >= MOST.get(kind, LARGEST) else below
+        _, what, words = HIDDEN[kind]
+        text = f"any {what}" if size >= MOST.get(kind, LARGEST) else f"any {what} under {words}"
         texts.append(text.format(joint=joint, size=size, unit=units.get(joint)))
     more = f" and {len(texts) - 5} more" if len(texts) > 5 else ""
     text = f"this log does not show {'; '.join(texts[:5])}{more}"
     joints = tuple(dict.fromkeys(joint for _, joint in hidden if joint))
     evidence = {f"{kind} {joint}".strip(): size for (kind, joint), size in sizes.items()}
-    return [Finding("faults-hidden", text, explanation.log.all_rows, joints, evidence=evidence)]
+    return [explanation.log.finding("faults-hidden", text, joints, **evidence)]
 
 
 def visible_size(explanation: Explanation, fault: Fault) -> float:
@@ -213,27 +207,17 @@ def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[F
         yield Fault("encoder-offset", joint, column[..., 0], 1)
     if log.header.ordered:  # rows in order of selection have no neighbours in time
         yield Fault("torque-delay", "", _rate(system, log, rows), log.nq)
-    yield Fault("base-tilted", "", _tilt(system, log, rows), log.nq)
-    yield Fault("masses-mismatch", "", _masses(system, log, rows), log.nq)
+    # Per degree of a tilt, about the horizontal axis that shows it better.
+    gravity, columns = system.robot.gravity.numpy(), robot_columns(system, log, rows, "gravity")[0]
+    axes = np.linalg.svd(gravity[None])[2][1:] * np.linalg.norm(gravity) * np.pi / 180.0
+    tilt = max((columns @ axis for axis in axes), key=lambda torque: float((torque**2).sum()))
+    yield Fault("base-tilted", "", tilt, log.nq)
+    # The inertial parameters of every other link are taken as wrong by the same share.
+    wrong = -np.repeat((-1.0) ** np.arange(log.nq), 10) * parameter_vector(system.robot).numpy()
+    yield Fault("masses-mismatch", "", robot_columns(system, log, rows, "masses")[0] @ wrong, log.nq)
 
 
 def _rate(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """`(n, nq)` rate of change of the torque that the motion needs; the measured one has more noise."""
     ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
     return (ahead - behind) / (2.0 * SPAN * log.dt)
-
-
-def _tilt(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Torque per degree of a tilt, about the horizontal axis that shows it better."""
-    columns = robot_columns(system, log, rows, "gravity")[0]
-    gravity = system.robot.gravity.numpy()
-    axes = np.linalg.svd(gravity[None])[2][1:] * np.linalg.norm(gravity) * np.pi / 180.0
-    torques = [columns @ axis for axis in axes]
-    return max(torques, key=lambda torque: float((torque**2).sum()))
-
-
-def _masses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Torque of all inertial parameters of every other link, which are taken as wrong by the same share."""
-    parameters = parameter_vector(system.robot).numpy()
-    sign = np.repeat((-1.0) ** np.arange(log.nq), 10)
-    return robot_columns(system, log, rows, "masses")[0] @ (-sign * parameters)

@@ -1,9 +1,7 @@
 """Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
 
-Round by round the simplest hypothesis within one standard error of the best is taken (Breiman, Friedman,
-Olshen, Stone, *Classification and Regression Trees*, 1984, sec. 3.4.3), as long as it lowers the held-out
-error by more than chance and more than matters. The log is then corrected, and the next round looks for a
-second fault, so that one fault does not show as several.
+The simplest hypothesis within one standard error of the best is taken (Breiman, Friedman, Olshen, Stone,
+*Classification and Regression Trees*, 1984, sec. 3.4.3), the log corrected, and a further one looked for.
 """
 
 from __future__ import annotations
@@ -14,32 +12,16 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from forcegp.checks import hypotheses
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import TorqueFit, TorqueProblem, cross_validate, gain_of, pooled_gain_of, score_of
-from forcegp.checks.hypotheses import (
-    LAGS,
-    ROBOT,
-    Hypothesis,
-    continuous,
-    corrected,
-    current_hypothesis,
-    delays,
-    discrete,
-    encoder_hypothesis,
-    finding_of,
-    gain_hypothesis,
-    plausible,
-    problem_of,
-    robot_hypotheses,
-)
+from forcegp.checks.hypotheses import Hypothesis, corrected
 from forcegp.checks.log import Array, Log
 from forcegp.checks.placement import leaves_surface
 from forcegp.constraints import ConstrainedSystem
 
-ROWS = 1600
-"""Rows that hypotheses are tested on."""
-SCREENING = 4
-"""Share of these rows, as its inverse, on which hypotheses must do better first."""
+ROWS, SCREENING = 1600, 4
+"""Rows that hypotheses are tested on; on one in so many they must do better first."""
 ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
@@ -50,11 +32,8 @@ SAME = 1e-3
 """Relative difference of errors that are equal."""
 DETERMINED = 3.0
 """A gain counts as known if it exceeds this many standard errors."""
-MATERIAL = 0.15
-"""Drop of Σ_j log error that matters: 14 % less error in one joint."""
-MATERIAL_EACH = 0.05
-"""Drop of log error per joint that matters where all joints are concerned."""
-
+MATERIAL, MATERIAL_EACH = 0.15, 0.05
+"""Drop of Σ_j log error that matters, 14 % less error in one joint; per joint where all are concerned."""
 
 Tried = tuple[Hypothesis, TorqueFit]
 
@@ -64,14 +43,10 @@ class Explanation:
     """What explains the torque: faults of the log, which are undone, and of the robot file.
 
     Attributes:
-        system: the robot with its contacts.
-        log: the log without the faults.
-        rows: rows that are looked at.
+        system, log, rows: robot and contacts, the log without the faults, and the rows that are looked at.
         problem: the torques that remain, over `rows`.
-        columns, prior: columns of the accepted hypotheses on the robot, and the sizes of their parameters.
-        robot: names of these hypotheses, which stay in the model.
-        findings: faults found, the most telling first.
-        repairs: what takes the faults out of a log, in order.
+        columns, prior, robot: of the accepted hypotheses on the robot, which stay in the model, with names.
+        findings, repairs: faults found, and what takes them out of a log, in order.
         taken: names and joints of the accepted hypotheses.
     """
 
@@ -93,7 +68,9 @@ class Explanation:
 
     def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
         """The problem on a log that a hypothesis has changed, with the present weights of the joints."""
-        return problem_of(self.system, log, self.rows if rows is None else rows, self.problem.scale)
+        return hypotheses.problem_of(
+            self.system, log, self.rows if rows is None else rows, self.problem.scale
+        )
 
     def weighed(self) -> Explanation:
         """The same with joints weighed by the noise that it leaves."""
@@ -116,8 +93,8 @@ class Explanation:
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     """Find the faults that explain the torque that the robot file leaves."""
-    rows = log.rows(ROWS, margin=max(LAGS))
-    problem = problem_of(system, log, rows)
+    rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
+    problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
     for _ in range(ROUNDS):
         accepted = _round(model)
@@ -131,25 +108,24 @@ def _round(model: Explanation) -> Explanation | None:
     """Accept the simplest hypothesis within one standard error of the best, if it explains enough."""
     system, log = model.system, model.log
     tried = [
-        (hypothesis, fit)
-        for hypothesis, fit in _fits(model)
-        if (hypothesis.name, hypothesis.joints) not in model.taken
-        and plausible(system, hypothesis, fit)
-        and not leaves_surface(system, log, corrected(log, hypothesis, fit.theta))
+        (h, fit)
+        for h, fit in _fits(model)
+        if (h.name, h.joints) not in model.taken
+        and hypotheses.plausible(system, h, fit)
+        and not leaves_surface(system, log, corrected(log, h, fit.theta))
     ]
-    good = [
-        (hypothesis, fit)
-        for hypothesis, fit in tried
-        if significant(fit.shares, model.fit.shares, len(hypothesis.joints) or log.nq)
-    ]
+    null = model.fit
+    good = [(h, fit) for h, fit in tried if significant(fit.shares, null.shares, len(h.joints) or log.nq)]
     if not good:
         return None
     best = min((fit for _, fit in good), key=lambda fit: fit.score.mean())
-    most, near = gain_of(best.score, model.fit.score)[0], []
-    for hypothesis, fit in good:
-        loss, error = gain_of(best.score, fit.score)
-        if loss <= max(error, SHARE * most) + 1e-9:
-            near.append((hypothesis, fit))
+    most = gain_of(best.score, null.score)[0]
+    losses = [gain_of(best.score, fit.score) for _, fit in good]
+    near = [
+        one
+        for one, (loss, error) in zip(good, losses, strict=True)
+        if loss <= max(error, SHARE * most) + 1e-9
+    ]
     chosen, fit = min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
     # The errors of an arm and of its mirror image are equal but for rounding.
     alike = [
@@ -158,9 +134,9 @@ def _round(model: Explanation) -> Explanation | None:
         if other.name == chosen.name and np.allclose(its.error, fit.error, rtol=SAME, atol=0.0)
         for joint in other.joints
     ]
-    finding = finding_of(system, log, chosen, fit, tuple(dict.fromkeys(alike)))
-    alternatives = alternatives_of(system, (chosen, fit), tried, model.fit)
-    finding = with_alternatives(finding, [finding_of(system, log, *pair) for pair in alternatives])
+    finding = hypotheses.finding_of(system, log, chosen, fit, tuple(dict.fromkeys(alike)))
+    alternatives = alternatives_of(system, (chosen, fit), tried, null)
+    finding = with_alternatives(finding, [hypotheses.finding_of(system, log, *pair) for pair in alternatives])
     return _accepted(model, chosen, fit.theta, finding)
 
 
@@ -168,7 +144,7 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
     """The explanation with one hypothesis more: its fault undone, or its parameters in the model."""
     taken = model.taken | {(hypothesis.name, hypothesis.joints)}
     model = replace(model, findings=(*model.findings, finding), taken=taken)
-    if hypothesis.name in ROBOT:
+    if hypothesis.name in hypotheses.ROBOT:
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, model.columns], axis=-1)
         prior = np.concatenate([hypothesis.prior, model.prior])
@@ -177,11 +153,11 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
         theta = theta[:1]
         for _ in range(2):  # Gauss-Newton steps, as the effect of an offset on the torque is not linear
             moved = corrected(model.log, hypothesis, theta)
-            refined = encoder_hypothesis(model.system, moved, model.rows, hypothesis.joints[0])
+            refined = hypotheses.encoder_hypothesis(model.system, moved, model.rows, hypothesis.joints[0])
             theta = theta + cross_validate(model.on(moved), refined.columns).theta
     repair = partial(corrected, hypothesis=hypothesis, theta=theta)
     log = repair(model.log)
-    problem = problem_of(model.system, log, model.rows)
+    problem = hypotheses.problem_of(model.system, log, model.rows)
     return replace(model, log=log, problem=problem, repairs=(*model.repairs, repair)).weighed()
 
 
@@ -190,13 +166,17 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     if len(model.prior):
         # Once the robot is at fault and its parameters are free, they bend to any sign and order. A delay
         # leaves the motion, and with it the columns of the robot's parameters, as they are.
-        for hypothesis in delays(log):
+        for hypothesis in hypotheses.delays(log):
             yield hypothesis, cross_validate(model.on(hypothesis.change(log)), model.columns, model.prior)
-        tried = robot_hypotheses(system, log, rows)
+        tried = hypotheses.robot_hypotheses(system, log, rows)
     else:
-        for hypothesis in _promising(model):
-            yield hypothesis, cross_validate(model.on(hypothesis.change(log)))
-        tried = continuous(system, log, rows)
+        few = model.rows[::SCREENING]
+        null = cross_validate(model.on(log, few)).score.mean()
+        for hypothesis in hypotheses.discrete(log):
+            changed = hypothesis.change(log)
+            if cross_validate(model.on(changed, few)).score.mean() < null:
+                yield hypothesis, cross_validate(model.on(changed))
+        tried = hypotheses.continuous(system, log, rows)
     off = []
     for hypothesis in tried:
         fit = model.with_(hypothesis)
@@ -204,7 +184,7 @@ def _fits(model: Explanation) -> Iterator[Tried]:
         if hypothesis.name == "gains" and significant(fit.shares, model.fit.shares, 1):
             off += hypothesis.joints
     if len(off) > 1:
-        together = gain_hypothesis(log, rows, tuple(off))
+        together = hypotheses.gain_hypothesis(log, rows, tuple(off))
         yield together, model.with_(together)
     if 2 * len(off) > log.nq > 1:
         yield from _currents(model)
@@ -213,30 +193,21 @@ def _fits(model: Explanation) -> Iterator[Tried]:
 def _currents(model: Explanation) -> Iterator[Tried]:
     """Gains of all joints that the log determines, tried where most torques are scaled wrongly."""
     log, rows, nq = model.log, model.rows, model.log.nq
-    fit = model.with_(current_hypothesis(log, rows, model.problem, tuple(range(nq))))
+    fit = model.with_(hypotheses.current_hypothesis(log, rows, model.problem, tuple(range(nq))))
     gains = 1.0 + fit.theta[:nq]
     determined = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[:nq])
     # A current has the sign of its torque, so gains of both signs have another cause.
     if 2 * len(determined) > nq and (gains[determined] > 0.0).all():
-        hypothesis = current_hypothesis(log, rows, model.problem, tuple(int(j) for j in determined))
+        hypothesis = hypotheses.current_hypothesis(
+            log, rows, model.problem, tuple(int(j) for j in determined)
+        )
         yield hypothesis, model.with_(hypothesis)
-
-
-def _promising(model: Explanation) -> Iterator[Hypothesis]:
-    """Hypotheses without parameters that lower the error on a part of the rows."""
-    few = model.rows[::SCREENING]
-    null = cross_validate(model.on(model.log, few)).score.mean()
-    for hypothesis in discrete(model.log):
-        if cross_validate(model.on(hypothesis.change(model.log), few)).score.mean() < null:
-            yield hypothesis
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:
     """Whether a drop of the score matters for the number of joints concerned, and is not due to chance.
 
-    Args:
-        better, worse: `(blocks, nq)` errors as shares of the torque.
-        concerned: number of joints.
+    The errors are shares of the torque `(blocks, nq)`.
     """
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
@@ -248,10 +219,8 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
 SMALL_MASS = 1e-6
 """Share of the robot's mass below which a mass is zero."""
 ALONE = 2.0
-"""Standard errors by which an alternative must lower the held-out error on its own.
-
-The threshold is low (chance exceeds it in 4 % of cases), since it is already known that something is wrong.
-"""
+"""Standard errors by which an alternative must lower the held-out error on its own, which chance exceeds in 4
+% of cases: it is already known that something is wrong."""
 TESTS = {
     "torque-gain": "hang a known weight from the tip: its torque shows the gain, whatever the masses",
     "torque-current": "hang a known weight from the tip: its torque shows the gains, whatever the masses",
@@ -273,10 +242,9 @@ TESTS = {
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
-    """The hypotheses that the held-out blocks cannot distinguish from the chosen one.
+    """The hypotheses that the held-out blocks cannot distinguish from the chosen one, the best first.
 
-    The best comes first. Each lowers the error significantly, and by as much as the chosen one to within one
-    standard error of the difference over blocks.
+    Each lowers the error as much as it, to within one standard error of the difference over blocks.
     """
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
         if _says_the_same(chosen[0], hypothesis):

@@ -1,7 +1,4 @@
-"""What a check says about a log: findings with rows, severity and remedy, and the report of them all.
-
-`KINDS` holds every kind of finding: how grave it is, what it means and what to do about it.
-"""
+"""Findings with rows, severity and remedy, their report, and `KINDS` of them with meaning and remedy."""
 
 from __future__ import annotations
 
@@ -9,21 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, SupportsFloat
 
+import numpy as np
+from numpy.typing import NDArray
+
 from forcegp.errors import UnknownNameError
+from forcegp.rows import Intervals, describe, intervals
 
 Severity = Literal["note", "warning", "error"]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of finding.
-
-    Attributes:
-        family: which part of the log it concerns.
-        severity: its weight unless a finding says otherwise.
-        title: in a few words.
-        remedy: what to do about it.
-    """
+    """A kind of finding: the part of the log that it concerns, its usual weight, title and remedy."""
 
     family: str
     severity: Severity
@@ -121,8 +115,6 @@ KINDS: dict[str, Kind] = {
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """From the gravest to the lightest."""
 
-Intervals = tuple[tuple[int, int], ...]
-
 
 @dataclass(frozen=True)
 class Finding:
@@ -195,6 +187,14 @@ class Finding:
             "evidence": {name: float(value) for name, value in self.evidence.items()},
             "alternatives": [other.to_dict() for other in self.alternatives],
         }
+
+
+def at_rows(
+    mask: NDArray[np.bool_], kind: str, text: str, joints: tuple[str, ...] = (), **evidence: SupportsFloat
+) -> list[Finding]:
+    """The finding on the rows of a mask, which end its text; none where the mask picks no row."""
+    rows = intervals(mask)
+    return [Finding(kind, f"{text} {describe(rows)}", rows, joints, evidence=evidence)] if rows else []
 
 
 class NotJudgedError(Exception):

@@ -92,11 +92,9 @@ class TorqueProblem:
     """Torques to be explained by known columns and by those of a hypothesis.
 
     Attributes:
-        r: `(n, nq)` unexplained torque [N m, N].
-        J: `(n, k, nq)` Jacobian of the touching points.
+        r, J: `(n, nq)` unexplained torque [N m, N], and Jacobian of the touching points `(n, k, nq)`.
         nuisance: `(n, nq, p)` columns that every hypothesis may use: friction and offset.
-        size: `(nq,)` size of the logged torque, which errors are compared with.
-        scale: `(nq,)` size of the torque's noise, which weighs the joints.
+        size, scale: `(nq,)` of the logged torque, for comparison, and of its noise, which weighs the joints.
     """
 
     r: Array
@@ -113,23 +111,19 @@ class TorqueProblem:
 
 @dataclass(frozen=True)
 class TorqueFit:
-    """A hypothesis fitted to a log.
+    """A hypothesis fitted to a log, and tested on its blocks.
 
     Attributes:
-        error: `(blocks, nq)` root mean square of the held-out residual, over `scale`.
-        theta: `(p,)` parameters of the hypothesis, from all blocks.
-        spread: `(p,)` their standard deviation, by the jackknife over blocks.
+        error, shares: `(blocks, nq)` root mean square of the held-out residual, over `scale` and over `size`.
+        theta, spread: `(p,)` parameters of the hypothesis, and their deviation by the jackknife over blocks.
         nuisance: parameters of the nuisance columns.
-        relative: `(nq,)` held-out error of the typical block over the size of the torque.
-        shares: `(blocks, nq)` the same block by block.
-        score: `(blocks,)` Σ_j log(error_j / size_j), with a floor where errors do not matter.
+        score: `(blocks,)` Σ_j log of the shares, with a floor where errors do not matter.
     """
 
     error: Array
     theta: Array
     spread: Array
     nuisance: Array
-    relative: Array
     shares: Array
     score: Array
 
@@ -148,15 +142,10 @@ def cross_validate(
 ) -> TorqueFit:
     """Fit the nuisance and the columns of a hypothesis, and test them on held-out blocks.
 
-    Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², with P the projector that takes contact forces out.
-
-    Args:
-        problem: what is to be explained.
-        columns: Φ `(n, nq, p)`, or `None` for the nuisance alone.
-        prior: s `(p,)`, how large parameters may be.
-        gains: joints whose torque the first parameters scale.
-        instruments: Z `(n, nq, p)` in place of least squares: Zᵀ P (r − N η − Φ θ) = 0, for columns that hold
-            errors themselves (Wooldridge, *Introductory Econometrics*, ch. 15).
+    Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², with P the projector that takes contact forces out. Φ are the
+    columns `(n, nq, p)`, none by default; the prior s `(p,)` says how large parameters may be; the first
+    parameters scale the torque of the joints `gains`. Instruments Z replace least squares by
+    Zᵀ P (r − N η − Φ θ) = 0, for columns that hold errors (Wooldridge, *Introductory Econometrics*, ch. 15).
     """
     p = columns.shape[-1] if columns is not None else 0
     A, y, unit, weight = _equations(problem, columns, prior)
@@ -168,11 +157,10 @@ def cross_validate(
     spread = np.sqrt(BLOCKS - 1.0) * np.std(thetas, axis=0)
     theta = (whole / unit)[:p]
     # An error counts in relation to the torque: a gain of zero explains a noisy torque, and nothing.
-    size = problem.size * np.abs(1.0 + gains_of(theta, gains, len(problem.size))) + 1e-12
-    relative = error * problem.scale / size
-    score = score_of(relative)
-    typical = np.median(relative, axis=0)
-    return TorqueFit(error, theta, (spread / unit)[:p], (whole / unit)[p:], typical, relative, score)
+    factor = np.ones(len(problem.size))
+    factor[list(gains)] += theta[: len(gains)]
+    shares = error * problem.scale / (problem.size * np.abs(factor) + 1e-12)
+    return TorqueFit(error, theta, (spread / unit)[:p], (whole / unit)[p:], shares, score_of(shares))
 
 
 def _equations(
@@ -238,13 +226,6 @@ def held_out(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
     return _held_out(A, y, weight)[0] * problem.scale / problem.size
 
 
-def gains_of(theta: Array, joints: tuple[int, ...], nq: int) -> Array:
-    """Gain less one by joint, from the leading parameters of a hypothesis on gains."""
-    gains = np.zeros(nq)
-    gains[list(joints)] = theta[: len(joints)]
-    return gains
-
-
 def _solve(gram: Array, side: Array, weight: Array, symmetric: bool = True) -> Array:
     """Solve the normal equations, or those with instruments, whose `gram` is not symmetric."""
     from scipy.linalg import cho_factor, cho_solve
@@ -267,11 +248,9 @@ def gain_of(better: Array, worse: Array) -> tuple[float, float]:
 def pooled_gain_of(better: Array, worse: Array) -> tuple[float, float]:
     """Drop of Σ_j log of the error over all blocks, and its standard error by the jackknife.
 
-    Where blocks differ in what they show, as free and touching ones do, the mean drop over blocks scatters
-    with that; the ratio of errors over all blocks does not (Cochran, *Sampling Techniques*, 1977, ch. 6).
-
-    Args:
-        better, worse: `(blocks, nq)` errors as shares of the torque.
+    Errors are shares of the torque `(blocks, nq)`. Where blocks differ in what they show, as touching and
+    free ones do, the mean drop over blocks scatters with that; the ratio of errors over all blocks does not
+    (Cochran, *Sampling Techniques*, 1977, ch. 6).
     """
 
     def drop(rows: Array) -> float:

@@ -1,10 +1,8 @@
-"""What may be wrong with a log or a robot file, one hypothesis each; the finding that an accepted one makes,
-and the log without the fault.
-"""
+"""What may be wrong with a log or a robot file, the finding that it makes, and the log without the fault."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -48,8 +46,7 @@ class Hypothesis:
         name: what is wrong: a kind of finding, or a family of kinds.
         size: number of parameters, discrete choices counted as none.
         change: makes the log as it would be, were the hypothesis right; parameters come on top.
-        columns: `(n, nq, p)` torque that the parameters add to r, if there are any.
-        prior: `(p,)` how large the parameters may be.
+        columns, prior: `(n, nq, p)` torque that the parameters add to r, and how large these may be `(p,)`.
         joints: indices of the joints concerned.
         shift: delay of the torque in samples.
         instruments: `(n, nq, p)` in place of least squares on columns that hold errors.
@@ -118,18 +115,11 @@ def unchanged(log: Log) -> Log:
     return log
 
 
-def flipped(log: Log, j: int | slice, names: tuple[str, ...]) -> Log:
-    """The log with the sign of some columns changed."""
-    sign = np.ones(log.nq)
-    sign[j] = -1.0
-    return log.replace(**{name: getattr(log, name) * sign for name in names})
-
-
-def swapped(log: Log, i: int, j: int, names: tuple[str, ...]) -> Log:
-    """The log with two joints exchanged in some columns."""
-    order = np.arange(log.nq)
-    order[[i, j]] = j, i
-    return log.replace(**{name: getattr(log, name)[:, order] for name in names})
+def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip: Sequence[int] = ()) -> Log:
+    """The log with two joints exchanged, or the sign of some joints changed, in some columns."""
+    index, sign = np.arange(log.nq), np.ones(log.nq)
+    index[list(order)], sign[list(flip)] = order[::-1], -1.0
+    return log.replace(**{name: getattr(log, name)[:, index] * sign for name in names})
 
 
 def delayed(log: Log, shift: int) -> Log:
@@ -146,14 +136,14 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
     """Signs, orders and delays: explanations without a parameter to fit."""
     every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
-        yield Hypothesis("torque-sign", 0, partial(flipped, j=slice(None), names=("tau",)), joints=every)
+        yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=every), joints=every)
     for j in every:
-        yield Hypothesis("torque-sign", 0, partial(flipped, j=j, names=("tau",)), joints=(j,))
-        yield Hypothesis("joint-sign", 0, partial(flipped, j=j, names=(*motion, "tau")), joints=(j,))
-        yield Hypothesis("joint-sign", 0, partial(flipped, j=j, names=motion), joints=(j,))
-    for i, j in combinations(every, 2):
-        yield Hypothesis("torque-order", 0, partial(swapped, i=i, j=j, names=("tau",)), joints=(i, j))
-        yield Hypothesis("joint-order", 0, partial(swapped, i=i, j=j, names=(*motion, "tau")), joints=(i, j))
+        yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=(j,)), joints=(j,))
+        yield Hypothesis("joint-sign", 0, partial(changed, names=(*motion, "tau"), flip=(j,)), joints=(j,))
+        yield Hypothesis("joint-sign", 0, partial(changed, names=motion, flip=(j,)), joints=(j,))
+    for pair in combinations(every, 2):
+        yield Hypothesis("torque-order", 0, partial(changed, names=("tau",), order=pair), joints=pair)
+        yield Hypothesis("joint-order", 0, partial(changed, names=(*motion, "tau"), order=pair), joints=pair)
     yield from delays(log)
 
 
@@ -182,8 +172,7 @@ def current_hypothesis(
 ) -> Hypothesis:
     """Gains of joints by instrumental variables; the instrument is the torque that the motion needs.
 
-    The logged torque of a light joint is mostly friction that the robot file does not describe. Used as a
-    regressor, it contains errors, which bias its gain towards zero (errors in variables).
+    Errors in a logged torque, mostly friction of a light joint, would bias its gain towards zero.
     """
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)
@@ -248,10 +237,16 @@ SMALL_GAIN = 0.2
 """Gains closer to 1 than this may as well be errors of the masses of a robot file."""
 EXPLAINED = 0.5
 """Share of the torque that a gain may leave unexplained, as any useful model may."""
-SMALL_TILT = 1.0
-"""Bases are levelled to better than this [degrees]."""
-SMALL_GRAVITY = 0.05
-"""Share of gravity below which a change of its size is an error of the masses."""
+SMALL_TILT, SMALL_GRAVITY = 1.0, 0.05
+"""Tilts [degrees] and changes of the size of gravity, as a share, that are errors of the masses."""
+
+
+DISCRETE = {
+    "torque-sign": "the torque of {} fits the motion with the opposite sign",
+    "joint-sign": "{} fits the robot file when it turns the other way",
+    "torque-order": "the torques of {} fit when exchanged",
+    "joint-order": "{} fit the robot file when exchanged",
+}
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
@@ -261,7 +256,7 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
     if hypothesis.name == "gains":
         joints = list(hypothesis.joints)
         # A gain that only makes the torque larger than its error explains nothing.
-        explained = float(np.median(fit.relative[joints])) < EXPLAINED
+        explained = float(np.median(np.median(fit.shares[:, joints], axis=0))) < EXPLAINED
         return explained and bool((np.abs(fit.theta[: len(joints)]) > SMALL_GAIN).any())
     if hypothesis.name == "gravity":
         assumed = system.robot.gravity.numpy()
@@ -300,14 +295,8 @@ def finding_of(
         return _gains(log, names, 1.0 + theta[: len(names)])
     if name == "gravity":
         return _gravity(system, log, theta[:3])
-    if name == "torque-sign":
-        text = f"the torque of {listed} fits the motion with the opposite sign"
-    elif name == "joint-sign":
-        text = f"{listed} fits the robot file when it turns the other way"
-    elif name == "torque-order":
-        text = f"the torques of {listed} fit when exchanged"
-    elif name == "joint-order":
-        text = f"{listed} fit the robot file when exchanged"
+    if name in DISCRETE:
+        text = DISCRETE[name].format(listed)
     elif name == "torque-delay":
         rows, seconds = abs(hypothesis.shift), abs(hypothesis.shift) * log.dt
         word = "after" if hypothesis.shift > 0 else "before"
@@ -326,7 +315,7 @@ def finding_of(
         worst = int(np.argmax(np.abs(theta[: 10 * log.nq : 10])))
         name, names = "masses-mismatch", (log.joint_names[worst],)
         evidence = {"largest_mass_change_kg": theta[10 * worst]}
-    return Finding(name, text, log.all_rows, names, evidence=evidence)
+    return log.finding(name, text, names, **evidence)
 
 
 def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
@@ -341,7 +330,7 @@ def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
     elif 2 * len(names) > log.nq > 1 and np.median(factor) > CURRENT:
         kind, among, text = "torque-current", gains > 0.0, f"{text}: currents, or torques on the motor side"
     joints = tuple(name for name, hit in zip(names, among, strict=True) if hit) or names
-    return Finding(kind, text, log.all_rows, joints, evidence=evidence)
+    return log.finding(kind, text, joints, **evidence)
 
 
 def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
@@ -354,10 +343,10 @@ def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
     vector = ", ".join(f"{value:.3g}" for value in fitted)
     if strength > 0.0 and size < WEIGHTLESS:
         text = "the torque contains no gravity: gravity compensation was subtracted"
-        return Finding("torque-without-gravity", text, log.all_rows, log.joint_names, evidence=evidence)
+        return log.finding("torque-without-gravity", text, log.joint_names, **evidence)
     tilted = strength > 0.0 and angle <= TILT
     text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"
-    return Finding("base-tilted" if tilted else "gravity-direction", text, log.all_rows, evidence=evidence)
+    return log.finding("base-tilted" if tilted else "gravity-direction", text, **evidence)
 
 
 def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:

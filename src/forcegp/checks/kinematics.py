@@ -1,24 +1,22 @@
 """Is qd the derivative of q, and qdd that of qd? Units of time and angle, signs, order, and noise of columns.
 
-Over short windows the change of x is compared with the integral I of its logged rate. Noise in either
-flattens one of the two regression lines, so the slope of Δx over I lies between cov/var(I) and
-var(Δx)/cov: a rate is at fault where both bounds are.
-
-Is the noise on the acceleration white, and as large as the header says? The departure of a sample from the
-cubic through its neighbours at distances k and 2k shows the noise around the frequency 1/(2 k dt), and hardly
-any motion. White noise shows alike at k = 1 and k = 3; filtered noise does not.
+A rate is at fault where both bounds of its slope are: noise in either flattens one of the two regression
+lines of the change of x over short windows on the integral of its logged rate. Is the noise on the
+acceleration white, and as large as the header says? White noise shows alike in the departures of samples from
+the cubic through their neighbours at distances of one and of three samples; filtered noise does not.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from forcegp import dynamics
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import residual, tensors
+from forcegp.checks.fit import cross_validate, tensors
+from forcegp.checks.hypotheses import problem_of
 from forcegp.checks.limits import DEGREE
 from forcegp.checks.log import Array, Log, Outcome
 from forcegp.constraints import ConstrainedSystem
@@ -26,10 +24,8 @@ from forcegp.robust import robust_std
 
 WINDOW = 0.05
 """Length of a window [s]; long enough that noise averages out, short against the motion."""
-TOLERANCE = 0.05
-"""A slope within this of 1 is right: filters and uneven clocks cost a few percent."""
-INSTANT = 0.15
-"""The same for accelerations, which change within a period."""
+TOLERANCE, INSTANT = 0.05, 0.15
+"""A slope within this of 1 is right: filters cost a few percent, and accelerations change within a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
 EXCHANGED = 0.9
@@ -40,12 +36,8 @@ JUMPS = 0.05
 """Largest share of windows that impacts cross: the velocity jumps there, which no acceleration holds."""
 INERTIA_ROWS = 200
 """Rows at which inertias are computed."""
-FRICTION_ROWS = 4000
-"""Rows from which viscous friction is estimated."""
-LEVER = 1e-6
-"""A contact without this lever arm does not act on a joint [m]."""
-AUTOCORRELATED = 20
-"""Neighbouring rows that are counted as one."""
+FRICTION_ROWS, LEAST_ROWS = 4000, 20
+"""Rows from which viscous friction is estimated, at most and at least."""
 ALIKE = 0.02
 """Slopes of all joints within this of one factor have one cause: the clock."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
@@ -58,10 +50,8 @@ class Match:
     """Changes and integrals of one level, and the slopes between them.
 
     Attributes:
-        change, integral: `(w, nq)` over windows, zero where an impact crosses one.
-        whole: both as they are.
-        low, high: `(nq,)` bounds of the slope.
-        correlation: `(nq,)`.
+        change, integral: `(w, nq)` over windows, zero where an impact crosses one; `whole`, both as they are.
+        low, high, correlation: `(nq,)` bounds of the slope, and correlation.
         moving: `(nq,)` bool, joints whose change stands out from noise.
     """
 
@@ -120,12 +110,20 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
     """One factor between changes and integrals of all joints and both levels: the clock is at fault."""
     if not log.stretches:
         return [], log
-    if log.derived:
-        return _check_long_step(log)
-    first, second = match(log, "q", "qd"), match(log, "qd", "qdd")
-    if first is None or second is None or not (first.moving & second.moving).any():
+    if "qd" in log.derived:  # only the length of a step says anything
+        step = f"{log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
+        long = log.finding("time-unit", f"rows are {step}", period=log.dt)
+        return [long] if log.dt >= 1.0 else [], log
+    first = match(log, "q", "qd")
+    if first is None or not first.moving.any():
         return [], log
     factor = float(np.median(first.low[first.moving]))
+    if log.derived:
+        near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
+        return _clock_finding(log, factor) if near or _one_factor(first, factor) else ([], log)
+    second = match(log, "qd", "qdd")
+    if second is None or not (first.moving & second.moving).any():
+        return [], log
     if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or not first.right(factor)[first.moving].all():
         return [], log
     both = first.moving & second.moving
@@ -137,27 +135,13 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def _clock_finding(log: Log, factor: float) -> Outcome:
     near = [unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE]
-    evidence = {"seconds_per_unit": factor, "period": log.dt}
     if near:
+        kind, repaired = "time-unit", log.t * near[0]
         text = f"time advances by {log.dt:.4g} per row, and the motion says {factor * log.dt:.4g} s"
-        finding = Finding("time-unit", text, log.all_rows, evidence=evidence)
-        return [finding], log.replace(t=log.t * near[0])
-    text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
-    return [Finding("time-scale", text, log.all_rows, evidence=evidence)], log.replace(t=log.t * factor)
-
-
-def _check_long_step(log: Log) -> Outcome:
-    """Without logged velocities and accelerations only the length of a step tells the unit of time."""
-    if "qd" not in log.derived:
-        first = match(log, "q", "qd")
-        factor = float(np.median(first.low[first.moving])) if first is not None else 1.0
-        near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
-        alike = first is not None and _one_factor(first, factor)
-        return _clock_finding(log, factor) if near or alike else ([], log)
-    if log.dt < 1.0:
-        return [], log
-    text = f"rows are {log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
-    return [Finding("time-unit", text, log.all_rows, evidence={"period": log.dt})], log
+    else:
+        kind, repaired = "time-scale", log.t * factor
+        text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
+    return [log.finding(kind, text, seconds_per_unit=factor, period=log.dt)], log.replace(t=repaired)
 
 
 def _one_factor(level: Match, factor: float) -> bool:
@@ -183,8 +167,11 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
     if permutation is not None:
         names = log.named(permutation != np.arange(log.nq))
         text = f"the velocities of {', '.join(names)} belong to each other's positions"
-        finding = Finding("velocity-order", text, log.all_rows, names)
-        return [finding], log.replace(qd=log.qd[:, permutation], qdd=_follow(log, permutation))
+        finding = log.finding("velocity-order", text, names)
+        rates, moved = match(log, "qd", "qdd"), permutation != np.arange(log.nq)
+        follows = rates is not None and np.median(rates.correlation[moved]) > RELATED
+        qdd = log.qdd[:, permutation] if follows else log.qdd  # where they had the order of the wrong ones
+        return [finding], log.replace(qd=log.qd[:, permutation], qdd=qdd)
     findings, factor = _velocity_findings(log, level, wrong)
     return findings, log.replace(qd=log.qd * factor)
 
@@ -200,9 +187,9 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
     for kind, slope, what in causes:
         hit = unexplained & level.right(slope) & (np.abs(level.correlation) >= RELATED)
         if hit.any():
-            joints, evidence = log.named(hit), {"slope": float(np.median(level.low[hit]))}
+            joints, slopes = log.named(hit), level.low[hit]
             text = f"qd of {', '.join(joints)} {what} the rate of change of q"
-            findings.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
+            findings.append(log.finding(kind, text, joints, slope=float(np.median(slopes))))
             factor[hit], unexplained = slope, unexplained & ~hit
     if unexplained.any():
         findings.append(_mismatch("velocity-mismatch", log, level, unexplained, "qd", "q"))
@@ -212,21 +199,18 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
 def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, value: str) -> Finding:
     """A rate without relation to its value."""
     joints, j = log.named(wrong), int(np.flatnonzero(wrong)[0])
-    evidence = {"slope": level.low[j], "correlation": level.correlation[j]}
-    text = (
-        f"{rate} of {', '.join(joints)} is not the rate of change of {value}: slope {level.low[j]:.3g}, "
-        f"correlation {level.correlation[j]:.3g}"
-    )
-    return Finding(kind, text, log.all_rows, joints, evidence=evidence)
+    slope, correlation = level.low[j], level.correlation[j]
+    shown = f"slope {slope:.3g}, correlation {correlation:.3g}"
+    text = f"{rate} of {', '.join(joints)} is not the rate of change of {value}: {shown}"
+    return log.finding(kind, text, joints, slope=slope, correlation=correlation)
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
     """Joints whose changes are of the size of encoder steps, so that nothing can be told of their rate."""
     size = np.sqrt((level.change**2).mean(axis=0))
-    steps = np.array(
-        [np.median(np.abs(x[x != 0.0])) if (x != 0.0).any() else 0.0 for x in np.diff(log.q, axis=0).T]
-    )
-    return size <= 3.0 * np.where((np.diff(log.q, axis=0) == 0.0).mean(axis=0) > 0.3, steps, 0.0)
+    moves = np.abs(np.diff(log.q, axis=0))
+    steps = np.nanmedian(np.where(moves > 0.0, moves, np.nan), axis=0)
+    return (size <= 3.0 * steps) & ((moves == 0.0).mean(axis=0) > 0.3)
 
 
 def _permutation(level: Match) -> np.ndarray | None:
@@ -248,14 +232,6 @@ def _permutation(level: Match) -> np.ndarray | None:
     return order if fits.min() >= EXCHANGED and better.all() else None
 
 
-def _follow(log: Log, permutation: np.ndarray) -> Array:
-    """Accelerations in the order of the velocities, where they had the order of the wrong ones."""
-    level = match(log, "qd", "qdd")
-    moved = permutation != np.arange(log.nq)
-    together = level is not None and np.median(level.correlation[moved]) > RELATED
-    return log.qdd[:, permutation] if together else log.qdd
-
-
 def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
     """`(nq,)` mean acceleration over a period in which the torque is held, over that at its start.
 
@@ -268,28 +244,15 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
         return np.ones(log.nq)
     with torch.no_grad():
         inverse = torch.linalg.inv(dynamics.mass_matrix(system.robot, q)).diagonal(dim1=-2, dim2=-1)
-    damping = system.robot.damping.numpy() + _undeclared_damping(system, log)
+    damping, rows, nq = system.robot.damping.numpy(), log.rows(FRICTION_ROWS), log.nq
+    if len(rows) >= LEAST_ROWS and log.tau[rows].any():
+        problem = problem_of(system, log, rows)
+        viscous, others = problem.nuisance[..., :nq], problem.nuisance[..., nq:]
+        fit = cross_validate(replace(problem, nuisance=others), viscous)
+        # Friction that the robot file lacks slows a joint as well.
+        damping = damping - np.where(-fit.theta > CLEARLY * fit.spread, fit.theta, 0.0)
     x = np.maximum(damping * log.dt * inverse.median(dim=0).values.numpy(), 1e-6)
     return -np.expm1(-x) / x
-
-
-def _undeclared_damping(system: ConstrainedSystem, log: Log) -> Array:
-    """`(nq,)` viscous friction that the robot file lacks, 0 where the torques do not show it [N m s/rad]."""
-    rows = log.rows(FRICTION_ROWS)
-    damping = np.zeros(log.nq)
-    torque, J = residual(system, log, rows)
-    for j in range(log.nq):
-        free = np.linalg.norm(J[:, :, j], axis=1) < LEVER
-        qd, r = log.qd[rows, j][free], torque[free, j]
-        if len(r) < 20:
-            continue
-        X = -np.stack([qd, np.sign(qd), np.ones_like(qd)], axis=1)
-        w, *_ = np.linalg.lstsq(X, r, rcond=None)
-        variance = ((r - X @ w) ** 2).sum() / (len(r) - 3) * np.linalg.pinv(X.T @ X)[0, 0]
-        # Neighbouring rows err alike, so only clear cases count.
-        if w[0] > CLEARLY * np.sqrt(AUTOCORRELATED * variance):
-            damping[j] = w[0]
-    return damping
 
 
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -313,10 +276,8 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     return [finding], log.replace(qdd=qdd, derived=log.derived | {"qdd"})
 
 
-DEPARTURE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
-"""The departure, with signs: it vanishes on cubics."""
-DEPARTURE_STRIDE = 3
-"""Distance of neighbours that shows noise below the corner of a filter."""
+DEPARTURE, DEPARTURE_STRIDE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, 3
+"""The departure, zero on cubics; at this stride it shows noise below the corner of a filter."""
 NOISE_FACTOR = 2.0
 """Ratio of noise found to noise stated that is reported."""
 FILTERED = 0.4
@@ -353,27 +314,24 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
         evidence["stated_std"] = stated
         filtered &= top < stated / NOISE_FACTOR
     if filtered.mean() > 0.5 and not log.header.filtered:
-        joints = log.named(filtered)
+        share = f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them"
+        text = (
+            f"the acceleration is filtered: at the highest frequencies it holds {share}, so it is not white"
+        )
         # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
         weight = "note" if stated is None else "warning"
-        text = (
-            f"the acceleration is filtered: at the highest frequencies it holds "
-            f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them, "
-            "so its noise is not white"
-        )
-        return [Finding("noise-filtered", text, log.all_rows, joints, evidence=evidence, weight=weight)], log
-    return (_stated(log, top, stated, evidence) if stated is not None else []), log
-
-
-def _stated(log: Log, noise: Array, stated: float, evidence: dict[str, float]) -> list[Finding]:
-    kinds = [("noise-understated", noise > NOISE_FACTOR * stated, np.max)]
+        return [
+            replace(log.finding("noise-filtered", text, log.named(filtered), **evidence), weight=weight)
+        ], log
+    if stated is None:
+        return [], log
+    kinds = [("noise-understated", top > NOISE_FACTOR * stated, np.max)]
     if not log.header.filtered:  # the highest frequencies show little of what a filter lets through
-        kinds.append(("noise-overstated", noise < stated / NOISE_FACTOR, np.min))
+        kinds.append(("noise-overstated", top < stated / NOISE_FACTOR, np.min))
     result = []
-    for kind, wrong, worst in kinds:
-        if wrong.any():
-            joints = log.named(wrong)
-            place = f"{worst(noise[wrong]):.3g} rad/s² at {', '.join(joints)}"
-            text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
-            result.append(Finding(kind, text, log.all_rows, joints, evidence=evidence))
-    return result
+    for kind, wrong, worst in (one for one in kinds if one[1].any()):
+        joints = log.named(wrong)
+        place = f"{worst(top[wrong]):.3g} rad/s² at {', '.join(joints)}"
+        text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
+        result.append(log.finding(kind, text, joints, **evidence))
+    return result, log

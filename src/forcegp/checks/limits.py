@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.checks.finding import Finding
+from forcegp.checks.finding import at_rows
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
-from forcegp.checks.log import Array, Log, Outcome, any_row, describe, intervals
+from forcegp.checks.log import Array, Log, Outcome
 from forcegp.constraints import ConstrainedSystem
+from forcegp.rows import intervals
 
 DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi
@@ -56,8 +57,8 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
     if _misfit(system, radians) > _misfit(system, log):
         return [], log
     beyond = f"beyond the joint limits in {100 * outside:.0f} % of the rows"
-    text, evidence = f"angles reach {largest:.4g}, {beyond}: degrees", {"largest": largest}
-    return [Finding("degrees", text, log.all_rows, log.named(turning), evidence=evidence)], radians
+    text = f"angles reach {largest:.4g}, {beyond}: degrees"
+    return [log.finding("degrees", text, log.named(turning), largest=largest)], radians
 
 
 def _misfit(system: ConstrainedSystem, log: Log) -> float:
@@ -90,11 +91,9 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
         slack = SLACK * np.where(np.isfinite(high - low), high - low, 0.0)
         with np.errstate(invalid="ignore"):
             beyond = ((value < low - slack) | (value > high + slack)) & log.usable[:, None]
-        if beyond.any():
-            hit, joints = any_row(beyond), log.named(beyond.any(axis=0))
-            rows = intervals(hit)
-            text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in {describe(rows)}"
-            findings.append(Finding(kinds[name], text, rows, joints, evidence={"rows": hit.sum()}))
+        hit, joints = beyond.any(axis=1), log.named(beyond.any(axis=0))
+        text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in"
+        findings += at_rows(hit, kinds[name], text, joints, rows=hit.sum())
     return findings, log
 
 
@@ -115,9 +114,6 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
             if runs and at.sum() > OFTENER * max(others, 1.0) and extreme != 0.0:
                 for a, b in runs:
                     clipped[a:b, j] = True
-    if not clipped.any():
-        return [], log
-    rows = intervals(any_row(clipped))
     joints = log.named(clipped.any(axis=0))
-    text = f"the torque of {', '.join(joints)} stays at its largest value in {describe(rows)}"
-    return [Finding("torque-saturated", text, rows, joints)], log
+    text = f"the torque of {', '.join(joints)} stays at its largest value in"
+    return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log

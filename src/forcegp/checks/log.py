@@ -1,10 +1,8 @@
-"""A log as it was recorded, valid or not: NaN and backward time are findings here, not errors.
+"""A log as it was recorded, valid or not, and the filter that torques are explained after.
 
-Beside it stand what the checks share: robust statistics, intervals of rows, units in messages, and the filter
-that torques are explained after. Noise ε on q̈ enters the explained torque as M ε. A fit then gains by
-shrinking the inertia, as any regression on noisy columns does; the same filter of a tenth of a second on
-positions, velocities, accelerations and torques takes that away. A linear filter on all columns leaves
-M q̈ = Q true up to the change of M and of the bias force within the window.
+Noise ε on q̈ enters the explained torque as M ε, and a fit gains by shrinking the inertia, as any regression
+on noisy columns does. The same filter of a tenth of a second on positions, velocities, accelerations and
+torques takes that away, and leaves M q̈ = Q true up to changes of M and of the bias force within it.
 """
 
 from __future__ import annotations
@@ -29,25 +27,9 @@ from forcegp.data.table import read_table
 from forcegp.errors import DataError
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
+from forcegp.rows import intervals
 
 Array = NDArray[Any]
-
-
-def intervals(mask: NDArray[np.bool_], join: int = 0) -> tuple[tuple[int, int], ...]:
-    """Half-open runs of true rows; runs that are at most `join` rows apart become one.
-
-    >>> intervals(np.array([True, True, False, True]))
-    ((0, 2), (3, 4))
-    """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    runs = [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-    joined: list[tuple[int, int]] = []
-    for start, stop in runs:
-        if joined and start - joined[-1][1] <= join:
-            joined[-1] = (joined[-1][0], stop)
-        else:
-            joined.append((start, stop))
-    return tuple(joined)
 
 
 def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
@@ -55,23 +37,9 @@ def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     return rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]
 
 
-def any_row(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """`(n,)` bool, rows of `(n, d)` in which any column is true."""
-    return np.asarray(mask.any(axis=1))
-
-
-def describe(spans: tuple[tuple[int, int], ...], most: int = 3) -> str:
-    """Rows in words, such as `row 4` or `rows 4 to 9, 20 to 31 and 5 more intervals`."""
-    texts = [f"{a}" if b - a == 1 else f"{a} to {b - 1}" for a, b in spans[:most]]
-    many = len(spans) > 1 or any(b - a > 1 for a, b in spans)
-    rest = f" and {len(spans) - most} more" if len(spans) > most else ""
-    return f"row{'s' * many} {', '.join(texts)}{rest}"
-
-
-OUTER = np.array([-10.0, 10.0, -5.0, 2.0]) / 3.0
-"""Minus the weights that carry a cubic from x = −2, −1, 1, 2 to −3."""
-SPREAD = 3.7
-"""Standard deviation of that contrast over the one of the middle value, for white noise."""
+OUTER, SPREAD = np.array([-10.0, 10.0, -5.0, 2.0]) / 3.0, 3.7
+"""Minus the weights that carry a cubic from x = −2, −1, 1, 2 to −3, and the standard deviation of that
+contrast over the one of the middle value, for white noise."""
 
 
 def spikes(x: Array) -> tuple[Array, Array]:
@@ -79,12 +47,7 @@ def spikes(x: Array) -> tuple[Array, Array]:
 
     e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the same departure
     measured on the neighbours alone, without x_i: a kink of the motion raises both, a spike the first only.
-
-    Args:
-        x: `(n, d)` evenly sampled values, n ≥ 7.
-
-    Returns:
-        Both departures `(n, d)`, zero in the three outermost rows.
+    Values are evenly sampled, `(n, d)` with n ≥ 7; both results are zero in the three outermost rows.
     """
     departure, around = np.zeros_like(x), np.zeros_like(x)
     a, b, c, middle, d, e, f = (x[k : len(x) - 6 + k] for k in range(7))
@@ -111,10 +74,9 @@ def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
     return f"{offset:+.4f} {position_unit(robot, j)}{degrees}"
 
 
-GAP = 1.5
-"""A step is a gap from this multiple of the median step on: half a sample is missing."""
-CLOCK_SPREAD = 10.0
-"""A gap also lies this many robust standard deviations of the steps above the median: clocks jitter."""
+GAP, CLOCK_SPREAD = 1.5, 10.0
+"""A gap is longer than this multiple of the median step, as half a sample is missing, and this many robust
+standard deviations of the steps longer than it, as clocks jitter."""
 SHORTEST = 8
 """Rows of the shortest stretch that is looked at."""
 SMOOTHING = 0.1
@@ -123,15 +85,9 @@ SMOOTHING = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Columns of a log, unchecked.
+    """Columns of a log, named as in a `Dataset`, unchecked.
 
     Attributes:
-        t: `(n,)` time [s].
-        q, qd, qdd, tau: `(n, nq)`, in radians, metres, newtons.
-        segment: `(n,)` number of the trajectory of each row.
-        contact: name → `(n,)` bool.
-        joint_names: the joints, in the order of the columns.
-        header: what the log says about itself.
         derived: the columns among `qd`, `qdd` that were computed here, not logged.
         masked: `(n,)` bool, rows that a check excludes from those after it.
     """
@@ -161,6 +117,10 @@ class Log:
     def all_rows(self) -> tuple[tuple[int, int], ...]:
         """The whole log as one interval."""
         return ((0, len(self)),)
+
+    def finding(self, kind: str, text: str, joints: tuple[str, ...] = (), **evidence: Any) -> Finding:
+        """A finding on the whole log."""
+        return Finding(kind, text, self.all_rows, joints, evidence=evidence)
 
     def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
         """Names of the joints that a mask picks."""
@@ -245,10 +205,7 @@ def log_of(data: Dataset) -> Log:
 def read_log(path: str | Path) -> Log:
     """Read a log from Parquet or CSV without refusing NaN, empty values or time that runs backward.
 
-    Velocities and accelerations that the file lacks are derived by a Savitzky-Golay filter.
-
-    Args:
-        path: the file, with the columns of docs/formats.md.
+    The columns are those of docs/formats.md; q̇ and q̈ that it lacks are derived by a Savitzky-Golay filter.
 
     Raises:
         DataError: the file is damaged, or a column is missing.
@@ -282,11 +239,7 @@ def derive(log: Log, absent: list[str]) -> Log:
 
 
 def of_robot(log: Log, robot: RobotModel) -> Log:
-    """The log with the robot's joints in its order; further logged joints are left out.
-
-    Raises:
-        DataError: a joint of the robot is not in the log, or the log is empty.
-    """
+    """The log with the robot's joints in its order; `DataError` if one is missing or the log is empty."""
     if len(log) == 0:
         raise DataError("the log holds no rows", expected="one or more samples")
     if not set(robot.joint_names) <= set(log.joint_names):
@@ -297,10 +250,8 @@ def of_robot(log: Log, robot: RobotModel) -> Log:
     )
 
 
-SMOOTHED_SECONDS = 0.1
-"""Length of the filter [s]."""
-SMOOTHED_ORDER = 3
-"""Degree of the polynomial: bends of the motion within the window are kept."""
+SMOOTHED_SECONDS, SMOOTHED_ORDER = 0.1, 3
+"""Length of the filter [s], and degree of its polynomial: bends of the motion within the window are kept."""
 
 
 def smoothed(log: Log) -> Log:

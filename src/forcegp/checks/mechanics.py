@@ -6,28 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError
 from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of, projector, residual, robust_parameters
-from forcegp.checks.hypotheses import (
-    LAGS,
-    contact_friction_columns,
-    friction_columns,
-    robot_columns,
-    sharper_friction_columns,
-)
-from forcegp.checks.log import Log, Outcome, any_row, describe, force_unit, intervals, position_unit, smoothed
+from forcegp.checks.log import Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
+from forcegp.rows import describe, intervals
 
 LEAST_ROWS = 200
 """Rows from which dynamics are judged."""
-SIGNIFICANT = 3.0
-"""Standard errors over blocks from which a part of the torque is there."""
-MATERIAL = 0.1
-"""Drop of the log error of a joint that makes friction or an offset worth reporting."""
+SIGNIFICANT, MATERIAL = 3.0, 0.1
+"""Standard errors over blocks, and drop of a joint's log error, from which friction or offsets count."""
 SPEEDS = (25.0, 95.0)
 """Percentiles of a joint's speed between which friction resists."""
 UNEXPLAINED = 0.5
@@ -36,10 +29,9 @@ TRACE_ROWS = 20_000
 """Rows at which the residual is looked at over time."""
 DISTURBANCE_SECONDS = 0.1
 """Length over which the residual is averaged [s]."""
-DISTURBANCE = 5.0
-"""Robust standard deviations of the log residual from which a stretch of time stands out."""
-LOUD = 4.0
-"""Factor over the residual of the worst tenth of the motion from which it stands out as well."""
+DISTURBANCE, LOUD = 5.0, 4.0
+"""A stretch of time stands out by so many robust standard deviations of the log residual, or by this factor
+over the residual of the worst tenth of the motion."""
 MOVING = 0.05
 """Share of the largest speed from which an arm moves."""
 VISIBLE = 0.1
@@ -57,7 +49,9 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         return passive, log
     smooth = smoothed(log)
     if not _enough(smooth):
-        raise NotJudgedError(f"fewer than {LEAST_ROWS} rows that lie {max(LAGS)} from the ends of a stretch")
+        raise NotJudgedError(
+            f"fewer than {LEAST_ROWS} rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
+        )
     explanation = explain(system, smooth)
     disturbed, rows = [], np.zeros(len(log), bool)
     if log.header.ordered:
@@ -79,7 +73,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _enough(log: Log) -> bool:
-    return len(log.rows(LEAST_ROWS, margin=max(LAGS))) == LEAST_ROWS
+    return len(log.rows(LEAST_ROWS, margin=max(hypotheses.LAGS))) == LEAST_ROWS
 
 
 def _without_torque(log: Log) -> list[Finding]:
@@ -110,7 +104,7 @@ def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
 
 def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) -> Explanation:
     """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
-    functions = (contact_friction_columns, sharper_friction_columns)
+    functions = (hypotheses.contact_friction_columns, hypotheses.sharper_friction_columns)
     columns = [columns(system, explanation.log, explanation.rows) for columns in functions]
     nuisance = np.concatenate([explanation.problem.nuisance, *columns], axis=-1)
     return replace(explanation, problem=replace(explanation.problem, nuisance=nuisance))
@@ -152,7 +146,7 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
         text = f"joints show {word} friction than the robot file declares (viscous, Coulomb): {listed}"
         evidence = dict(zip((f"viscous {joint}" for joint in joints), viscous[hit], strict=True))
         evidence |= dict(zip((f"coulomb {joint}" for joint in joints), coulomb[hit], strict=True))
-        findings.append(Finding("friction-undeclared", text, log.all_rows, joints, evidence=evidence))
+        findings.append(log.finding("friction-undeclared", text, joints, **evidence))
     return findings
 
 
@@ -166,7 +160,7 @@ def _offsets(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(robot, j)}" for j, joint in off.items())
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
     text = f"the logged torque is off by a constant: {listed}"
-    return [Finding("torque-offset", text, log.all_rows, joints, evidence=evidence)]
+    return [log.finding("torque-offset", text, joints, **evidence)]
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:
@@ -175,7 +169,7 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
     if share <= UNEXPLAINED:
         return []
     text = f"robot file, friction and offsets leave {100 * share:.0f} % of the torque unexplained"
-    return [Finding("torque-unexplained", text, explanation.log.all_rows, evidence={"share": share})]
+    return [explanation.log.finding("torque-unexplained", text, share=share)]
 
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
@@ -188,7 +182,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
     friction = _dry_friction(system.robot, explanation, rows, width)
-    visible = any_row(np.abs(trace) > VISIBLE * explanation.problem.size + friction)
+    visible = np.asarray((np.abs(trace) > VISIBLE * explanation.problem.size + friction).any(axis=1))
     bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)
@@ -252,8 +246,8 @@ def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
         r, J = residual(system, log, index)
-        columns = [robot_columns(system, log, index, name)[0] for name in explanation.robot]
-        columns = np.concatenate([*columns, friction_columns(system, log, index)], axis=-1)
+        columns = [hypotheses.robot_columns(system, log, index, name)[0] for name in explanation.robot]
+        columns = np.concatenate([*columns, hypotheses.friction_columns(system, log, index)], axis=-1)
         r = r - columns @ coefficients
         parts.append((projector(J, scale) @ (r / scale)[..., None])[..., 0] * scale)
     return np.concatenate(parts)

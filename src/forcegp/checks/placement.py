@@ -1,8 +1,7 @@
 """Do the joint angles place the tip on the surface where the log says that it touches?
 
-A tip that is centimetres off the surface has one of two causes. Either the surface lies elsewhere: then the
-distance is a plane over the path. Or the angles are wrong: then one change of them takes the tip onto the
-surface in all rows.
+A tip is centimetres off because the surface lies elsewhere, and the distance is a plane over the path; or
+because the angles are wrong, and one change of them takes it onto the surface in all rows.
 """
 
 from __future__ import annotations
@@ -24,9 +23,8 @@ ROWS = 2000
 """Contact rows that are looked at."""
 BETTER = 0.25
 """Share of what a displaced surface leaves that changed angles may leave."""
-LARGEST = 1.0
-"""Largest encoder offset that is looked for [rad]."""
-STEPS = 6
+LARGEST, STEPS = 1.0, 6
+"""Largest encoder offset that is looked for [rad], and the Gauss-Newton steps that find it."""
 
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:

@@ -1,8 +1,4 @@
-"""Each column by itself: a clock that runs evenly, numbers that a sensor can have meant, steps of the state.
-
-Numbers that a sensor cannot have meant are NaN, held rows, spikes and coarse steps. Positions that jump, and
-velocities that jump at an impact, are steps of the state within one sample.
-"""
+"""Each column by itself: an even clock, numbers that a sensor can have meant, steps of the state."""
 
 from __future__ import annotations
 
@@ -10,33 +6,22 @@ import numpy as np
 import torch
 
 from forcegp import dynamics
-from forcegp.checks.finding import Finding
+from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.fit import tensors
-from forcegp.checks.log import Array, Log, Outcome, any_row, describe, intervals, spikes
+from forcegp.checks.log import Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS
 from forcegp.robust import robust_std
-
-
-def _after(mask: np.ndarray) -> tuple[tuple[int, int], ...]:
-    """Rows at the end of the steps that a mask over steps picks."""
-    return intervals(np.concatenate([[False], mask]))
+from forcegp.rows import describe, intervals
 
 
 def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
     """Time stamps that repeat or run backward within a segment."""
-    findings, repeated, backward = [], log.steps == 0.0, log.steps < 0.0
-    for kind, word, mask in (
-        ("time-repeated", "repeats", repeated),
-        ("time-backward", "runs backward", backward),
-    ):
-        if mask.any():
-            rows = _after(mask)
-            text = f"time {word} in {describe(rows)}"
-            findings.append(Finding(kind, text, rows, evidence={"steps": mask.sum()}))
-    wrong = np.concatenate([[False], log.steps <= 0.0])
-    return findings, log.mask(wrong) if findings else log
+    repeated, backward = (np.append(False, wrong) for wrong in (log.steps == 0.0, log.steps < 0.0))
+    findings = at_rows(repeated, "time-repeated", "time repeats in", steps=repeated.sum())
+    findings += at_rows(backward, "time-backward", "time runs backward in", steps=backward.sum())
+    return findings, log.mask(repeated | backward) if findings else log
 
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -48,7 +33,7 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
         gaps &= ~log.masked[:-1]
     if not gaps.any():
         return [], log
-    rows, longest = _after(gaps), float(np.nanmax(log.steps))
+    rows, longest = intervals(np.append(False, gaps)), float(np.nanmax(log.steps))
     missing = int(np.round(log.steps[gaps] / log.dt - 1.0).sum())
     text = (
         f"about {missing} samples are missing before {describe(rows)}; the longest gap takes {longest:.4g} s"
@@ -67,8 +52,7 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
     if spread <= UNIFORM_TOLERANCE:
         return [], log
     text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
-    evidence = {"relative_spread": spread, "period_s": log.dt}
-    return [Finding("time-jitter", text, log.all_rows, evidence=evidence)], log
+    return [log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)], log
 
 
 def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -77,23 +61,19 @@ def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
     if stated is None or not abs(log.dt / stated - 1.0) > UNIFORM_TOLERANCE:
         return [], log
     text = f"the header states a period of {stated:.4g} s, and the rows are {log.dt:.4g} s apart"
-    evidence = {"stated_s": stated, "period_s": log.dt}
-    return [Finding("period-header", text, log.all_rows, evidence=evidence)], log
+    return [log.finding("period-header", text, stated_s=stated, period_s=log.dt)], log
 
 
 HELD_RUN = 2
 """A logger that fails to update repeats a row at least this often before it is reported as held."""
-STUCK_SECONDS = 0.05
-"""A channel stands still when it repeats one value for this long while the joint moves [s]."""
-STUCK_VISIBLE = 0.02
-"""Share of its range that a channel should have moved by in that time."""
+STUCK_SECONDS, STUCK_VISIBLE = 0.05, 0.02
+"""A channel that repeats one value for so long [s] should have moved by this share of its range."""
 SPIKE = 12.0
 """Robust standard deviations beyond which a single value is a spike: never reached by normal noise."""
 SPIKE_ALONE = 4.0
 """Factor by which a spike stands out from the misfit of its neighbours."""
 SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
-"""Departures of the neighbours may differ from those of one wrong value by this share of it, and by this many
-robust standard deviations."""
+"""Share of a wrong value, and robust deviations, by which departures of its neighbours may differ."""
 SPIKE_SHARED = 0.05
 """A departure of another channel by this share of a value's own says that the motion jumped."""
 DRIVEN = 0.5
@@ -119,12 +99,9 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
         wrong = ~np.isfinite(value)
         columns += [f"{name}.{log.joint_names[j]}" for j in np.flatnonzero(wrong.any(axis=0))]
         bad = bad | wrong.any(axis=1)
-    if not bad.any():
-        return [], log
-    rows = intervals(bad)
     listed = ", ".join(columns[:4]) + (" and others" if len(columns) > 4 else "")
-    text = f"{int(bad.sum())} rows hold a NaN or an infinite value, in {listed}: {describe(rows)}"
-    return [Finding("not-finite", text, rows, evidence={"rows": bad.sum()})], log
+    text = f"{int(bad.sum())} rows hold a NaN or an infinite value, in {listed}:"
+    return at_rows(bad, "not-finite", text, rows=bad.sum()), log
 
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -136,10 +113,8 @@ def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
     held = np.concatenate([[False], same & moving & (np.diff(log.segment) == 0)])
     if held.sum() < HELD_RUN:
         return [], log
-    rows = intervals(held)
-    share = held.mean()
-    text = f"{int(held.sum())} rows ({100 * share:.2g} %) repeat the one before: {describe(rows)}"
-    return [Finding("rows-held", text, rows, evidence={"rows": held.sum(), "share": share})], log.mask(held)
+    text = f"{int(held.sum())} rows ({100 * held.mean():.2g} %) repeat the one before:"
+    return at_rows(held, "rows-held", text, rows=held.sum(), share=held.mean()), log.mask(held)
 
 
 def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -204,13 +179,10 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
             outlier &= ~_driven(system, log, departure, outlier)
         # The neighbours of a spike are off as well, by less.
         peak = outlier & (np.abs(departure) >= _within_two(np.abs(departure)))
-        bad |= any_row(peak)
+        bad |= peak.any(axis=1)
         hit += [f"{name}.{joint}" for joint in log.named(peak.any(axis=0))]
-    if not bad.any():
-        return [], log
-    rows = intervals(bad)
-    text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}: {describe(rows)}"
-    return [Finding("spike", text, rows, evidence={"rows": bad.sum()})], log.mask(bad)
+    text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}:"
+    return at_rows(bad, "spike", text, rows=bad.sum()), log.mask(bad)
 
 
 def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
@@ -228,8 +200,7 @@ def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
 def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
     """`(n, nq)` bool, values that depart as others do, of which each is compared with its column's range.
 
-    A shock moves several joints, or shows in torque and acceleration; a sensor errs in one channel. No shock
-    moves the position.
+    A shock moves several joints, or shows in torque and acceleration, and never in the position.
     """
     departure = departures[name][0]
     if name == "q":
@@ -249,7 +220,7 @@ def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.n
     """`(n, nq)` bool, accelerations that a step of the joint's own torque makes: Δτ_j (M⁻¹)_jj."""
     step = np.pad(np.abs(np.diff(log.tau, axis=0)), ((1, 1), (0, 0)))
     step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
-    rows = np.flatnonzero(any_row(outlier))
+    rows = np.flatnonzero(outlier.any(axis=1))
     if len(rows):
         M = dynamics.mass_matrix(system.robot, tensors(log, rows, "q")[0])
         inverse = torch.linalg.inv(M).diagonal(dim1=-2, dim2=-1).detach().numpy()
@@ -292,8 +263,7 @@ def _within_two(x: Array) -> Array:
 def resolution(x: Array) -> Array:
     """Step between the values that a column takes, where it takes few; else zero."""
     steps = np.zeros(x.shape[1])
-    for j in range(x.shape[1]):
-        levels = np.unique(x[:, j])
+    for j, levels in enumerate(map(np.unique, x.T)):
         if 2 < len(levels) < 0.75 * len(x):
             gaps = np.diff(levels)
             # Rounding in the last digit makes two levels of one; those gaps are not steps.
@@ -320,28 +290,20 @@ def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
         f"positions come in steps of {step[worst]:.3g} rad ({log.joint_names[worst]}), which add noise of "
         f"{noise[worst]:.3g} rad/s to a velocity from neighbouring samples"
     )
-    return [Finding("quantised", text, log.all_rows, joints, evidence={"step": step[worst]})], log
+    return [log.finding("quantised", text, joints, step=step[worst])], log
 
 
-JUMP = 30.0
-"""Robust standard deviations beyond which a step is a jump, not noise: fifteen at each of two rows."""
-FASTEST = 2.0
-"""A jump also exceeds what the fastest joint changes within a step by this factor."""
-
-
-def _surplus(x: Array, rate: Array, log: Log) -> Array:
-    """`(n, nq)` change of x over each step beyond what its rate accounts for, at the row after the step."""
-    surplus = np.zeros_like(x)
-    for s in log.stretches:
-        mean = 0.5 * (rate[s][1:] + rate[s][:-1])
-        surplus[s][1:] = np.diff(x[s], axis=0) - mean * np.diff(log.t[s])[:, None]
-    return surplus
+JUMP, FASTEST = 30.0, 2.0
+"""A jump exceeds so many robust standard deviations of the steps, fifteen at each of two rows, and the change
+of the fastest joint within a step by this factor."""
 
 
 def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
     """`(n, nq)` bool, rows at which a column jumps."""
-    surplus = _surplus(x, rate, log)
-    usable = log.usable
+    surplus, usable = np.zeros_like(x), log.usable
+    for s in log.stretches:  # what the rate does not account for
+        mean = 0.5 * (rate[s][1:] + rate[s][:-1])
+        surplus[s][1:] = np.diff(x[s], axis=0) - mean * np.diff(log.t[s])[:, None]
     scale = (
         robust_std(surplus[usable]) + resolution(x[usable]) + np.finfo(float).eps * np.abs(x[usable]).max()
     )
@@ -358,13 +320,9 @@ def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
     if "qd" in log.derived:
         return [], log
     jumps = _jumps(log.q, log.qd, log)
-    if not jumps.any():
-        return [], log
-    rows = intervals(any_row(jumps))
-    joints = log.named(jumps.any(axis=0))
-    text = f"the position of {', '.join(joints)} jumps at {describe(rows)}"
-    segment = log.segment + np.cumsum(any_row(jumps))
-    return [Finding("position-jump", text, rows, joints)], log.replace(segment=segment)
+    at, joints = np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
+    findings = at_rows(at, "position-jump", f"the position of {', '.join(joints)} jumps at", joints)
+    return findings, log.replace(segment=log.segment + np.cumsum(at))
 
 
 def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -372,10 +330,7 @@ def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
     if log.derived:
         return [], log
     jumps = _jumps(log.qd, log.qdd, log)
-    if not jumps.any():
-        return [], log
-    around = any_row(jumps)
-    rows = intervals(around)
-    text = f"the velocity jumps, as at an impact, at {describe(rows)}"
+    around, joints = np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
+    findings = at_rows(around, "impact", "the velocity jumps, as at an impact, at", joints)
     around[:-1] |= around[1:]
-    return [Finding("impact", text, rows, log.named(jumps.any(axis=0)))], log.mask(around)
+    return findings, log.mask(around)

@@ -95,7 +95,7 @@ def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]
 
     with progress_bar(f"looking at {log.name}", 1) as advance:
         guessed = guess_mapping(log, system, progress=advance)
-    write_or_keep(lambda path: write_text(path, guessed.toml), out)
+    write_or_keep(lambda path: write_text(path, guessed.toml()), out)
     doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
     return {"mapping": str(out), **doubts, "next": f"check {out}, then import with --mapping {out}"}
 
@@ -213,7 +213,7 @@ def _print(report: Report) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from forcegp.checks.log import describe
+    from forcegp.rows import describe
 
     if report.findings:
         table = Table(box=None, pad_edge=False)

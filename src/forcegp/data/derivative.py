@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.errors import DataError
 from forcegp.robust import MAD_TO_STD
+from forcegp.rows import runs
 
 UNIFORM_TOLERANCE = 0.02
 """Largest departure of a time step from the median step, as a fraction: clocks jitter, gaps do not pass."""
@@ -75,9 +75,7 @@ def differentiate(
     half, residuals = window // 2, []
     # Norm of the weights at each position of the window, per unit time step.
     norms = [np.linalg.norm(savgol_coeffs(window, order, deriv=degree, pos=place)) for place in range(window)]
-    edges = [0, *(np.flatnonzero(np.diff(segment)) + 1).tolist(), len(segment)]
-    for first, last in pairwise(edges):
-        rows = slice(first, last)
+    for rows in runs(segment):
         dt = _time_step(t, rows, window)
         samples = x[rows]
         result[rows] = savgol_filter(samples, window, order, deriv=degree, delta=dt, axis=0, mode="interp")

@@ -42,13 +42,7 @@ NUMBERS = 16
 
 @dataclass(frozen=True)
 class Imported:
-    """A log that has been imported.
-
-    Attributes:
-        data: the data set.
-        report: what was found and done.
-        contacts: the evidence for each contact that was detected.
-    """
+    """A data set, what was found in the log and done to it, and the evidence for each detected contact."""
 
     data: Dataset
     report: ImportReport
@@ -102,15 +96,7 @@ def import_log(
     mapping: Mapping | str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Imported:
-    """Read a log, and say what was found in it and done to it.
-
-    Args:
-        path, scene, mapping: see `read_log`.
-        progress: called while the file is read, with the work done and the total.
-
-    Raises:
-        DataError, MappingError, MissingDependencyError: see `read_log`.
-    """
+    """Read a log as `read_log` does, and say what was found and done; `progress` gets work done and total."""
     system = system_of(scene)
     robot = system.robot
     if mapping is None:
@@ -118,7 +104,7 @@ def import_log(
     else:
         log_mapping = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
     report = ImportReport(str(path))
-    report.did(f"read {Path(path).name} by mapping {Path(log_mapping.source).name}")
+    report.steps.append(f"read {Path(path).name} by mapping {Path(log_mapping.document.source).name}")
     try:
         signals = gather(path, log_mapping, robot.joint_names, report, progress)
         numbers = NUMBERS * len(signals.joint_names) * len(signals)
@@ -167,7 +153,12 @@ def _dataset(
     settings = mapping.sections.derivatives
     dt = usual_step(signals.t)
     margin = settings.impact_margin if settings.impact_margin is not None else 0.5 * settings.window * dt
-    contact_extras = _contact_extras(signals, margin, mapping, system, report)
+    impact = {name: _tensor(mask.astype(np.float64)) for name, mask in impact_mask(signals, margin).items()}
+    of_contacts = {"impact": impact} if impact else {}
+    if "wrench" in signals.vectors and signals.contact:
+        sensed = per_contact(signals, system, mapping)
+        of_contacts |= {name: {key: _tensor(x) for key, x in group.items()} for name, group in sensed.items()}
+        report.steps.append("took the tool's weight off the wrench and carried it to the contact")
     vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
     header = DataHeader(
         dt=dt,
@@ -186,23 +177,10 @@ def _dataset(
         joint_names=robot.joint_names,
         contact={name: torch.from_numpy(value) for name, value in signals.contact.items()},
         extras={} if std is None else {"qdd_std": _tensor(std)},
-        contact_extras=contact_extras,
+        contact_extras=of_contacts,
         segment=torch.from_numpy(signals.segment),
         header=header,
     )
-
-
-def _contact_extras(
-    signals: Signals, margin: float, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
-) -> dict[str, dict[str, torch.Tensor]]:
-    """Rows at impacts of each contact, and the forces that a sensor measured there."""
-    impact = {name: _tensor(mask.astype(np.float64)) for name, mask in impact_mask(signals, margin).items()}
-    extras = {"impact": impact} if impact else {}
-    if "wrench" in signals.vectors and signals.contact:
-        sensed = per_contact(signals, system, mapping)
-        extras |= {name: {key: _tensor(x) for key, x in group.items()} for name, group in sensed.items()}
-        report.did("took the tool's weight off the wrench and carried it to the contact")
-    return extras
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:

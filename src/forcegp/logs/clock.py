@@ -8,22 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.errors import DataError
-from forcegp.logs.signals import Array, ImportReport, Signals, listed
+from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.rows import describe, numbered
 
-RESTART_STEPS = 2.0
-"""A clock that falls back to within so many steps of where its trajectory began, or before, has restarted."""
-SHORTEST_TRAJECTORY = 10
-"""Rows before a restart; fewer are stamps out of order."""
+RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
+"""A clock that falls back to within so many steps of where its trajectory began, or before, has restarted,
+after so many rows at least; fewer are stamps out of order."""
 GAP_STEPS = 5.0
 """A step longer than so many usual ones is a gap."""
 
 
 def usual_step(t: Array) -> float:
-    """The median of the positive time steps [s].
-
-    Raises:
-        DataError: time never increases.
-    """
+    """The median of the positive time steps [s]; `DataError` where time never increases."""
     steps = np.diff(t)
     steps = steps[steps > 0.0]
     if not len(steps):
@@ -36,11 +32,7 @@ def usual_step(t: Array) -> float:
 
 
 def drop_repeated(signals: Signals, report: ImportReport) -> None:
-    """Drop rows that repeat the one before, stamp and values.
-
-    Raises:
-        DataError: rows with the same stamp hold different values.
-    """
+    """Drop rows that repeat the one before; `DataError` where only the stamp is the same."""
     same = np.concatenate([[False], np.diff(signals.t) == 0.0])
     if not same.any():
         return
@@ -51,7 +43,7 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
     if len(different):
         rows = signals.row[different]
         raise DataError(
-            f"rows {listed(rows)} have the time stamp of the row before, with other values",
+            f"{describe(numbered(rows))}: the time stamp of the row before, with other values",
             expected="one row for each time",
             got=f"{len(rows)} such rows",
             hint="is this the right column of time? Its resolution may be too coarse",
@@ -63,10 +55,8 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
 def split_trajectories(signals: Signals, gap: float | None, report: ImportReport) -> None:
     """Number the trajectories: a new one begins where the clock restarts and after a gap.
 
-    Args:
-        signals: the log; its `segment` holds what the log itself says.
-        gap: longest step within a trajectory [s], or `None` for `GAP_STEPS` usual steps.
-        report: gets what was found.
+    A step longer than `gap` [s], by default `GAP_STEPS` usual ones, is a gap. `signals.segment` holds the
+    numbers that the log itself gives.
 
     Raises:
         DataError: time steps back without restarting; the message has the rows.
@@ -84,7 +74,7 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
                 start = row
         if wrong:
             raise DataError(
-                f"time goes back in row{'s' * (len(wrong) > 1)} {listed(signals.row[wrong])}",
+                f"time goes back in {describe(numbered(signals.row[wrong]))}",
                 expected=f"more than {t[wrong[0] - 1]:.9g} s in row {signals.row[wrong[0]]}",
                 got=f"{t[wrong[0]]:.9g} s",
                 hint="sort the log by time, or take a column of time that increases within a trajectory",
@@ -99,10 +89,9 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
 
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
-    """Find, and if asked drop, rows whose positions and torques are those of the row before, to the last bit.
+    """Find, and if asked drop, rows with the positions and torques of the row before, to the last bit.
 
-    A logger that is faster than its source writes such rows; they flatten derivatives. At rest, an
-    encoder's position stays the same, so only rows in which the torque stays too are counted.
+    A logger that is faster than its source writes them; they flatten derivatives. At rest the torque changes.
     """
     held = np.zeros(len(signals), dtype=bool)
     held[1:] = signals.segment[1:] == signals.segment[:-1]
@@ -122,18 +111,8 @@ def join_stream(
 ) -> None:
     """Add a vector of a stream with a clock of its own, interpolated at the times of the log.
 
-    Rows of the log that the stream does not cover are dropped: before its first stamp, after its last, and
-    within its gaps.
-
-    Args:
-        signals: the log.
-        name: under which the vector is added.
-        t, values: the stream, `(k,)` and `(k, d)`.
-        gap: longest step of the stream that is interpolated over [s], or `None` for `GAP_STEPS` usual steps.
-        report: gets what was dropped.
-
-    Raises:
-        DataError: the stream's clock does not increase, or the streams do not overlap.
+    Rows of the log that the stream, with stamps t `(k,)`, does not cover are dropped: before its first stamp,
+    after its last, and within its gaps.
     """
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
@@ -158,7 +137,9 @@ def join_stream(
         report.find("uncovered", message, signals.row[~covered])
         signals.keep(covered, split=True)
     signals.vectors[name] = onto(t, values, signals.t)
-    report.did(f"interpolated {name} from {1.0 / usual_step(t):.4g} Hz onto the clock of the positions")
+    report.steps.append(
+        f"interpolated {name} from {1.0 / usual_step(t):.4g} Hz onto the clock of the positions"
+    )
 
 
 UNEVEN = 0.02
@@ -168,10 +149,7 @@ SMOOTH = ("q", "qd")
 
 
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
-    """Values `(n, d)` of a stream with increasing stamps t, at other times within its own `(k, d)`.
-
-    The interpolation is linear, or by a cubic spline (not-a-knot) where there are four rows.
-    """
+    """Values `(n, d)` of a stream with stamps t at other times, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)
@@ -180,21 +158,18 @@ def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
 def even_clock(signals: Signals, period: float | None, report: ImportReport) -> None:
     """Put every trajectory on an evenly spaced clock of its own start, if its own is uneven.
 
-    Args:
-        signals: the log.
-        period: the time step [s], or `None` for the log's usual step.
-        report: gets the step, and how uneven the clock was.
+    The step is `period` [s], by default the log's usual one.
     """
-    steps = [np.diff(signals.t[rows]) for rows in signals.runs() if rows.stop - rows.start > 1]
-    worst = max((float(np.abs(s - np.median(s)).max() / np.median(s)) for s in steps), default=0.0)
+    stretches = [rows for rows in signals.runs() if rows.stop - rows.start > 1]
+    if not stretches:
+        raise DataError("the log has no trajectory of two rows or more")
+    steps = [np.diff(signals.t[rows]) for rows in stretches]
+    worst = max(float(np.abs(s - np.median(s)).max() / np.median(s)) for s in steps)
     if worst > UNEVEN:
         report.find("uneven", f"time steps depart by up to {100.0 * worst:.3g} % from the usual step")
     elif period is None:
         return
     step = period if period is not None else usual_step(signals.t)
-    stretches = [rows for rows in signals.runs() if rows.stop - rows.start > 1]
-    if not stretches:
-        raise DataError("the log has no trajectory of two rows or more")
     grids, nearest = [], []
     for rows in stretches:
         t = signals.t[rows]
@@ -208,9 +183,6 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
         signals.vectors[name] = np.concatenate(parts)
     index: NDArray[np.int64] = np.concatenate(nearest)
     signals.contact = {name: value[index] for name, value in signals.contact.items()}
-    signals.t, signals.row, signals.segment = (
-        np.concatenate(grids),
-        signals.row[index],
-        signals.segment[index],
-    )
-    report.did(f"resampled to steps of {step:.9g} s (positions by cubic splines, torques linearly)")
+    signals.t, signals.row = np.concatenate(grids), signals.row[index]
+    signals.segment = signals.segment[index]
+    report.steps.append(f"resampled to steps of {step:.9g} s (positions by cubic splines, torques linearly)")

@@ -1,6 +1,4 @@
-"""Intervals in which a contact is closed, with the evidence for them.
-
-The evidence is the distance to the surface, a measured force, or λ of the rigid body.
+"""Intervals in which a contact is closed, from its distance, a measured force or λ.
 
 A force-torque sensor's reading becomes force and moment of the environment at the contact, in the world. The
 sensor sits in a frame of the robot, at p_S with rotation R. With f and m its reading as the environment and
@@ -25,9 +23,10 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
 from forcegp.logs.mapping import ContactStateSection, Mapping
-from forcegp.logs.signals import Array, ImportReport, Signals, runs
+from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
+from forcegp.rows import runs
 
 CHUNK = 1 << 12
 """Rows that are computed at a time."""
@@ -52,14 +51,7 @@ def _wrench(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Force, moment about the sensor and its position, `(n, 3)` each, in the world, less the tool's weight.
 
-    Args:
-        robot: the robot.
-        mapping: describes the sensor.
-        q: `(n, nq)` positions.
-        reading: `(n, 6)` force and moment in the sensor's axes or the world's [N], [N m].
-
-    Raises:
-        MappingError: the sensor's frame is none of the robot.
+    The reading `(n, 6)` is in the sensor's axes or the world's [N], [N m].
     """
     section = mapping.sections.wrench
     assert section is not None
@@ -77,11 +69,7 @@ def _wrench(
 
 
 def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
-    """The sensor's force and moment at each contact with a surface, `F_sensor` and `M_sensor` of a data set.
-
-    Raises:
-        MappingError: the sensor's frame is none of the robot.
-    """
+    """The sensor's force and moment at each contact with a surface: `F_sensor` and `M_sensor`."""
     touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
 
     def sensed(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
@@ -96,15 +84,10 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
 
 
 def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
-    """λ `(n,)` of the rigid-body model [N], zero in free motion where the model is right.
+    """λ `(n,)` of the rigid-body model at one contact [N], zero in free motion where the model is right.
 
     M q̈ − Q is the generalized force that the known forces do not explain, and
     λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) the part of it along the surface's normal.
-
-    Args:
-        signals: with `qd`, `qdd` and `tau`.
-        system: the robot with its contacts.
-        contact: which of them.
     """
     alone = ConstrainedSystem(system.robot, [contact])
 
@@ -132,32 +115,23 @@ def _evidence(
     return multiplier(signals, system, contact)
 
 
-SEPARATION = 6.0
-"""Least distance between the two levels of force, in standard deviations of the open one."""
-RELEASE_STD = 4.0
-"""A contact counts as closed from where the force leaves the open level by so many of its deviations."""
-TOUCHING = 1e-3
-"""How near the surface the touching point is in contact at most, unless the mapping says otherwise [m]."""
-DISTANCE_STD = 6.0
-"""A contact is closed up to so many deviations of the distances of the closed contact above their median."""
-SMALLEST_DISTANCE = 1e-6
-"""Least such distance [m]: rounding of a log of an exact simulation."""
+SEPARATION, RELEASE_STD = 6.0, 4.0
+"""Least distance between the two levels of force, in standard deviations of the open one; a contact counts as
+closed from where the force leaves the open level by so many of them."""
+TOUCHING, DISTANCE_STD, SMALLEST_DISTANCE = 1e-3, 6.0, 1e-6
+"""A contact is closed up to so many deviations of the distances of the closed contact above their median, at
+least for rounding and at most [m], unless the mapping says otherwise."""
 BINS = 512
 """Bins of the histogram that the two levels are told apart in."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a contact's state was read from.
+    """What a contact's state was read from: `wrench`, `multiplier` or `distance`, in N or m.
 
-    Attributes:
-        contact: its name.
-        source: `wrench`, `multiplier` or `distance`.
-        threshold, release: closed from `threshold` on, and then up to `release` on either side [N] or [m].
-        closed_level, closed_spread, open_level, open_spread: median and deviation of the evidence in each
-            state; NaN where the state does not occur.
-        intervals: first and last time of each closed interval [s].
-        merged: intervals that were too short and got their neighbours' state.
+    Closed from `threshold` on, and then up to `release` on either side; median and deviation of the evidence
+    in each state, NaN where it does not occur; first and last time of each closed interval [s]; and how many
+    intervals were too short and got their neighbours' state.
     """
 
     contact: str
@@ -174,32 +148,20 @@ class Evidence:
     def sentence(self) -> str:
         """The evidence in one sentence."""
         unit, scale = ("mm", 1e3) if self.source == "distance" else ("N", 1.0)
-        levels = (self.closed_level, self.closed_spread, self.open_level, self.open_spread, self.threshold)
-        closed, closed_spread, open_, open_spread, threshold = (scale * level for level in levels)
+        closed = f"{scale * self.closed_level:.3g} ± {scale * self.closed_spread:.2g} {unit}"
+        open_ = f"{scale * self.open_level:.3g} ± {scale * self.open_spread:.2g} {unit}"
         return (
             f"contact {self.contact!r} by {self.source}: {len(self.intervals)} closed intervals, "
-            f"{closed:.3g} ± {closed_spread:.2g} {unit} closed, {open_:.3g} ± {open_spread:.2g} {unit} open, "
-            f"threshold {threshold:.3g} {unit}"
+            f"{closed} closed, {open_} open, threshold {scale * self.threshold:.3g} {unit}"
         )
 
 
 def detect(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
 ) -> list[Evidence]:
-    """Set `signals.contact` for every contact of the scene.
+    """Set `signals.contact` for every contact of the scene, and return the evidence for those detected.
 
-    Args:
-        signals: the log, with `qd` and `qdd` where a contact is found from λ.
-        system: the robot with its contacts.
-        mapping: how each contact's state is known.
-        report: gets the evidence.
-
-    Returns:
-        The evidence for each contact that was detected.
-
-    Raises:
-        DataError: the evidence does not separate two states.
-        MappingError: the mapping does not say how a contact is known, or names one that the scene lacks.
+    Contacts found from λ need `qd` and `qdd`.
     """
     sections = mapping.sections.contact
     for name in sections:
@@ -221,10 +183,8 @@ def detect(
         elif source == "column":
             states[name] = signals.contact[name]
         elif not isinstance(contact, SurfaceContact):
-            key = ("contact", name, "source")
-            raise mapping.error(
-                key, "only a contact with a surface can be detected", "column, always or never"
-            )
+            text = "only a contact with a surface can be detected"
+            raise mapping.error(("contact", name, "source"), text, "column, always or never")
         else:
             values = _evidence(signals, system, mapping, contact, source)
             states[name], detection = _detect(signals, values, name, sections[name])
@@ -257,8 +217,8 @@ def _detect(
 def touching(distance: Array) -> float:
     """Distance up to which a contact is closed [m], at most `TOUCHING`.
 
-    Within `TOUCHING` of the surface most rows are those of the closed contact; the threshold is their median
-    and `DISTANCE_STD` of their deviations. It parts them from those of the tip coming near and leaving.
+    Most rows so near are those of the closed contact: the threshold, their median and `DISTANCE_STD` of their
+    deviations, parts them from those of the tip coming near and leaving.
 
     >>> touching(np.array([0.0, 0.001, -0.001, 0.0, 0.002, 0.9, 30.0]) * 1e-3) < 1e-5
     True
@@ -273,11 +233,8 @@ def touching(distance: Array) -> float:
 def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
     """Force from which a contact is closed, and the force up to which that interval then extends [N].
 
-    The first is the one that parts the forces into the two groups with the least variance within them (Otsu
-    1979); the second lies `RELEASE_STD` deviations above the median of the open group.
-
-    Raises:
-        DataError: the two groups are not apart, so that the log may hold one state only.
+    The first parts the forces into the two groups with the least variance within them (Otsu 1979); the second
+    lies `RELEASE_STD` deviations above the median of the open group. `DataError` if the groups are not apart.
     """
     if section.threshold is not None:
         return section.threshold, section.release if section.release is not None else 0.5 * section.threshold

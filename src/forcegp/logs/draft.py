@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
+
+CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
+"""What a current needs beside its unit."""
 
 
 @dataclass
 class Family:
-    """Columns of one quantity, one for each joint.
+    """Columns of one quantity, one for each joint; `declared`, if the log says their unit.
 
-    Attributes:
-        pattern: their common name, with `{joint}` where they differ.
-        columns: what stands for `{joint}` → column.
-        declared: whether the log declares the unit.
-        sign: +1, −1, or one of them for each joint of the robot.
-        by_joint: joint of the robot → column, where `columns` does not name the joints as the positions do.
+    `columns` has what stands for `{joint}` in the common pattern → column; `by_joint` joint of the robot →
+    column, where that does not name the joints as the positions do.
     """
 
     pattern: str
@@ -27,32 +26,24 @@ class Family:
     sign: float | dict[str, float] = 1.0
     by_joint: dict[str, str] = field(default_factory=dict)
 
+    def table(self) -> dict[str, Any]:
+        """Keys of the mapping."""
+        columns = {"columns": self.by_joint} if self.by_joint else {"column": self.pattern}
+        sign = None if self.sign == 1.0 else self.sign
+        current = CURRENT if self.unit in ("A", "mA") else {}
+        return {**columns, "stream": self.stream or None, "unit": self.unit, "sign": sign, **current}
+
 
 @dataclass
 class Draft:
-    """A proposed mapping.
-
-    Attributes:
-        source: the log.
-        time, time_unit, segment: column and unit of time, and the column that numbers the trajectories.
-        joints: joint of the robot → what the log calls it.
-        families: quantity → its columns.
-        wrench: columns of the force and, if any, of the moment.
-        contacts: contact of the scene → lines of its table.
-        comments: table → sentences above it.
-        doubts: what the user must check.
-    """
+    """A proposed mapping: tables, in which a key that is `None` is left out, families of columns by quantity,
+    comments above each table, and what the user must check."""
 
     source: str
-    time: str = ""
-    time_unit: str = "s"
-    segment: str | None = None
+    time: dict[str, Any] = field(default_factory=dict)
     joints: dict[str, str] = field(default_factory=dict)
     families: dict[str, Family] = field(default_factory=dict)
-    wrench: list[list[str]] = field(default_factory=list)
-    wrench_stream: str = ""
-    wrench_frame: str = ""
-    contacts: dict[str, list[str]] = field(default_factory=dict)
+    further: dict[str, dict[str, Any]] = field(default_factory=dict)
     comments: dict[str, list[str]] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
 
@@ -66,39 +57,17 @@ class Draft:
         """The mapping file."""
         lines = [f"# Mapping of {_plain(self.source)}, proposed from its headings and values."]
         lines += ["# Check it, above all the lines marked CHECK, and import with --mapping.", ""]
-        time = {"column": self.time, "unit": self.time_unit, "segment": self.segment}
-        lines += self._table("time", time) + self._table("joints", self.joints)
-        for name in ("position", "velocity", "acceleration", "torque"):
-            if name in self.families:
-                lines += self._table(name, _keys(name, self.families[name]))
-        if self.wrench:
-            columns: dict = dict(zip(("force", "torque"), self.wrench, strict=False))
-            wrench = columns | {"stream": self.wrench_stream or None, "frame": self.wrench_frame}
-            lines += self._table("wrench", wrench)
-        for name, body in self.contacts.items():
-            lines += [*self._above(f"contact {name}"), f"[contact.{json.dumps(name)}]", *body, ""]
+        quantities = {name: family.table() for name, family in self.families.items()}
+        tables = {"time": self.time, "joints": self.joints, **quantities, **self.further}
+        for name, table in tables.items():
+            body = [f"{quoted(k)} = {_value(value)}" for k, value in table.items() if value is not None]
+            above = [f"# {_plain(sentence)}" for sentence in self.comments.get(name, [])]
+            lines += [*above, f"[{name}]", *body, ""] if body else []
         lines += [
             "[derivatives]",
             'method = "savitzky_golay"   # or "smoother", with error bars from a model',
         ]
         return "\n".join([*lines, "window = 11", "order = 3", "filter_torque = true", ""])
-
-    def _above(self, table: str) -> list[str]:
-        return [f"# {_plain(sentence)}" for sentence in self.comments.get(table, [])]
-
-    def _table(self, table: str, keys: Mapping[str, object]) -> list[str]:
-        body = [f"{_key(key)} = {_value(value)}" for key, value in keys.items() if value is not None]
-        return [*self._above(table), f"[{table}]", *body, ""] if body else []
-
-
-def _keys(name: str, family: Family) -> dict[str, object]:
-    """The table of a quantity."""
-    keys: dict[str, object] = {"columns": family.by_joint} if family.by_joint else {"column": family.pattern}
-    keys |= {"stream": family.stream or None, "unit": family.unit}
-    keys["sign"] = None if family.sign == 1.0 else family.sign
-    if name == "torque" and family.unit in ("A", "mA"):
-        keys |= {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
-    return keys
 
 
 def _plain(text: str) -> str:
@@ -106,11 +75,12 @@ def _plain(text: str) -> str:
     return "".join(c if c.isprintable() else " " for c in text)
 
 
-def _key(name: str) -> str:
+def quoted(name: str) -> str:
+    """A name as a key of TOML."""
     return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)
 
 
 def _value(value: object) -> str:
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
+        return "{ " + ", ".join(f"{quoted(k)} = {_value(v)}" for k, v in value.items()) + " }"
     return json.dumps(value)

@@ -18,25 +18,9 @@ from forcegp.logs import units
 from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
 from forcegp.logs.mapping import Mapping
 from forcegp.logs.readers import read
-from forcegp.logs.signals import Array, ImportReport, Signals, listed
+from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.logs.table import LogTable, Progress, Stream
-
-
-def joint_factors(mapping: Mapping, name: str, joints: Sequence[str]) -> tuple[Array, Array]:
-    """Factors s k to SI on the joint side, and offsets o in the unit of the column, `(nq,)` each.
-
-    Raises:
-        MappingError: a joint has no number.
-    """
-    section = mapping.quantity(name)
-    assert section is not None
-    scale = mapping.per_joint(name, "sign", joints) * units.QUANTITY[name][section.unit]
-    if section.side == "motor":
-        scale *= mapping.per_joint(name, "gear_ratio", joints) ** (1.0 if name == "torque" else -1.0)
-    if name == "torque" and mapping.sections.torque.torque_constant is not None:
-        scale *= mapping.per_joint(name, "torque_constant", joints)
-    return scale, mapping.per_joint(name, "offset", joints)
-
+from forcegp.rows import describe, numbered
 
 SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
 """Quantity of a mapping → name in a data set."""
@@ -50,12 +34,7 @@ def gather(
     progress: Progress | None = None,
     rows: int | None = None,
 ) -> Signals:
-    """Read the mapped columns of a log onto one clock, at most `rows` rows where the format allows it.
-
-    Raises:
-        DataError: the log cannot be read, or a value or a time stamp is not usable; names the rows.
-        MappingError: the mapping does not fit the robot.
-    """
+    """Read the mapped columns of a log onto one clock, at most `rows` rows where the format allows it."""
     needed = _needed(mapping, joints)
     table = read(path, wanted=needed.__contains__, rows=rows, progress=progress)
     report.format = table.format
@@ -83,10 +62,8 @@ class _Gathering:
         self, table: LogTable, mapping: Mapping, joints: tuple[str, ...], report: ImportReport
     ) -> None:
         self.table, self.mapping, self.joints, self.report = table, mapping, joints, report
-        self.time = mapping.sections.time
-        position = mapping.columns_of("position", joints)
-        section = mapping.sections.position
-        self.reference = table.stream_of(position[0], section.stream)
+        self.time, position = mapping.sections.time, mapping.columns_of("position", joints)
+        self.reference = table.stream_of(position[0], mapping.sections.position.stream)
 
     def run(self) -> Signals:
         """The quantities, those of the reference stream first."""
@@ -111,11 +88,20 @@ class _Gathering:
 
     def _vector(self, name: str) -> tuple[Stream, Array]:
         """A joint vector in SI units on the joint side."""
+
+        def numbers(key: str) -> Array:
+            return self.mapping.per_joint(name, key, self.joints)
+
         section = self.mapping.quantity(name)
         assert section is not None
         columns = self.mapping.columns_of(name, self.joints)
         stream = self.table.stream_of(columns[0], section.stream)
-        scale, offset = joint_factors(self.mapping, name, self.joints)
+        # s k, to SI on the joint side, and o in the unit of the column.
+        scale, offset = numbers("sign") * units.QUANTITY[name][section.unit], numbers("offset")
+        if section.side == "motor":
+            scale *= numbers("gear_ratio") ** (1.0 if name == "torque" else -1.0)
+        if name == "torque" and self.mapping.sections.torque.torque_constant is not None:
+            scale *= numbers("torque_constant")
         result = np.empty((len(stream), len(self.joints)))
         for i, column in enumerate(columns):
             np.subtract(self._take(stream, column), offset[i], out=result[:, i])
@@ -153,8 +139,8 @@ class _Gathering:
 
     def _stamps(self, stream: Stream) -> Array:
         """Time stamps of a stream [s]."""
-        holder = stream if self.time.column in stream.columns else None
-        if holder is None:
+        holder = stream
+        if self.time.column not in stream.columns:
             if len(self.table.streams) > 1 and stream is not self.reference:
                 raise DataError(
                     f"{self.table.source}: stream {stream.name!r} has no column {self.time.column!r}",
@@ -189,8 +175,7 @@ class _Gathering:
         rows = signals.row[bad]
         if self.time.missing == "error":
             raise DataError(
-                f"{self.table.source}: values are missing or not finite in "
-                f"row{'s' * (len(rows) > 1)} {listed(rows)}",
+                f"{self.table.source}: values are missing or not finite in {describe(numbered(rows))}",
                 expected="a number in every mapped column",
                 got=f"{len(rows)} incomplete rows of {len(signals)}",
                 hint='missing = "drop" under [time] drops them',
@@ -206,5 +191,5 @@ class _Gathering:
             span = f"{signals.t.min():.6g} to {signals.t.max():.6g} s" if len(signals) else "no complete row"
             raise DataError(f"{self.table.source}: no row between start and stop", expected=span)
         if not inside.all():
-            self.report.did(f"kept the {inside.sum()} rows from {start:g} to {stop:g} s")
+            self.report.steps.append(f"kept the {inside.sum()} rows from {start:g} to {stop:g} s")
             signals.keep(inside)

@@ -6,9 +6,9 @@ torque with the inverse dynamics of the scene's robot, gravity included. What is
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,10 @@ from forcegp.errors import DataError
 from forcegp.logs import units
 from forcegp.logs.clock import even_clock
 from forcegp.logs.contact import force_levels, level_and_spread, multiplier
-from forcegp.logs.draft import Draft
+from forcegp.logs.draft import Draft, quoted
 from forcegp.logs.gather import gather
 from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
-from forcegp.logs.mapping import ContactStateSection, Mapping, parse_mapping
+from forcegp.logs.mapping import ContactStateSection, parse_mapping
 from forcegp.logs.readers import read
 from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.logs.smoothing import add_derivatives
@@ -39,40 +39,20 @@ CLEARER = 1.5
 """A unit is certain if the torque fits so much better than in the other one."""
 NEAR = 1.3
 """A ratio is that of a unit if it is within this factor."""
+LEAST_FORCE = 1.0
+"""A contact that is always closed presses with more than this [N]."""
 
 
-@dataclass(frozen=True)
-class Guess:
-    """A proposed mapping.
-
-    Attributes:
-        toml: the file, with comments.
-        doubts: what the user must check, one sentence each.
-    """
-
-    toml: str
-    doubts: tuple[str, ...]
-
-    def mapping(self) -> Mapping:
-        """The proposal as a mapping."""
-        return parse_mapping(self.toml.encode(), "proposed mapping")
-
-
-def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Guess:
-    """Propose a mapping for a log.
-
-    Raises:
-        DataError: the log cannot be read.
-        MappingError: time, positions or torques are not recognised.
-    """
+def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
+    """Propose a mapping for a log; `MappingError` where time, positions or torques are not recognised."""
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
     stream = find_time(table, draft)
     find_families(stream, system.robot, draft)
     find_wrench(table, system.robot, draft)
     _try(path, draft, system, _possible_units(draft, stream))
-    propose_contacts(table, draft, system, lambda: _signals(path, draft, system))
-    return Guess(draft.toml(), tuple(draft.doubts))
+    propose_contacts(table, draft, system, cache(lambda: _signals(path, draft, system)))
+    return draft
 
 
 def _possible_units(draft: Draft, stream: Stream) -> list[str]:
@@ -109,8 +89,8 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
 def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
     """The log by the draft, `without` one quantity, with accelerations; incomplete rows left out."""
     families = {name: family for name, family in draft.families.items() if name != without}
-    toml = replace(draft, families=families, contacts={}).toml()
-    toml = toml.replace("[time]\n", '[time]\nmissing = "drop"\n', 1)
+    further = {name: table for name, table in draft.further.items() if not name.startswith("contact")}
+    toml = replace(draft, time=draft.time | {"missing": "drop"}, families=families, further=further).toml()
     mapping, report = parse_mapping(toml.encode(), "proposed mapping"), ImportReport(str(path))
     signals = gather(path, mapping, system.robot.joint_names, report, rows=ROWS)
     even_clock(signals, None, report)
@@ -205,29 +185,23 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
     return slopes, correlation
 
 
-LEAST_FORCE = 1.0
-"""A contact that is always closed presses with more than this [N]."""
-
-
 def propose_contacts(
-    table: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
+    log: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
 ) -> None:
     """Write into a draft how the state of each contact of the scene may be known; `signals` reads the log."""
-    trial: Signals | None = None
     for contact in system.contacts:
-        name = contact.name
-        named = (c for c in table.names if "contact" in c.lower() and (name in c or system.m == 1))
+        name, table = contact.name, f"contact.{quoted(contact.name)}"
+        named = (c for c in log.names if "contact" in c.lower() and (name in c or system.m == 1))
         column = next(named, None)
-        if column is not None and np.isin(table.stream_of(column).columns[column], (0.0, 1.0)).all():
-            draft.contacts[name] = ['source = "column"', f"column = {json.dumps(column)}"]
-        elif draft.wrench or not isinstance(contact, SurfaceContact):
-            draft.contacts[name] = ['source = "wrench"' if draft.wrench else 'source = "always"']
+        if column is not None and np.isin(log.stream_of(column).columns[column], (0.0, 1.0)).all():
+            draft.further[table] = {"source": "column", "column": column}
+        elif "wrench" in draft.further or not isinstance(contact, SurfaceContact):
+            draft.further[table] = {"source": "wrench" if "wrench" in draft.further else "always"}
         else:
-            trial = signals() if trial is None else trial
-            values = multiplier(trial, system, contact)
-            source, reason = _state(values, name)
-            draft.contacts[name] = [f'source = "{source}"   # or "multiplier", "distance", "always", "never"']
-            draft.say(f"contact {name}", f"no contact column; {reason}", doubt=True)
+            source, reason = _state(multiplier(signals(), system, contact), name)
+            draft.further[table] = {"source": source}
+            draft.say(table, f"no contact column; {reason}", doubt=True)
+            draft.say(table, "source may also be multiplier, distance, always or never")
 
 
 def _state(values: Array, name: str) -> tuple[str, str]:

@@ -74,11 +74,7 @@ def declared_unit(name: str, stream: Stream) -> str | None:
 
 
 def find_time(table: LogTable, draft: Draft) -> Stream:
-    """The stream with the columns of the joints, and its column of time.
-
-    Raises:
-        MappingError: no column increases like time.
-    """
+    """The stream with the columns of the joints; its column of time goes into the draft."""
     stream = max(table.streams, key=lambda s: (len(s.columns), len(s)))
     candidates = []
     for name, values in stream.columns.items():
@@ -95,26 +91,22 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
             expected="a column of time stamps",
             got=", ".join(stream.columns)[:300],
         )
-    _, draft.time, step = max(candidates)
-    unit = declared_unit(draft.time, stream)
+    _, column, step = max(candidates)
+    unit, doubt = declared_unit(column, stream), False
     if unit in units.TIME:
-        draft.time_unit = unit
-        draft.say("time", f"the unit {unit} is declared; steps are {step:.6g} {unit}")
+        text = f"the unit {unit} is declared; steps are {step:.6g} {unit}"
     else:
         # Robots are logged at 10 Hz to 10 kHz, so the step alone tells s, ms, µs and ns apart.
-        draft.time_unit = "s" if step <= 0.1 else "ms" if step <= 100.0 else "us" if step <= 1e5 else "ns"
-        doubt = draft.time_unit != "s"
-        draft.say("time", f"steps of {step:.6g} were taken for {draft.time_unit}", doubt)
-    draft.segment = next((name for name in _SEGMENTS if name in stream.columns), None)
+        unit = "s" if step <= 0.1 else "ms" if step <= 100.0 else "us" if step <= 1e5 else "ns"
+        text, doubt = f"steps of {step:.6g} were taken for {unit}", unit != "s"
+    draft.say("time", text, doubt)
+    segment = next((name for name in _SEGMENTS if name in stream.columns), None)
+    draft.time = {"column": column, "unit": unit, "segment": segment}
     return stream
 
 
 def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
-    """The columns of each quantity, and what the log calls each joint.
-
-    Raises:
-        MappingError: no family of columns is the position or the torque of the robot's joints.
-    """
+    """The columns of each quantity, and what the log calls each joint."""
     families = _families(stream, robot)
     if not any(re.search("[A-Za-z]", name) for name in stream.columns):
         find_by_values(stream, robot.joint_names, draft)
@@ -226,10 +218,13 @@ def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
                 if axis and stem in names:
                     columns.setdefault((part, axis), column)
         if all((0, axis) in columns for axis in "xyz"):
-            draft.wrench_stream = stream.name
-            parts = [0, 1] if all((1, axis) in columns for axis in "xyz") else [0]
-            draft.wrench = [[columns[part, axis] for axis in "xyz"] for part in parts]
-            draft.wrench_frame = robot.frame_names[-1]
+            draft.further["wrench"] = {
+                "force": [columns[0, axis] for axis in "xyz"],
+                "stream": stream.name or None,
+            }
+            if all((1, axis) in columns for axis in "xyz"):
+                draft.further["wrench"]["torque"] = [columns[1, axis] for axis in "xyz"]
+            draft.further["wrench"]["frame"] = robot.frame_names[-1]
             unknown = "the sensor's frame, its sign (acts_on) and the tool's weight are not in the log"
             draft.say("wrench", unknown, doubt=True)
             return
@@ -240,17 +235,16 @@ RELATED = 0.95
 
 
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
-    """Propose families of a log whose columns have numbers for names.
+    """Propose families of a log whose columns have numbers for names, in blocks of one per joint.
 
-    The columns beside time come in blocks of one per joint, from base to tip. Positions and velocities are
-    two blocks of which one is the rate of change of the other; the block that is left is the torque.
+    Positions and velocities are blocks of which one is the rate of the other; the one left is the torque.
     """
     nq = len(joints)
-    names = [name for name in stream.columns if name != draft.time]
+    names = [name for name in stream.columns if name != draft.time["column"]]
     blocks = [names[k : k + nq] for k in range(0, len(names) - nq + 1, nq)]
     if len(names) % nq or not 2 <= len(blocks) <= 4:
         return
-    t = stream.columns[draft.time]
+    t = stream.columns[draft.time["column"]]
     values = [np.stack([stream.columns[name] for name in block], axis=1) for block in blocks]
     every = range(len(blocks))
     pairs = [(k, other) for k, other in permutations(every, 2) if _is_rate(t, values[k], values[other])]

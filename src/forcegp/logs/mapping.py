@@ -1,13 +1,11 @@
 """Mapping files: which column of a log is which quantity of which joint, in TOML (docs/import.md).
 
-Joints are matched by name. `[joints]` says what the log calls each joint of the robot, and a column such as
-`"q_{joint}"` is filled in with that name. A data set, and ROS joint states with the robot's names, need no
-file.
+`[joints]` says what the log calls each joint of the robot, and a column such as `"q_{joint}"` is filled in
+with that name. A data set, and ROS joint states with the robot's names, need no file.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -22,7 +20,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data.checks import lock_hint
 from forcegp.errors import MappingError, did_you_mean
 from forcegp.logs import units
-from forcegp.logs.draft import Draft, Family
+from forcegp.logs.draft import Draft, Family, quoted
 from forcegp.logs.readers import read
 from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
@@ -123,64 +121,37 @@ BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "
 
 @dataclass(frozen=True)
 class Mapping:
-    """A mapping file that has been read and checked.
-
-    Attributes:
-        sections: the tables.
-        document: the file, for messages.
-    """
+    """A mapping file that has been read and checked: its tables, and the document for messages."""
 
     sections: MappingSections
     document: Document
-
-    @property
-    def source(self) -> str:
-        """Name of the file."""
-        return self.document.source
 
     def quantity(self, name: str) -> QuantitySection | None:
         """The table of a joint vector: `position`, `velocity`, `acceleration` or `torque`."""
         return getattr(self.sections, name)
 
     def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
-        """The log's column of a quantity for each joint of the robot.
-
-        Args:
-            name: the quantity.
-            joints: the robot's joints.
-
-        Raises:
-            MappingError: a joint has no column, or a name is not a joint of the robot.
-        """
+        """The log's column of a quantity for each joint of the robot."""
         section = self.quantity(name)
         assert section is not None
         self._check_joints(("joints",), self.sections.joints, joints)
         self._check_joints((name, "columns"), section.columns, joints)
-        columns = []
-        for joint in joints:
-            if joint in section.columns:
-                columns.append(section.columns[joint])
-            elif section.column is not None and (joint in self.sections.joints or not self.sections.joints):
-                columns.append(section.column.replace("{joint}", self.sections.joints.get(joint, joint)))
-            else:
-                missing = [j for j in joints if j not in section.columns and j not in self.sections.joints]
-                raise self.error(
-                    (name,),
-                    f"joint {joint!r} has no column",
-                    expected=f"{joint} = under columns",
-                    hint=lock_hint(missing),
-                )
+        called = self.sections.joints or dict(zip(joints, joints, strict=True))
+        pattern = section.column
+        named = {} if pattern is None else {j: pattern.replace("{joint}", n) for j, n in called.items()}
+        named |= section.columns
+        lacking = [joint for joint in joints if joint not in named]
+        if lacking:
+            text, expected = f"joint {lacking[0]!r} has no column", f"{lacking[0]} = under columns"
+            raise self.error((name,), text, expected=expected, hint=lock_hint(lacking))
+        columns = [named[joint] for joint in joints]
         if len(set(columns)) < len(columns):
             twice = next(c for c in columns if columns.count(c) > 1)
             raise self.error((name,), f"column {twice!r} is given for two joints", expected="'{joint}' in it")
         return columns
 
     def per_joint(self, name: str, key: str, joints: Sequence[str]) -> NDArray[np.float64]:
-        """The numbers `(nq,)` of a key that holds one for all joints or one for each.
-
-        Raises:
-            MappingError: a joint is missing or unknown.
-        """
+        """The numbers `(nq,)` of a key that holds one for all joints or one for each."""
         value: PerJoint = getattr(self.quantity(name), key)
         if not isinstance(value, dict):
             return np.full(len(joints), float(value))
@@ -297,22 +268,21 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
 
 
 def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
-    """The mapping of a log whose names leave no doubt.
-
-    Raises:
-        MappingError: they do; the hint says how to write a mapping.
-    """
+    """The mapping of a log whose names leave no doubt; otherwise `MappingError`, with a hint."""
     table, robot = read(path, rows=1), system.robot
     names, joints = set(table.names), robot.joint_names
     symbols = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
     logged = {n: s for n, s in symbols.items() if names >= {f"{s}.{joint}" for joint in joints}}
     if {"position", "torque"} <= set(logged) and "t" in names:
-        draft = Draft(str(path), "t", segment="segment" if "segment" in names else None)
+        draft = Draft(str(path), {"column": "t", "segment": "segment" if "segment" in names else None})
         for name, symbol in logged.items():
             draft.families[name] = Family(f"{symbol}.{{joint}}", {}, unit=units.SI[name])
-        for name in {f"contact.{contact}" for contact in system.contact_names} & names:
-            column = f"column = {json.dumps(name)}"
-            draft.contacts[name.removeprefix("contact.")] = ['source = "column"', column]
+        for contact in system.contact_names:
+            if f"contact.{contact}" in names:
+                draft.further[f"contact.{quoted(contact)}"] = {
+                    "source": "column",
+                    "column": f"contact.{contact}",
+                }
         return parse_mapping(draft.toml().encode(), "columns named as in a data set")
     if "header" in names and names >= {f"{n}.{joint}" for n in ("position", "effort") for joint in joints}:
         return load_mapping("ros_joint_states")

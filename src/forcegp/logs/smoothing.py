@@ -22,12 +22,11 @@ from scipy.optimize import minimize_scalar
 from forcegp.data.derivative import SavitzkyGolay, differentiate
 from forcegp.errors import DataError
 from forcegp.logs.mapping import DerivativesSection
-from forcegp.logs.signals import Array, ImportReport, Signals, runs
+from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.rows import runs
 
-STATES = 4
-"""Size of the state: position to jerk."""
-SHORTEST = 8
-"""Rows that a piece needs: twice the size of the state."""
+STATES, SHORTEST = 4, 8
+"""Size of the state, position to jerk, and rows that a piece needs."""
 LEARNED_ROWS = 2000
 """Rows from which ρ is learned: the longest pieces, up to so many."""
 LOG_RHO = (-30.0, 8.0)
@@ -44,32 +43,24 @@ W = np.outer(TAYLOR, TAYLOR) / (7.0 - np.add.outer(np.arange(STATES), np.arange(
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Estimates of one joint, `(n,)` each.
+    """Estimates of one joint, `(n,)` each, the standard deviation of q̈ and σ of the measured position.
 
-    Attributes:
-        position, velocity, acceleration: means.
-        velocity_std, acceleration_std: posterior standard deviations.
-        also: another column through the same filter, as if it were a position.
-        noise_std: σ, of the measured position.
+    `also` is another column through the same filter, as if it were a position.
     """
 
     position: Array
     velocity: Array
     acceleration: Array
-    velocity_std: Array
     acceleration_std: Array
     also: Array | None
     noise_std: float
 
 
 def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = None) -> Smoothed:
-    """Smooth the positions of one joint, piece by piece, with one ρ and σ for all pieces.
+    """Smooth the positions q of one joint, piece by piece, with one ρ and σ for all pieces.
 
-    Args:
-        t: `(n,)` time [s], evenly spaced within each piece.
-        q: `(n,)` measured positions.
-        piece: `(n,)` number of the piece of each row; at least `SHORTEST` rows each.
-        also: `(n,)` another quantity, to be passed through the same filter.
+    All are `(n,)`: evenly spaced time within each piece [s], the number of each row's piece, of at least
+    `SHORTEST` rows, and `also`, another quantity to be passed through the same filter.
 
     >>> t = np.arange(400) * 0.01
     >>> noise = 1e-3 * np.random.default_rng(0).standard_normal(400)
@@ -80,7 +71,7 @@ def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = No
     stretches = runs(piece)
     rho, sigma = learn(q, stretches)
     n = len(q)
-    mean, variance = np.empty((n, STATES)), np.empty((n, STATES))
+    mean, variance = np.empty((n, STATES)), np.empty(n)
     second = None if also is None else np.empty(n)
     gains_of = cache(lambda count: _gains(count, rho))
     for rows in stretches:
@@ -88,11 +79,10 @@ def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = No
         gain, back, covariance = gains_of(count)
         scale = ((t[rows.stop - 1] - t[rows.start]) / (count - 1)) ** -np.arange(float(STATES))
         mean[rows] = _run(q[rows], gain, back) * scale
-        variance[rows] = np.diagonal(covariance, axis1=1, axis2=2) * (sigma * scale) ** 2
+        variance[rows] = covariance[:, 2, 2] * (sigma * scale[2]) ** 2
         if also is not None and second is not None:
             second[rows] = _run(also[rows], gain, back)[:, 0]
-    std = np.sqrt(variance)
-    return Smoothed(mean[:, 0], mean[:, 1], mean[:, 2], std[:, 1], std[:, 2], second, sigma)
+    return Smoothed(mean[:, 0], mean[:, 1], mean[:, 2], np.sqrt(variance), second, sigma)
 
 
 def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
@@ -175,16 +165,10 @@ def _run(y: Array, gain: Array, back: Array) -> Array:
 def add_derivatives(signals: Signals, settings: DerivativesSection, report: ImportReport) -> Array | None:
     """Compute `qd` and `qdd` where the log has none, and pass the torque through the same filter.
 
-    Args:
-        signals: the log, on an even clock; contact switches cut it into pieces.
-        settings: method, and what to differentiate.
-        report: gets the steps, and pieces that are too short.
+    The clock is even; contact switches cut the log into pieces, and pieces that are too short are dropped.
 
     Returns:
         `(n, nq)` standard deviation of the computed q̈, or `None` where q̈ is logged.
-
-    Raises:
-        DataError: no piece is long enough.
     """
     logged = [name for name in ("qd", "qdd") if name in signals.vectors]
     if len(logged) == 2:
@@ -195,9 +179,11 @@ def add_derivatives(signals: Signals, settings: DerivativesSection, report: Impo
     how = "a Kalman (RTS) smoother with white snap"
     if golay:
         how = f"a Savitzky-Golay filter of window {settings.window} and order {settings.order}"
-    report.did(f"computed {' and '.join(name for name in ('qd', 'qdd') if name not in logged)} by {how}")
+    report.steps.append(
+        f"computed {' and '.join(name for name in ('qd', 'qdd') if name not in logged)} by {how}"
+    )
     if "qdd" not in logged and settings.filter_torque:
-        report.did("passed the torque through the same filter")
+        report.steps.append("passed the torque through the same filter")
     return std
 
 
@@ -257,12 +243,7 @@ def _smooth(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSec
 
 
 def impact_mask(signals: Signals, margin: float) -> dict[str, NDArray[np.bool_]]:
-    """Rows near a switch of each contact, where accelerations are those of an impact or one-sided fits.
-
-    Args:
-        signals: the log.
-        margin: time on either side of a switch [s].
-    """
+    """Rows within `margin` [s] of a switch of each contact: accelerations of an impact, or one-sided fits."""
     masks = {}
     for name, closed in signals.contact.items():
         mask = np.zeros(len(signals), dtype=bool)

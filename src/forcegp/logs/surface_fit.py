@@ -16,25 +16,25 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, Plane, Sphere, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
+from forcegp.forces.calibration import autocorrelation_time
 from forcegp.logs.signals import Array
 from forcegp.robust import robust_std
 
-LEAST_POINTS = 20
-"""Points that a fit needs."""
-ROUNDING = 1e-9
-"""Smallest scale of the residuals, in their unit, so that an exact fit has one."""
+LEAST_POINTS, ROUNDING = 20, 1e-9
+"""Points that a fit needs, and the smallest scale of their residuals, so that an exact fit has one."""
 OUTLIER_STD = 4.0
 """Rows with residuals beyond so many deviations are outliers."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters, their covariance, residuals of the rows used, and how many of these are independent."""
+    """Parameters, covariance, residuals of the rows used, how many of these are independent, and outliers."""
 
     x: Array
     covariance: Array
     residuals: Array
     effective: float
+    outliers: int
 
 
 def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> Solution:
@@ -48,27 +48,13 @@ def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> So
     inside = np.abs(first - np.median(first)) <= OUTLIER_STD * max(float(robust_std(first)), ROUNDING)
     final = least_squares(lambda x: residual(x)[inside], robust, x_scale="jac")
     residuals = residual(final.x)[inside]
-    effective = len(residuals) / correlation_time(residuals)
+    centered = torch.from_numpy(residuals - residuals.mean())[:, None]
+    time = float(autocorrelation_time(centered, torch.zeros(len(residuals), dtype=torch.int64)))
+    effective = max(len(residuals) / time, min(LEAST_POINTS, len(residuals)))
     information = final.jac.T @ final.jac * (effective / len(residuals))
     scale = max(float(residuals.std()), ROUNDING)
-    return Solution(final.x, scale**2 * np.linalg.pinv(information, hermitian=True), residuals, effective)
-
-
-def correlation_time(values: Array) -> float:
-    """1 + 2 Σ ρ_k up to the first negative ρ_k: the rows that count as one independent row (Sokal 1997).
-
-    >>> 0.8 < correlation_time(np.random.default_rng(0).standard_normal(4000)) < 1.2
-    True
-    """
-    x = values - values.mean()
-    n = len(x)
-    power = np.abs(np.fft.rfft(x, 2 * n)) ** 2
-    autocorrelation = np.fft.irfft(power)[:n]
-    if not autocorrelation[0] > 0.0:
-        return 1.0
-    rho = autocorrelation / autocorrelation[0]
-    first = int(np.argmax(rho < 0.0)) if (rho < 0.0).any() else n
-    return float(min(max(1.0 + 2.0 * rho[1:first].sum(), 1.0), n / LEAST_POINTS if n > LEAST_POINTS else n))
+    covariance = scale**2 * np.linalg.pinv(information, hermitian=True)
+    return Solution(final.x, covariance, residuals, effective, int((~inside).sum()))
 
 
 LEAST_RADIUS_STD = 4.0
@@ -77,17 +63,15 @@ LEAST_RADIUS_STD = 4.0
 
 @dataclass(frozen=True)
 class Tip:
-    """A rounded tip: a ball that ends at the path's points, or has its centre there.
+    """A ball of radius r [m], to be fitted if `None`, that ends at the path's points or has its centre there.
 
-    Attributes:
-        axes: `(n, 3)` unit vectors from the ball's centre to the path's points; zero where these are centres.
-        radius: r of the ball; `None` to fit it [m].
+    `axes` are unit vectors `(n, 3)` from its centre to the path's points; zero where these are centres.
     """
 
     axes: Array
     radius: float | None
 
-    def start(self, x: list[float]) -> Array:
+    def start(self, *x: float) -> Array:
         """Initial parameters, with those of a surface first."""
         return np.array([*x, 0.0] if self.radius is None else x)
 
@@ -96,11 +80,7 @@ class Tip:
         return float(x[-1]) if self.radius is None else self.radius
 
     def std(self, solution: Solution) -> dict[str, float]:
-        """Error bar of a fitted radius.
-
-        Raises:
-            DataError: the orientation of the tip does not show it.
-        """
+        """Error bar of a fitted radius; `DataError` where the tip's orientation does not show it."""
         if self.radius is not None:
             return {}
         radius, std = self.of(solution.x), float(np.sqrt(solution.covariance[-1, -1]))
@@ -117,11 +97,7 @@ class Tip:
 def tip_of(
     system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor, radius: float | Literal["fit"] | None
 ) -> Tip:
-    """The tip that touched at positions `(n, nq)`: that of the scene, or a ball that ends at its point.
-
-    Raises:
-        DataError: the scene's tip has a radius of its own, or the point is the origin of its frame.
-    """
+    """The tip that touched at positions `(n, nq)`: that of the scene, or a ball that ends at its point."""
     if radius is None:
         return Tip(np.zeros((len(q), 3)), contact.radius)
     point = torch.tensor(tuple(contact.point), dtype=q.dtype)
@@ -138,34 +114,25 @@ def tip_of(
 
 MOST_POINTS = 20_000
 """Points that are fitted; of a longer path, every k-th."""
-LEAST_WIDTH = 10.0
-"""Least width of a path that determines a plane, in deviations of its residuals."""
-LARGEST_TILT = 0.2
-"""Standard deviation of the tilt [rad] beyond which the path does not determine a plane."""
+LEAST_WIDTH, LARGEST_TILT = 10.0, 0.2
+"""Least width of a path in deviations of its residuals, and largest deviation of a tilt [rad], of a plane."""
 
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """A fitted surface.
+    """A fitted surface of a contact.
 
     Attributes:
-        contact: name of the contact.
-        surface: the plane or sphere.
         std: standard deviations: `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane;
             `center` [m] (the largest of its three) and `radius` [m] of a sphere; `tip_radius` [m] if fitted.
-        residual: deviation of the path from the surface [m].
-        points, outliers: rows that were fitted, and rows too far off to be on the surface.
-        effective_points: how many independent rows the fitted ones are worth.
+        solution: the least squares that it comes from.
         tip_radius: of the tip that touched [m].
     """
 
     contact: str
     surface: Plane | Sphere
     std: dict[str, float]
-    residual: float
-    points: int
-    outliers: int
-    effective_points: float
+    solution: Solution
     tip_radius: float = 0.0
 
     def toml(self) -> str:
@@ -245,7 +212,7 @@ def _plane(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
         n = normal(x)
         return centered @ n - tip.of(x) * (tip.axes @ n + 1.0) - x[2]
 
-    solution = robust_least_squares(residual, tip.start([0.0, 0.0, 0.0]))
+    solution = robust_least_squares(residual, tip.start(0.0, 0.0, 0.0))
     x, cov, across = solution.x, solution.covariance, float((centered @ v).std())
     tilt = float(np.sqrt(max(cov[0, 0], cov[1, 1])))
     if not (tilt < LARGEST_TILT and across > LEAST_WIDTH * solution.residuals.std()):
@@ -258,7 +225,7 @@ def _plane(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
     n = normal(x)
     plane = Plane(tuple(float(c) for c in n), float(n @ middle + x[2]))
     std = {"offset": float(np.sqrt(cov[2, 2])), "tilt": tilt} | tip.std(solution)
-    return _result(contact, plane, std, solution, len(points), tip.of(x))
+    return SurfaceFit(contact, plane, std, solution, tip.of(x))
 
 
 def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
@@ -277,7 +244,7 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit
         r = tip.of(x)
         return np.linalg.norm(centered - r * tip.axes - x[:3], axis=1) - r - x[3]
 
-    solution = robust_least_squares(residual, tip.start([*start[:3], np.sqrt(squared)]))
+    solution = robust_least_squares(residual, tip.start(*start[:3], np.sqrt(squared)))
     x, cov = solution.x, solution.covariance
     center, radius = x[:3] + middle, float(x[3])
     std = {"center": float(np.sqrt(np.diag(cov)[:3].max())), "radius": float(np.sqrt(cov[3, 3]))}
@@ -289,11 +256,4 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit
             hint="fit a plane, or slide over a larger part of the sphere",
         )
     sphere = Sphere(tuple(float(c) for c in center), radius)
-    return _result(contact, sphere, std, solution, len(points), tip.of(x))
-
-
-def _result(
-    contact: str, surface: Plane | Sphere, std: dict[str, float], solution: Solution, points: int, tip: float
-) -> SurfaceFit:
-    used, residual = len(solution.residuals), float(solution.residuals.std())
-    return SurfaceFit(contact, surface, std, residual, used, points - used, solution.effective, tip)
+    return SurfaceFit(contact, sphere, std, solution, tip.of(x))

@@ -1,8 +1,5 @@
-"""What every reader returns: named columns of numbers, grouped by the clock that they share.
-
-What a foreign log claims is checked before the work is done; the bounds are in `forcegp.limits`. A small
-compressed file can claim to hold more than memory does.
-"""
+"""What every reader returns, named columns of numbers by the clock that they share, and guards of their size:
+a small compressed file can claim to hold more than memory does. The bounds are in `forcegp.limits`."""
 
 from __future__ import annotations
 
@@ -16,9 +13,6 @@ from numpy.typing import NDArray
 from forcegp import limits
 from forcegp.errors import DataError, ForceGPError, did_you_mean
 from forcegp.resources import announce_memory
-
-COPIES = 2
-"""A table is in memory as it is in the file, and as float64."""
 
 
 def check_count(source: str, what: str, count: int, most: int) -> None:
@@ -51,7 +45,7 @@ def check_values(source: str, rows: int, columns: int) -> None:
     """Raise `DataError` where a table is wider or larger than what is read; announce a large one."""
     check_count(source, "columns", columns, limits.COLUMNS)
     check_count(source, f"numbers ({rows:,} rows × {columns} columns)", rows * columns, limits.LOG_VALUES)
-    announce_memory(COPIES * 8 * rows * columns, f"reading {source}")
+    announce_memory(2 * 8 * rows * columns, f"reading {source}")  # as in the file, and as float64
 
 
 Column = NDArray[np.float64]
@@ -92,11 +86,7 @@ class LogTable:
         return [name for stream in self.streams for name in stream.columns]
 
     def stream_of(self, column: str, stream: str | None = None) -> Stream:
-        """The stream that holds a column.
-
-        Raises:
-            DataError: no such stream or column, or several streams hold it and none is named.
-        """
+        """The stream that holds a column; `DataError` where none does, or several and none is named."""
         among = [s for s in self.streams if stream is None or s.name == stream]
         if not among:
             raise missing(self.source, "stream", stream or "", [s.name for s in self.streams])
@@ -140,10 +130,9 @@ def foreign(source: str, kind: str) -> Iterator[None]:
         yield
     except ForceGPError:
         raise
-    except FileNotFoundError as cause:
-        raise DataError(f"{source}: no such file", got=str(cause)) from cause
-    except PermissionError as cause:
-        raise DataError(f"{source}: the file may not be read", got=str(cause)) from cause
+    except (FileNotFoundError, PermissionError) as cause:
+        what = "no such file" if isinstance(cause, FileNotFoundError) else "the file may not be read"
+        raise DataError(f"{source}: {what}", got=str(cause)) from cause
     except (Exception, RecursionError, MemoryError) as cause:
         lines = str(cause).splitlines()
         raise DataError(
@@ -159,12 +148,8 @@ def arrays_to_streams(
     """Streams of the arrays of a file, one for each number of rows.
 
     A matrix `(n, d)` becomes the columns `name[0]` to `name[d-1]`. Rows run along the axis whose length
-    most arrays share; `(d, n)` is transposed. Arrays of another length are streams of their own.
-
-    Args:
-        source: name of the file, for messages.
-        arrays: numeric arrays of one or two dimensions.
-        remarks: gets a sentence for each array that was transposed or left out.
+    most arrays share; `(d, n)` is transposed. Arrays of another length are streams of their own. `remarks`
+    gets a sentence for each array that was transposed or left out.
     """
     usable = {}
     for name, array in arrays.items():

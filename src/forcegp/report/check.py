@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 from forcegp import dynamics
 from forcegp.checks import KINDS, Finding, Log, Report
 from forcegp.checks.contact import tip_path
-from forcegp.checks.log import Array, describe, of_robot
+from forcegp.checks.log import Array, of_robot
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.files import write_text
 from forcegp.report.html import render
 from forcegp.report.style import INK, OTHER, Picture, draw
+from forcegp.rows import describe
 
 COLOURS = {"error": "#a1121f", "warning": "#d08c00", "note": "#0072b2"}
 POINTS = 1500

@@ -72,11 +72,7 @@ def read(
 
 
 def format_of(path: Path) -> str:
-    """The key in `FORMATS` of a log.
-
-    Raises:
-        DataError: no such file, or a format that is not read or not safe to read.
-    """
+    """The key in `FORMATS` of a log."""
     if path.is_dir():
         return _format_of_folder(path)
     if not path.is_file():
@@ -85,7 +81,9 @@ def format_of(path: Path) -> str:
     suffix = path.suffix.lower()
     with path.open("rb") as file:
         head = file.read(32)
-    _refuse_pickles(path, suffix, head)
+    protocol = len(head) > 2 and head[0] == 0x80 and 2 <= head[1] <= 5
+    if suffix in _REFUSED or (protocol and suffix not in _TEXT):
+        raise _unsafe(path, f"a file ending in {suffix}" if suffix in _REFUSED else "a pickle")
     for magic, kind in _MAGIC:
         if head.startswith(magic):
             return "matlab" if kind == "hdf5" and suffix == ".mat" else kind
@@ -123,12 +121,6 @@ def _format_of_zip(path: Path) -> str:
     if names and all(name.endswith(".npy") for name in names):
         return "numpy"
     raise _unknown(path, "a zip archive")
-
-
-def _refuse_pickles(path: Path, suffix: str, head: bytes) -> None:
-    protocol = len(head) > 2 and head[0] == 0x80 and 2 <= head[1] <= 5
-    if suffix in _REFUSED or (protocol and suffix not in _TEXT):
-        raise _unsafe(path, f"a file ending in {suffix}" if suffix in _REFUSED else "a pickle")
 
 
 def _unsafe(path: Path, what: str) -> DataError:

@@ -17,16 +17,9 @@ from numpy.typing import NDArray
 
 from forcegp import limits
 from forcegp.errors import DataError, optional_module
+from forcegp.logs import table
 from forcegp.logs.readers.matlab5 import Variable, variables
-from forcegp.logs.table import (
-    LogTable,
-    Progress,
-    Wanted,
-    arrays_to_streams,
-    check_count,
-    check_expansion,
-    foreign,
-)
+from forcegp.logs.table import LogTable, Progress, Wanted
 
 Arrays = dict[str, NDArray[np.generic]]
 MAX_ARRAYS = 4096
@@ -34,22 +27,18 @@ MAX_ARRAYS = 4096
 
 
 def read_numpy(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the numeric arrays of an `.npz` archive, or the array of an `.npy` file.
-
-    Raises:
-        DataError: an array holds Python objects, the file is damaged, or it is too large.
-    """
+    """Read the numeric arrays of an `.npz` archive, or the array of an `.npy` file."""
     del wanted, rows, progress
     arrays: Arrays = {}
     remarks: list[str] = []
-    with foreign(str(path), "a NumPy file"):
+    with table.foreign(str(path), "a NumPy file"):
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 members = archive.infolist()
-                check_count(str(path), "arrays", len(members), MAX_ARRAYS)
+                table.check_count(str(path), "arrays", len(members), MAX_ARRAYS)
                 size = sum(member.file_size for member in members)
-                check_count(str(path), "bytes", size, 8 * limits.LOG_VALUES)
-                check_expansion(str(path), size, path.stat().st_size)
+                table.check_count(str(path), "bytes", size, 8 * limits.LOG_VALUES)
+                table.check_expansion(str(path), size, path.stat().st_size)
                 for member in members:
                     with archive.open(member) as file:
                         name = member.filename.removesuffix(".npy")
@@ -57,7 +46,7 @@ def read_numpy(path: Path, *, wanted: Wanted, rows: int | None, progress: Progre
         else:
             with path.open("rb") as file:
                 arrays = _array(str(path), "", file, path.stat().st_size)
-    streams = arrays_to_streams(str(path), arrays, remarks)
+    streams = table.arrays_to_streams(str(path), arrays, remarks)
     return LogTable(str(path), "numpy", streams, tuple(remarks))
 
 
@@ -76,7 +65,7 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
             hint="save each quantity as an array of its own",
         )
     count = int(np.prod(shape, dtype=object)) if shape else 1
-    check_count(source, "numbers", count, limits.LOG_VALUES)
+    table.check_count(source, "numbers", count, limits.LOG_VALUES)
     if count * dtype.itemsize > size:
         raise DataError(f"{source}: the array claims to be larger than its file", got=f"{shape} of {dtype}")
     data = file.read(count * dtype.itemsize)
@@ -87,22 +76,17 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
 
 
 def read_hdf5(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the numeric data sets of an HDF5 file; one in a group is `group/name`.
-
-    Raises:
-        DataError: the file is damaged or too large.
-        MissingDependencyError: `h5py` is not installed.
-    """
+    """Read the numeric data sets of an HDF5 file; one in a group is `group/name`."""
     del wanted, rows, progress
     remarks: list[str] = []
-    streams = arrays_to_streams(str(path), _hdf5_arrays(path, "/", remarks), remarks)
+    streams = table.arrays_to_streams(str(path), _hdf5_arrays(path, "/", remarks), remarks)
     return LogTable(str(path), "hdf5", streams, tuple(remarks))
 
 
 def _hdf5_arrays(path: Path, separator: str, remarks: list[str]) -> Arrays:
     h5py = optional_module("h5py", "Reading HDF5 files", "import")
     arrays: Arrays = {}
-    with foreign(str(path), "HDF5"), h5py.File(path, "r") as file:
+    with table.foreign(str(path), "HDF5"), h5py.File(path, "r") as file:
         _walk(h5py, file, "", separator, arrays, remarks, {h5py.h5o.get_info(file.id).addr})
     return arrays
 
@@ -125,7 +109,7 @@ def _walk(
         if mark in seen:
             continue
         seen.add(mark)
-        check_count(group.file.filename, "objects", len(seen), limits.COLUMNS)
+        table.check_count(group.file.filename, "objects", len(seen), limits.COLUMNS)
         if isinstance(item, h5py.Group):
             _walk(h5py, item, f"{name}{separator}", separator, arrays, remarks, seen)
         elif isinstance(item, h5py.Dataset):
@@ -140,8 +124,8 @@ def _take(item: Any, name: str, arrays: Arrays, remarks: list[str]) -> None:
         remarks.append(f"{name!r} lies outside the file and was left out")
     else:
         source, taken = item.file.filename, sum(array.size for array in arrays.values()) + item.size
-        check_count(source, "numbers", taken, limits.LOG_VALUES)
-        check_expansion(source, 8 * taken, Path(source).stat().st_size)
+        table.check_count(source, "numbers", taken, limits.LOG_VALUES)
+        table.check_expansion(source, 8 * taken, Path(source).stat().st_size)
         arrays[name] = item[()]
 
 
@@ -153,10 +137,6 @@ def read_matlab(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
     """Read the numeric arrays of a MATLAB file; fields of a struct are `struct.field`.
 
     Cells, objects, sparse matrices and function handles are left out with a remark.
-
-    Raises:
-        DataError: the file is damaged or too large.
-        MissingDependencyError: a file of version 7.3, and `h5py` is not installed.
     """
     del wanted, rows, progress
     with path.open("rb") as file:
@@ -166,11 +146,11 @@ def read_matlab(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
     if HDF5_MAGIC in (head[:8], head[512:520]):  # version 7.3: names as in MATLAB, and axes in its order
         arrays = {name: array.T for name, array in _hdf5_arrays(path, ".", remarks).items()}
     else:
-        with foreign(str(path), "a MATLAB file"):
+        with table.foreign(str(path), "a MATLAB file"):
             for variable in _version4(path) if 0 in head[:4] else variables(path.read_bytes(), str(path)):
                 _collect(variable, arrays, remarks)
-    check_count(str(path), "arrays", len(arrays), limits.COLUMNS)
-    return LogTable(str(path), "matlab", arrays_to_streams(str(path), arrays, remarks), tuple(remarks))
+    table.check_count(str(path), "arrays", len(arrays), limits.COLUMNS)
+    return LogTable(str(path), "matlab", table.arrays_to_streams(str(path), arrays, remarks), tuple(remarks))
 
 
 def _version4(path: Path) -> Iterator[Variable]:
@@ -178,9 +158,9 @@ def _version4(path: Path) -> Iterator[Variable]:
     from scipy.io import loadmat, whosmat
 
     listing = whosmat(path)
-    check_count(str(path), "arrays", len(listing), limits.COLUMNS)
+    table.check_count(str(path), "arrays", len(listing), limits.COLUMNS)
     claimed = sum(math.prod(shape) for _, shape, _ in listing)
-    check_count(str(path), "numbers", claimed, min(limits.LOG_VALUES, path.stat().st_size))
+    table.check_count(str(path), "numbers", claimed, min(limits.LOG_VALUES, path.stat().st_size))
     for name, value in loadmat(path).items():
         if not name.startswith("__"):
             yield Variable(name, value if isinstance(value, np.ndarray) else "is sparse")

@@ -26,11 +26,8 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 KINDS = (JOINT_STATE, WRENCH)
 """Message types that are read."""
-QUANTITIES = {"position": "rad", "velocity": "rad/s", "effort": "Nm"}
-"""Quantities of a joint state, with their units by REP 103."""
-WRENCH_COLUMNS = {
-    f"{part}.{axis}": unit for part, unit in (("force", "N"), ("torque", "Nm")) for axis in "xyz"
-}
+UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
+"""Units of the quantities of a joint state, by REP 103, and of a wrench."""
 CLOCKS = ("header", "receive")
 """Columns of time that every topic has."""
 
@@ -48,31 +45,20 @@ def canonical(kind: str) -> str:
 
 
 def decoder(kind: str, encoding: str) -> Decode:
-    """Decodes messages of a type in `KINDS`, in the encoding `ros1` or `cdr`.
-
-    Raises:
-        MissingDependencyError: `rosbags` is not installed.
-    """
+    """Decodes messages of a type in `KINDS`, in the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
-    stores = typesys.Stores
-    store = typesys.get_typestore(stores.ROS1_NOETIC if encoding == "ros1" else stores.ROS2_HUMBLE)
-    deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
+    first = encoding == "ros1"
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
+    deserialize = store.deserialize_ros1 if first else store.deserialize_cdr
     return lambda raw: deserialize(raw, kind)
 
 
 @dataclass
 class Messages:
-    """Messages of one topic about one set of joints, in the order of the first message.
-
-    Attributes:
-        names: the joints; none for a wrench.
-        rows: the numbers of each message.
-        stamps: stamp of the header and time of recording [ns].
-    """
+    """Messages of one topic with the same columns, their stamps and the times of recording [ns]."""
 
     topic: str
-    kind: str
-    names: tuple[str, ...]
+    columns: tuple[str, ...]
     rows: list[list[float]] = field(default_factory=list)
     stamps: list[tuple[int, int]] = field(default_factory=list)
 
@@ -80,43 +66,29 @@ class Messages:
         """The columns that are wanted and hold numbers, with times from `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
         columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps.T), strict=True))
-        units: dict[str, str] = dict.fromkeys(CLOCKS, "s")
-        parts = {f"{quantity}.{n}": unit for quantity, unit in QUANTITIES.items() for n in self.names}
         values = np.ascontiguousarray(np.array(self.rows, dtype=np.float64).T)
-        for (part, unit), column in zip((parts or WRENCH_COLUMNS).items(), values, strict=True):
-            if not np.isnan(column).all() and wanted(part):
-                columns[part], units[part] = column, unit
-        return Stream(name, columns, units)
+        for column, numbers in zip(self.columns, values, strict=True):
+            if not np.isnan(numbers).all() and wanted(column):
+                columns[column] = numbers
+        return Stream(name, columns, {c: UNITS.get(c.partition(".")[0], "s") for c in columns})
 
 
 @dataclass
 class Collector:
-    """Gathers the messages of a bag, one stream for each topic and set of joints.
-
-    Args:
-        source: name of the bag, for messages.
-    """
+    """Gathers the messages of a bag, one stream for each topic and set of joints."""
 
     source: str
-    _streams: dict[tuple[str, tuple[str, ...]], Messages] = field(default_factory=dict)
+    _streams: dict[tuple[str, frozenset[str]], Messages] = field(default_factory=dict)
     _numbers: int = 0
 
     def add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
-        """Take one message.
-
-        Raises:
-            DataError: it is too large, or its arrays do not fit its joint names.
-        """
+        """Take one message; `DataError` if it is too large, or its arrays do not fit its joint names."""
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
-        names, values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
-        stream = self._streams.setdefault((topic, tuple(sorted(names))), Messages(topic, kind, names))
-        if stream.names != names:
-            order = [names.index(name) for name in stream.names]
-            blocks = range(0, len(values), len(names))
-            values = [values[start + i] for start in blocks for i in order]
+        values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
+        stream = self._streams.setdefault((topic, frozenset(values)), Messages(topic, tuple(values)))
         stamp = message.header.stamp
-        stream.rows.append(values)
+        stream.rows.append([values[column] for column in stream.columns])
         stream.stamps.append((stamp.sec * 10**9 + stamp.nanosec, receive_ns))
         self._numbers += len(values)
         check_count(self.source, "numbers", self._numbers, limits.LOG_VALUES)
@@ -128,11 +100,7 @@ class Collector:
         return max((len(stream.rows) for stream in self._streams.values()), default=0)
 
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
-        """The log, with the columns that are wanted; `topics` are all topics of the bag with their types.
-
-        Raises:
-            DataError: no topic has a message type that is read.
-        """
+        """The log, with the columns that are wanted; `topics` are all topics of the bag with their types."""
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             raise DataError(
@@ -155,35 +123,31 @@ class Collector:
         return LogTable(self.source, format_, tuple(streams), tuple(remarks))
 
 
-def _joint_state(source: str, topic: str, message: Any) -> tuple[tuple[str, ...], list[float]]:
-    """Joint names, and position, velocity and effort in their order; NaN where a quantity is empty."""
+def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
+    """Position, velocity and effort of each joint by column; NaN where a quantity is empty."""
     names = tuple(str(name)[: limits.LOG_NAME] for name in message.name)
     if not names or len(set(names)) < len(names):
         raise DataError(f"{source}: a joint state on {topic} has no joint names, or one twice", got=names[:8])
-    values: list[float] = []
-    for quantity in QUANTITIES:
+    values: dict[str, float] = {}
+    for quantity in ("position", "velocity", "effort"):
         numbers = getattr(message, quantity)
         if len(numbers) not in (0, len(names)):
             raise DataError(
                 f"{source}: a joint state on {topic} has {len(numbers)} values of {quantity}",
                 expected=f"one for each of its {len(names)} joints, or none",
             )
-        values += [float(x) for x in numbers] if len(numbers) else [np.nan] * len(names)
-    return names, values
+        numbers = numbers if len(numbers) else [np.nan] * len(names)
+        values |= {f"{quantity}.{name}": float(x) for name, x in zip(names, numbers, strict=True)}
+    return values
 
 
-def _wrench(message: Any) -> tuple[tuple[str, ...], list[float]]:
-    force, torque = message.wrench.force, message.wrench.torque
-    return (), [force.x, force.y, force.z, torque.x, torque.y, torque.z]
+def _wrench(message: Any) -> dict[str, float]:
+    parts = {"force": message.wrench.force, "torque": message.wrench.torque}
+    return {f"{part}.{axis}": getattr(vector, axis) for part, vector in parts.items() for axis in "xyz"}
 
 
 def read_rosbag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2.
-
-    Raises:
-        DataError: the bag is damaged, compressed or too large, or has no message of these types.
-        MissingDependencyError: `rosbags` is not installed.
-    """
+    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2."""
     with (path if path.is_file() else path / "metadata.yaml").open("rb") as file:
         first = file.read(12) == b"#ROSBAG V2.0"
     number, encoding = (1, "ros1") if first else (2, "cdr")
@@ -229,12 +193,7 @@ RECORD_BYTES = 256 << 20
 
 
 def read_mcap(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of an MCAP file, also of one that was cut off and has no index.
-
-    Raises:
-        DataError: the file is damaged or too large, or has no message of these types.
-        MissingDependencyError: `mcap` or `rosbags` is not installed.
-    """
+    """Read the joint states and wrenches of an MCAP file, also of one that was cut off and has no index."""
     package = optional_module("mcap.reader", "Reading MCAP files", "import")
     collector = Collector(str(path))
     decoders: dict[int, Decode | None] = {}

@@ -42,15 +42,7 @@ class _Element(NamedTuple):
 
 
 def variables(content: bytes, source: str) -> Iterator[Variable]:
-    """The variables of a file, in their order.
-
-    Args:
-        content: of the whole file.
-        source: its name, for messages.
-
-    Raises:
-        DataError: the file is damaged or too large.
-    """
+    """The variables of a file with that content, in their order; `source` names it in messages."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise DataError(f"{source}: not a MATLAB file of versions 5 to 7", got=content[:20])

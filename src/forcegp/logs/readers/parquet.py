@@ -13,18 +13,8 @@ import numpy as np
 
 from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs.table import (
-    Column,
-    LogTable,
-    Progress,
-    Stream,
-    Wanted,
-    check_count,
-    check_expansion,
-    check_values,
-    foreign,
-    joined,
-)
+from forcegp.logs import table
+from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -35,13 +25,9 @@ BATCH_ROWS = 1 << 16
 
 
 def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the columns of numbers, flags and times; a list column becomes `name[0]`, `name[1]`, …
-
-    Raises:
-        DataError: the file is damaged or too large, or a list column has lists of different length.
-    """
+    """Read the columns of numbers, flags and times; a list column becomes `name[0]`, `name[1]`, …"""
     remarks: list[str] = []
-    with foreign(str(path), "Parquet"):
+    with table.foreign(str(path), "Parquet"):
         columns = read_columns([path], wanted, rows, remarks, progress)
     return LogTable(str(path), "parquet", (Stream("", columns),), tuple(remarks))
 
@@ -60,7 +46,7 @@ def read_columns(
     for path in paths:
         with pq.ParquetFile(path) as file:
             total += _check(str(path), file)
-            check_values(str(path), total, 1)
+            table.check_values(str(path), total, 1)
     length = sum(path.stat().st_size for path in paths)
     done = 0
     for path in paths:
@@ -72,13 +58,13 @@ def read_columns(
                         if wanted(part) or wanted(name):
                             chunks.setdefault(part, []).append(values)
                 done += len(batch)
-                check_values(str(path), done, max(len(chunks), 1))
-                check_expansion(str(path), 8 * done * len(chunks), length)
+                table.check_values(str(path), done, max(len(chunks), 1))
+                table.check_expansion(str(path), 8 * done * len(chunks), length)
                 if progress is not None:
                     progress(done, total)
                 if rows is not None and done >= rows:
                     break
-    columns = joined(chunks, rows)
+    columns = table.joined(chunks, rows)
     for name, values in columns.items():
         if len(values) != min(done, rows or done):
             raise DataError(f"{paths[0]}: column {name!r} is missing in some of the files")
@@ -88,10 +74,10 @@ def read_columns(
 def _check(source: str, file: object) -> int:
     """Number of rows of a file whose claimed size is within the limits."""
     shape = file.metadata  # pyright: ignore[reportAttributeAccessIssue]
-    check_count(source, "columns", shape.num_columns, limits.COLUMNS)
+    table.check_count(source, "columns", shape.num_columns, limits.COLUMNS)
     groups = [shape.row_group(i) for i in range(shape.num_row_groups)]
     numbers = sum(group.column(j).num_values for group in groups for j in range(group.num_columns))
-    check_count(source, "numbers", numbers, limits.LOG_VALUES)
+    table.check_count(source, "numbers", numbers, limits.LOG_VALUES)
     return shape.num_rows
 
 
@@ -137,10 +123,10 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
             expected=f"{width} numbers in every row",
             got=f"{lengths[row]} in row {row}",
         )
-    check_count(source, "columns", width, limits.COLUMNS)
+    table.check_count(source, "columns", width, limits.COLUMNS)
     flat = pc.cast(values.flatten(), pa.float64(), safe=False).to_numpy(zero_copy_only=False)
-    table = flat.reshape(len(values), width)
-    return {f"{name}[{i}]": np.ascontiguousarray(table[:, i]) for i in range(width)}
+    numbers = flat.reshape(len(values), width)
+    return {f"{name}[{i}]": np.ascontiguousarray(numbers[:, i]) for i in range(width)}
 
 
 MAX_INFO_BYTES = 4 << 20
@@ -152,13 +138,10 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 
     The columns are named as in `meta/info.json`: `observation.state.<motor>`, or `observation.state[i]`
     where the motors have no names. Images and videos are not read.
-
-    Raises:
-        DataError: the folder is not a LeRobot data set, or is damaged or too large.
     """
     features = _features(path / "meta" / "info.json")
     files = sorted((path / "data").rglob("*.parquet"))
-    check_count(str(path), "files", len(files), limits.LOG_FILES)
+    table.check_count(str(path), "files", len(files), limits.LOG_FILES)
     if not files:
         raise DataError(f"{path}: no episodes", expected=f"Parquet files below {path / 'data'}")
     names = {
@@ -167,14 +150,14 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
         for i, motor in enumerate(_motors(description))
     }
     remarks: list[str] = []
-    with foreign(str(path), "a LeRobot data set"):
+    with table.foreign(str(path), "a LeRobot data set"):
         columns = read_columns(files, lambda n: wanted(names.get(n, n)), rows, remarks, progress)
     renamed = {names.get(name, name): values for name, values in columns.items()}
     return LogTable(str(path), "lerobot", (Stream("", renamed),), tuple(remarks))
 
 
 def _features(file: Path) -> dict[str, Any]:
-    check_count(str(file), "bytes", file.stat().st_size, MAX_INFO_BYTES)
+    table.check_count(str(file), "bytes", file.stat().st_size, MAX_INFO_BYTES)
     try:
         info = json.loads(file.read_text(encoding="utf-8"))
         features = info["features"]

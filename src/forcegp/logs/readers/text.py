@@ -1,7 +1,6 @@
 """CSV and text columns with any separator, decimal mark and heading, read in blocks; folders of such files.
 
-How a table is written is found from its first lines: encoding, separator, decimal mark, heading, first line
-of numbers. In a folder each file holds one quantity: `q.txt`, `tau.txt`, …
+How a table is written is found from its first lines. In a folder each file holds one quantity: `q.txt`, …
 """
 
 from __future__ import annotations
@@ -11,24 +10,14 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
 from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs.table import (
-    Column,
-    LogTable,
-    Progress,
-    Stream,
-    Wanted,
-    check_count,
-    check_values,
-    foreign,
-    joined,
-    streams_by_length,
-)
+from forcegp.logs import table
+from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -52,12 +41,9 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a text table is written.
+    """How a text table is written, after `first_line` lines without numbers.
 
-    Attributes:
-        first_line: number of lines before the first line of numbers.
-        kinds: `number`, `bool`, `date`, `text` or `empty`, one per column.
-        units: name → unit, where a line below the heading declares units.
+    Each column is a `number`, `bool`, `date`, `text` or `empty`; a line below the heading may declare units.
     """
 
     encoding: str
@@ -70,11 +56,7 @@ class Dialect:
 
 
 def sniff(path: Path) -> Dialect:
-    """Find out how a text table is written, from its first lines.
-
-    Raises:
-        DataError: the file is empty, binary, or has no two lines with equally many numbers.
-    """
+    """Find out how a text table is written, from its first lines."""
     with path.open("rb") as file:
         head = file.read(SAMPLE_BYTES)
     text, encoding = _decode(path, head)
@@ -158,7 +140,7 @@ def _dialect(
 ) -> Dialect:
     rows = [split(line, separator) for line in lines[first : first + SAMPLE_LINES] if line.strip()]
     width = len(rows[0])
-    check_count(str(path), "columns", width, limits.COLUMNS)
+    table.check_count(str(path), "columns", width, limits.COLUMNS)
     above = [split(line.lstrip("#%/ \t"), separator) for line in lines[:first] if line.strip()]
     widths = (width, width if rows[0][-1] else width - 1)
     above = [fields for fields in above if len(fields) in widths]
@@ -199,27 +181,23 @@ _EDGES = re.compile(rb"(?m)^ | (?=\r?$)")
 
 
 def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read a text table; columns of text are left out with a remark.
-
-    Raises:
-        DataError: not a table, a line with another number of fields, or a field that is not a number.
-    """
+    """Read a text table; columns of text are left out with a remark."""
     dialect = sniff(path)
     kinds = {n: kind for n, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(n)}
     remarks = [f"column {n!r} holds text and was left out" for n, kind in kinds.items() if kind == "text"]
     kinds = {name: kind for name, kind in kinds.items() if kind not in ("text", "empty")}
     chunks: dict[str, list[Column]] = {name: [] for name in kinds}
     done = 0
-    with foreign(str(path), "a table of text"), path.open("rb") as file:
+    with table.foreign(str(path), "a table of text"), path.open("rb") as file:
         source = _Blocks(file, dialect, path.stat().st_size, progress)
         for batch in _batches(source, dialect, kinds) if kinds else ():
             done += len(batch)
-            check_values(str(path), done, len(kinds))
+            table.check_values(str(path), done, len(kinds))
             for name, kind in kinds.items():
                 chunks[name].append(_numbers(batch.column(name), kind))
             if rows is not None and done >= rows:
                 break
-        values = joined(chunks, rows)
+        values = table.joined(chunks, rows)
     if dialect.encoding == "cp1252":
         remarks.append("the file is not UTF-8 and was read as Windows-1252")
     units = {name: unit for name, unit in dialect.units.items() if name in values}
@@ -232,7 +210,6 @@ def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterat
     from pyarrow import csv
 
     types = {"number": pa.float64(), "bool": pa.bool_(), "date": pa.timestamp("ns")}
-    options: dict[str, Any] = {"decimal_point": dialect.decimal, "null_values": list(MISSING)}
     yield from csv.open_csv(
         pa.PythonFile(source, mode="r"),
         read_options=csv.ReadOptions(
@@ -244,7 +221,10 @@ def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterat
         ),
         parse_options=csv.ParseOptions(delimiter=dialect.separator, ignore_empty_lines=True),
         convert_options=csv.ConvertOptions(
-            include_columns=list(kinds), column_types={n: types[kind] for n, kind in kinds.items()}, **options
+            include_columns=list(kinds),
+            column_types={n: types[kind] for n, kind in kinds.items()},
+            decimal_point=dialect.decimal,
+            null_values=list(MISSING),
         ),
     )
 
@@ -287,7 +267,7 @@ class _Blocks(io.RawIOBase):
         # Blanks at the edges of a line are only known once the line is complete.
         end = text.rfind(b"\n") + 1 if block else len(text)
         self._rest, text = text[end:], text[:end]
-        check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)
+        table.check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)
         result = _EDGES.sub(b"", _BLANKS.sub(b" ", text))
         return result if result or not block else self.read(size)
 
@@ -300,32 +280,29 @@ def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
     """Read the tables of a folder; a column is `file[i]`, or `file.heading` where the file has headings.
 
     Files with the same number of rows share a clock and make one stream.
-
-    Raises:
-        DataError: a file is not a table of numbers, or the folder is too large.
     """
 
     def in_file(file: Path, column: str) -> str:
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"
 
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
-    check_count(str(path), "files", len(files), limits.LOG_FILES)
+    table.check_count(str(path), "files", len(files), limits.LOG_FILES)
     groups: dict[int, dict[str, Column]] = {}
     remarks: list[str] = []
     for number, file in enumerate(files):
         try:
-            table = read_text(file, wanted=lambda n, f=file: wanted(in_file(f, n)), rows=rows, progress=None)
+            part = read_text(file, wanted=lambda n, f=file: wanted(in_file(f, n)), rows=rows, progress=None)
         except DataError as error:
             if "no table of numbers" not in error.message:
                 raise
             remarks.append(f"{file.name} holds no table of numbers and was left out")
             continue
-        remarks += [f"{file.name}: {remark}" for remark in table.remarks]
-        columns = {in_file(file, name): values for name, values in table.streams[0].columns.items()}
+        remarks += [f"{file.name}: {remark}" for remark in part.remarks]
+        columns = {in_file(file, name): values for name, values in part.streams[0].columns.items()}
         if columns:
             groups.setdefault(len(next(iter(columns.values()))), {}).update(columns)
-            check_values(str(path), 1, sum(map(len, groups.values())))
+            table.check_values(str(path), 1, sum(map(len, groups.values())))
         if progress is not None:
             progress(number + 1, len(files))
     most = max(groups, key=lambda length: (len(groups[length]), length), default=0)
-    return LogTable(str(path), "text folder", streams_by_length(groups, most), tuple(remarks))
+    return LogTable(str(path), "text folder", table.streams_by_length(groups, most), tuple(remarks))
