@@ -21,7 +21,7 @@ $(READY): pyproject.toml constraints.txt
 	@echo "[setup] PyTorch"
 	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt torch
 	@echo "[setup] forcegp and the tools that test it"
-	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt -e ".[mujoco,pybullet,view,sweep,test,dev,docs]"
+	@$(BIN)/python -m pip install --progress-bar off --quiet -c constraints.txt -e ".[mujoco,pybullet,sweep,test,dev,docs]"
 	@touch $(READY)
 	@echo "[setup] done"
 
