@@ -116,7 +116,12 @@ def test_the_page_is_served_until_interrupted() -> None:
 
         Thread(target=fetch, daemon=True).start()
 
-    serve("<p>λ</p>", 0, ask)
+    # A test that runs in the background of a shell has its interrupts ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        serve("<p>λ</p>", 0, ask)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert pages == ["<p>λ</p>"]
 
 
