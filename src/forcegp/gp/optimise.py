@@ -137,6 +137,7 @@ def minimise(
     analytical: frozenset[str] = frozenset(),
     bounds: Bounds | None = None,
     progress: Progress | None = None,
+    first_step: float = FIRST_STEP,
 ) -> Learned:
     """Minimise an objective over tensors.
 
@@ -147,6 +148,7 @@ def minimise(
         analytical: names of the analytical parameters θ_A, which have an ADAM of their own.
         bounds: box of each tensor, for L-BFGS.
         progress: called after each evaluation.
+        first_step: largest change of an entry in the first step of L-BFGS in a box.
 
     Raises:
         NumericalError: the objective is not finite at the start.
@@ -154,7 +156,7 @@ def minimise(
     began = time.perf_counter()
     recorder = _Recorder(objective, start, progress)
     if options.optimizer == "lbfgs":
-        converged, message = _lbfgs(recorder, start, options, bounds or {})
+        converged, message = _lbfgs(recorder, start, options, bounds or {}, first_step)
     else:
         converged, message = _adam(recorder, start, options, analytical, bounds or {})
     if not np.isfinite(recorder.value):
@@ -170,6 +172,7 @@ def _lbfgs(
     start: Mapping[str, Tensor],
     options: LearningOptions,
     bounds: Bounds,
+    first_step: float,
 ) -> tuple[bool, str]:
     def function(x: np.ndarray) -> tuple[float, np.ndarray]:
         # SciPy counts between iterations only, so a line search would go on beyond the limit.
@@ -187,7 +190,7 @@ def _lbfgs(
         return False, "not finite at the start"
     # In a box, L-BFGS-B's first step is the whole gradient, to the corners of the box where that is steep. In
     # units of √(first step ÷ gradient) the gradient is that step.
-    unit = min(1.0, math.sqrt(FIRST_STEP / max(steepest, 1e-300)))
+    unit = min(1.0, math.sqrt(first_step / max(steepest, 1e-300)))
 
     def scaled(u: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = function(np.clip(x + unit * u, low, high)) if u.any() else first
