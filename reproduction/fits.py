@@ -140,12 +140,13 @@ def fit_and_score(
     peak = peak_memory() if resettable else None
     fit.save(folder / MODEL)
     found = evaluate(load_model(folder / MODEL), task.test(split, test_samples), compare=False)
+    summary: dict[str, Any] = found.summary()
     score = Score(
         model=name,
         points=points,
         split=split,
         seed=task.seed,
-        **{measure: getattr(found, measure) for measure in MEASURES},
+        **{measure: summary[measure] for measure in MEASURES},
         test_samples=found.samples,
         fit_seconds=fit.seconds,
         predict_seconds=found.seconds_per_state * found.samples,

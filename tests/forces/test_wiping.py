@@ -36,10 +36,10 @@ def in_contact(data: forcegp.Dataset) -> torch.Tensor:
 
 @pytest.mark.slow
 def test_the_normal_force_is_found_without_a_force_sensor() -> None:
-    """On the last six seconds of five logs: a stroke has one error, and six seconds hold few strokes."""
+    """On the last six seconds of three logs: a stroke has one error, and six seconds hold few strokes."""
     scene = load_scene("ur5_wiping")
     errors, inside, read, truth = [], [], [], []
-    for seed in range(5):
+    for seed in range(3):
         log = simulate(scene.system(), replace(scene.simulation, duration=24.0, seed=seed)).data
         train, test = log[: 18 * 250 : EVERY], log[18 * 250 :]
         test = test[in_contact(test)]

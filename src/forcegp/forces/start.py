@@ -288,9 +288,6 @@ class Search:
     ) -> Learned:
         """Learn; on a part of the data first where there is much, and from several starts on request.
 
-        With Coulomb friction or a mixing matrix, a limited and an unlimited first step end in two optima,
-        each in the better one on some logs (benchmarks/notes/inference.md), so both are tried.
-
         Args:
             problem: whose objective is minimised.
             progress: called after each evaluation on all data.
@@ -302,11 +299,9 @@ class Search:
         """
         if begin is not None:
             return self._minimise(problem, checked_start(begin, self.start), progress)
-        several = problem.has_coulomb or any(_kind(key) == MIXING for key in self.start)
         candidates = (
-            self._minimise(problem, self._warmed(problem, cold, step), progress, step)
+            self._minimise(problem, self._warmed(problem, cold), progress)
             for cold in random_starts(self.start, self.options.restarts, self.options.seed)
-            for step in ((FIRST_STEP, math.inf) if several else (FIRST_STEP,))
         )
         return min(candidates, key=lambda learned: learned.value)
 
@@ -321,12 +316,12 @@ class Search:
         rows = problem.rows_for(tensors, self.held)
         return problem.negative_log_likelihood(kernel_parameters({**self.held, **tensors}), rows) + weak
 
-    def _warmed(self, problem: Problem, cold: Tensors, step: float) -> Tensors:
+    def _warmed(self, problem: Problem, cold: Tensors) -> Tensors:
         """Where to begin on all data: what fewer samples taught, unless the cold start is better."""
         first = cold
         for samples in warm_start_sizes(problem.training.samples, self.options.warm_start):
             small = dataclasses.replace(problem, training=problem.training.thinned(samples))
-            first = self._minimise(small, self._better(small, (first, cold)), None, step).tensors
+            first = self._minimise(small, self._better(small, (first, cold)), None).tensors
         return self._better(problem, (first, cold))
 
     @torch.no_grad()
@@ -336,9 +331,7 @@ class Search:
             return one
         return min((one, two), key=lambda tensors: float(self.objective(problem, tensors)))
 
-    def _minimise(
-        self, problem: Problem, begin: Tensors, progress: Progress | None, step: float = FIRST_STEP
-    ) -> Learned:
+    def _minimise(self, problem: Problem, begin: Tensors, progress: Progress | None) -> Learned:
         analytical = frozenset(key for key in begin if key.startswith(ANALYTICAL + "."))
         hyper = {key: value for key, value in self.start.items() if key not in analytical}
         bounds = box_around(hyper, begin)
@@ -356,6 +349,10 @@ class Search:
             progress(evaluations, value + constant, best)
 
         report = None if progress is None else whole
+        # The entries of a mixing matrix are not logarithms. With Coulomb friction, either rule ends in the
+        # better optimum on some logs (benchmarks/notes/inference.md), so its first step is not limited.
+        free = problem.has_coulomb or any(_kind(key) == MIXING for key in hyper)
+        step = math.inf if free else FIRST_STEP
         learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report, step)
         history = [value + constant for value in learned.history]
         doubts = doubts_at_bounds(learned.tensors, bounds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
@@ -48,7 +49,9 @@ class PyBulletEngine(Engine):
                     hint='use the engine "mujoco"',
                 )
         self._robot, self._dt = robot, dt
-        self._bullet: Any = BulletClient(pybullet.DIRECT)
+        # The constructor of a client passes options, and PyBullet prints a line where there are any.
+        self._bullet: Any = BulletClient.__new__(BulletClient)
+        vars(self._bullet).update(_shapes={}, _pid=os.getpid(), _client=pybullet.connect(pybullet.DIRECT))
         self._bullet.setTimeStep(dt)
         self._bullet.setGravity(*robot.gravity.tolist())
         self._body = self._load()
