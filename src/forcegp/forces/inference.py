@@ -18,7 +18,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import CONTACT, ForcePrior
+from forcegp.forces.priors.base import ForcePrior
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.bound import bound_of
 from forcegp.gp.exact import ExactPosterior, require_exact_fits
@@ -117,10 +117,8 @@ def posterior_of(
     return ForcePosterior(problem.process_at(hyperparameters), latent)
 
 
-EXACT_SAMPLES, EXACT_ON_SURFACE = 1000, 300
-"""Samples up to which inference is exact by default, and where only forces at contacts are unknown: a few
-points cover their inputs, and exact inference costs the cube of all rows, however few latent forces there
-are."""
+EXACT_SAMPLES = 1000
+"""Samples up to which inference is exact by default."""
 
 
 def require_double(system: ConstrainedSystem) -> None:
@@ -144,7 +142,7 @@ def is_finite(priors: Sequence[ForcePrior]) -> bool:
 
 
 def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> bool:
-    """Whether inference is sparse: on request, for finite priors, and beyond some number of samples.
+    """Whether inference is sparse: on request, for finite priors, and beyond `EXACT_SAMPLES`.
 
     Raises:
         ModelError: sparse inference is asked for, and a force is a function of time.
@@ -158,9 +156,7 @@ def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> boo
                 hint='use inference="exact" on evenly spaced rows (`forcegp select --method even`)',
             )
         return False
-    rest = [prior for prior in priors if not prior.kernel.is_finite]
-    limit = EXACT_ON_SURFACE if all(prior.target == CONTACT for prior in rest) else EXACT_SAMPLES
-    return inference == "sparse" or (inference == "auto" and (not rest or samples > limit))
+    return inference == "sparse" or (inference == "auto" and (is_finite(priors) or samples > EXACT_SAMPLES))
 
 
 @torch.no_grad()
