@@ -27,10 +27,10 @@ from torch import Tensor
 
 import forcegp
 from forcegp.data import split_by_stretches
-from forcegp.forces.learn import Problem, kernel_parameters
 from forcegp.forces.priors.sets import PAPER, default_priors
+from forcegp.forces.problem import Problem, kernel_parameters
 from forcegp.forces.quantities import states
-from forcegp.forces.start import initial
+from forcegp.forces.search import initial
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.models.structured_learning import training_for
 from forcegp.simulate import simulate

@@ -21,8 +21,8 @@ from torch import Tensor
 import forcegp
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, split_by_stretches
-from forcegp.forces.identifiability import force_correlation
-from forcegp.forces.observations import Observation
+from forcegp.forces.measurements import Observation
+from forcegp.forces.posterior import force_correlation
 from forcegp.forces.priors.contact import ContactForcePrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.forces.quantities import States, states

@@ -25,7 +25,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp.errors import NumericalError
-from forcegp.forces.coulomb import CoulombFriction, with_coulomb
+from forcegp.forces.priors.contact import CoulombFriction, with_coulomb
 from forcegp.forces.quantities import states
 from forcegp.gp.kernels import Linear, SquaredExponential
 

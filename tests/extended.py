@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.forces.learn import kernel_parameters
+from forcegp.forces.problem import kernel_parameters
 from forcegp.forces.quantities import affine_maps, states_at
 from forcegp.gp.features import Block, Features, rows_of, stacked
 from forcegp.gp.kernels import (

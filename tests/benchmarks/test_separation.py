@@ -9,7 +9,7 @@ import pytest
 import forcegp
 from benchmarks.separation import judge, separate, unfitted
 from forcegp.data.fields import DataHeader
-from forcegp.forces.observations import Observation
+from forcegp.forces.measurements import Observation
 from random_data import NOISE_STD, random_data, table_system
 
 SHORT = 0.35

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp.errors import ModelError
-from forcegp.forces.learn import kernel_parameters
+from forcegp.forces.problem import kernel_parameters
 from forcegp.forces.quantities import affine_map
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, mixed_contacts, two_contacts

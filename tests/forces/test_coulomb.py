@@ -12,20 +12,19 @@ import torch
 from torch import Tensor
 
 import forcegp
-from forcegp.forces.coulomb import (
+from forcegp.forces.measurements import Measurement
+from forcegp.forces.posterior import ForceSamples
+from forcegp.forces.priors.contact import (
     CoulombErrorPrior,
     CoulombFriction,
+    SlidingFrictionPrior,
     below_jamming,
     coulomb_keys,
     coupled,
     with_coulomb,
 )
-from forcegp.forces.inference import force_posterior
-from forcegp.forces.learn import kernel_parameters
-from forcegp.forces.measurements import Measurement
-from forcegp.forces.posterior import ForceSamples
-from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.problem import force_posterior, kernel_parameters
 from forcegp.forces.quantities import States, affine_map, states
 from forcegp.gp.kernels import Linear
 from forces.cases import CONTACTS, draw, logged, mixed_contacts, two_contacts

@@ -12,8 +12,8 @@ from torch import Tensor
 
 import forcegp
 from forcegp.errors import ModelError
-from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.priors.joint import DisturbancePrior, JointFrictionPrior
+from forcegp.forces.problem import kernel_parameters
 from forcegp.forces.quantities import affine_map
 from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.models.structured_fit import StructuredFit

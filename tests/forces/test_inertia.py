@@ -23,7 +23,7 @@ from forcegp.forces.inverse_dynamics import (
     products,
     sums,
 )
-from forcegp.forces.observations import Observation, training_of
+from forcegp.forces.measurements import Observation, training_of
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.robot.model import RobotModel

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import forcegp
-from forcegp.forces.observations import COLUMNS, Observation
+from forcegp.forces.measurements import COLUMNS, Observation
 from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import QUANTITIES, affine_map, states
 from forcegp.gp.likelihood import negative_log_likelihood

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.start import FAR, LIMITS, box_around, doubts_at_bounds, initial_hyperparameters
+from forcegp.forces.search import FAR, LIMITS, box_around, doubts_at_bounds, initial_hyperparameters
 from forcegp.gp.features import Block
 
 N, ROWS = 50, 6

@@ -10,11 +10,10 @@ import torch
 
 import forcegp
 from forcegp.errors import ModelError
-from forcegp.forces.inference import force_posterior, log_likelihood, without_inducing
-from forcegp.forces.learn import kernel_parameters
 from forcegp.forces.noise import STICK_NOISE, TORQUE_NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.problem import force_posterior, kernel_parameters, log_likelihood, without_inducing
 from forcegp.forces.quantities import affine_map
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook

@@ -10,7 +10,7 @@ import torch
 
 import forcegp
 from forcegp.evaluation import evaluate
-from forcegp.forces.coulomb import coulomb_keys
+from forcegp.forces.priors.contact import coulomb_keys
 from forcegp.logs.surface_fit import fit_surface
 from forcegp.models.registry import create
 from forcegp.scene import load_scene

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.bound import negative_bound
 from forcegp.gp.features import Block
-from forcegp.gp.likelihood import negative_log_likelihood
+from forcegp.gp.likelihood import negative_bound, negative_log_likelihood
 from gp.sparse_cases import PROCESSES, first, parameters, rows, textbook
 
 DIFFERENCES = 1e-6

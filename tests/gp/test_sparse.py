@@ -11,10 +11,9 @@ from extended import is_extended
 from extended import posterior as dense
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.bound import bound_of
 from forcegp.gp.features import Block, rows_of
 from forcegp.gp.kernels import sub
-from forcegp.gp.likelihood import condition, cross_gram
+from forcegp.gp.likelihood import bound_of, condition, cross_gram
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sums import accumulate
 from gp.sparse_cases import (

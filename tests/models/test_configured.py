@@ -25,9 +25,9 @@ from forcegp.models.configured import Configured, configured, keys_of
 from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import SHALLOW, NeuralNetwork
+from forcegp.models.structured_file import CLASSES
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
-from forcegp.models.structured_spec import CLASSES
 from forcegp.scene import load_model_table, load_scene
 from forcegp.scene.sections import LearningSection, ModelSection, NoiseSection
 from logs import random_log

@@ -12,9 +12,8 @@ import forcegp
 from extended import deviation_errors, is_extended
 from forcegp.errors import NumericalError
 from forcegp.forces.priors.sets import default_priors
-from forcegp.gp.factor import require_semidefinite
 from forcegp.gp.kernels import Matern52
-from forcegp.models.prediction import Prediction
+from forcegp.models.prediction import Prediction, require_semidefinite
 from forcegp.models.registry import create
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate

@@ -13,13 +13,13 @@ import torch
 import forcegp
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, UnknownNameError
-from forcegp.forces.observations import Observation
+from forcegp.forces.measurements import Observation
 from forcegp.forces.priors.base import OperatorForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import QUANTITIES
-from forcegp.forces.start import negative_log_prior
+from forcegp.forces.search import negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
 from forcegp.gp.optimise import LearningOptions

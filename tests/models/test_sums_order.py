@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import forcegp
-from forcegp.forces.inference import Totals, basis_of
+from forcegp.forces.problem import Totals, basis_of
 from forcegp.models import structured_stream
 from forcegp.storage.checkpoint import Checkpoint
 from random_data import random_data, table_system

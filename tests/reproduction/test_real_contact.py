@@ -15,7 +15,7 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError
 from forcegp.evaluation import evaluate
-from forcegp.forces.observations import measurement_of
+from forcegp.forces.measurements import measurement_of
 from forcegp.gp.optimise import LearningOptions
 from forcegp.logs import import_log
 from forcegp.models.registry import create

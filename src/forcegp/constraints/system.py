@@ -162,9 +162,9 @@ class ConstrainedSystem:
         Raises:
             ShapeError: not boolean, or a shape that does not fit the contacts and the batch.
         """
-        n, device = len(self.contacts), self.robot.device
+        n = len(self.contacts)
         if active is None:
-            return torch.ones(*batch, self.m, dtype=torch.bool, device=device)
+            return torch.ones(*batch, self.m, dtype=torch.bool, device=self.robot.device)
         if not isinstance(active, Tensor):
             raise ShapeError("active is not a tensor", expected="a bool tensor", got=type(active).__name__)
         sizes = zip(reversed(active.shape), reversed((*batch, n)), strict=False)

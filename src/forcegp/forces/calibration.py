@@ -15,8 +15,6 @@ import scipy
 import torch
 from torch import Tensor
 
-from forcegp.forces.inference import force_posterior
-from forcegp.forces.learn import Problem, typical
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import (
     GROWTH,
@@ -27,6 +25,7 @@ from forcegp.forces.noise import (
     trained_region,
 )
 from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.problem import Problem, force_posterior, typical
 from forcegp.forces.quantities import affine_map
 
 STRETCHES = 8

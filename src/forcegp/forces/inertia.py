@@ -32,9 +32,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
 from forcegp.forces.calibration import autocorrelation_time
-from forcegp.forces.inference import force_posterior
 from forcegp.forces.inverse_dynamics import (
-    LEAST,
     Estimate,
     NormalEquations,
     Rows,
@@ -48,13 +46,13 @@ from forcegp.forces.inverse_dynamics import (
     products,
     sums,
 )
-from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForceMean
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.problem import Problem, force_posterior
 from forcegp.gp.features import Block
 from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
@@ -178,12 +176,10 @@ def inertia_of(
         system: robot and contacts of the robot file.
         friction: what the friction of a joint depends on.
         mean: prior mean of Q, with the motor torque.
-        training: samples in motion.
+        training: samples in motion, `LEAST` of them free.
     """
     robot = system.robot
     rows = free_rows(system, friction, mean, training)
-    if rows is None:
-        return Inertia(robot, doubts=_unchecked(training))
     remembering = rows.with_memory()
     identified = rigid_robot(robot, remembering)
     if identified is not None:
@@ -195,19 +191,6 @@ def inertia_of(
     if not bool(armature.any()):
         return Inertia(robot)
     return Inertia(robot.replace(armature=robot.armature + armature), doubts=_told(robot, armature))
-
-
-def _unchecked(training: Training) -> tuple[str, ...]:
-    """The warning for a log in contact with neither free motion nor a measured force."""
-    closed = sum(int(m.active.any(-1).sum()) for m in training.measurements)
-    if not closed or set(training.quantities) != {"qdd"}:
-        return ()
-    free = max(int((~m.active.any(-1)).sum()) for m in training.measurements)
-    return (
-        f"{free} samples in free motion are too few to check the masses of the robot file (expected: {LEAST} "
-        "or more), and any error of the masses biases the multiplier: add a few seconds of free motion to "
-        "the log, or measure the contact force",
-    )
 
 
 def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:

@@ -151,26 +151,23 @@ Estimate = Callable[[NormalEquations], Tensor]
 
 def free_rows(
     system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
-) -> Rows | None:
-    """Samples in free motion and their partners; `None` where there are too few."""
-    for quantity, m in zip(training.quantities, training.measurements, strict=True):
-        free = (~m.active.any(-1)).nonzero()[:, 0]
-        if quantity != "qdd" or len(free) < LEAST:
-            continue
-        m = m[free]
-        later, memory = partners(m, training.filter_span), bristles(m)
-        first = (later >= 0).nonzero()[:, 0]
-        paired = len(first) >= LEAST
-        if not paired:
-            first = torch.arange(len(free), device=free.device)
-        first = first[torch.linspace(0, len(first) - 1, min(MOST, len(first))).round().long().to(free.device)]
-        _, group = stretches(m.segment[first]).unique(return_inverse=True)
-        i = torch.arange(len(first), device=free.device)
-        if not paired:
-            return _rows(system, prior, mean, m[first], memory[first], group, i)
-        both, n = torch.cat([first, later[first]]), len(first)
-        return _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
-    return None
+) -> Rows:
+    """Samples in free motion and their partners, of which there are `LEAST` or more in a measurement."""
+    motions = (m for m in training.measurements if m.quantity == "qdd")
+    free = ((m, (~m.active.any(-1)).nonzero()[:, 0]) for m in motions)
+    m = next(m[rows] for m, rows in free if len(rows) >= LEAST)
+    later, memory = partners(m, training.filter_span), bristles(m)
+    first = (later >= 0).nonzero()[:, 0]
+    paired = len(first) >= LEAST
+    if not paired:
+        first = torch.arange(len(m.t), device=m.t.device)
+    first = first[torch.linspace(0, len(first) - 1, min(MOST, len(first))).round().long().to(m.t.device)]
+    _, group = stretches(m.segment[first]).unique(return_inverse=True)
+    i = torch.arange(len(first), device=m.t.device)
+    if not paired:
+        return _rows(system, prior, mean, m[first], memory[first], group, i)
+    both, n = torch.cat([first, later[first]]), len(first)
+    return _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
 
 
 def _in_time(m: Measurement) -> Tensor:

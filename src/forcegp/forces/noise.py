@@ -25,12 +25,11 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.measurements import Measurement, Training
-from forcegp.forces.observations import NoiseStd
+from forcegp.forces.measurements import Measurement, NoiseStd, Training
 from forcegp.forces.priors.base import NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
-from forcegp.forces.quantities import AffineMap, States, linearize_field
+from forcegp.forces.quantities import AffineMap, ForceField, States, linearize_field
 from forcegp.robot.model import RobotModel
 
 
@@ -221,10 +220,6 @@ class SampleNoise:
         std = self.std if self.std.ndim == 1 else self.std[rows]
         state, weight = (None if x is None else x[rows] for x in (self.state, self.weight))
         return SampleNoise(std, self.force, state, weight)
-
-
-ForceField = Callable[[ConstrainedSystem, States], Tensor]
-"""The impressed force Q̄ at states, `(n, nq)`."""
 
 
 def state_jacobian(

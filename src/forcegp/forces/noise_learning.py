@@ -34,12 +34,11 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import NumericalError
-from forcegp.forces.inference import force_posterior
-from forcegp.forces.learn import Problem
 from forcegp.forces.noise import learned_slopes
 from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.problem import Problem, force_posterior
 from forcegp.forces.quantities import affine_map
-from forcegp.forces.start import Search
+from forcegp.forces.search import Search
 from forcegp.gp.optimise import Learned, Progress
 
 ROUNDS = 3

@@ -63,6 +63,10 @@ def states(
     return States(q, qd, tau, active, system.equations(q, qd, active), qdd, time=time)
 
 
+ForceField = Callable[[ConstrainedSystem, States], Tensor]
+"""The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""
+
+
 class FlatStates(NamedTuple):
     """States of any batch shape as a list.
 

@@ -14,8 +14,15 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.draws import FEATURES, FunctionSamples, draw_priors, kernel_terms
-from forcegp.gp.factor import bordered, require_resolved_noise, require_resolved_variance
-from forcegp.gp.features import Block, Features, chunked, rows_mean
+from forcegp.gp.factor import bordered
+from forcegp.gp.features import (
+    Block,
+    Features,
+    chunked,
+    require_resolved_noise,
+    require_resolved_variance,
+    rows_mean,
+)
 from forcegp.gp.kernels import Parameters, Process, sub
 from forcegp.gp.likelihood import Conditioned, add_rows, condition, cross_gram, gram, offsets, target_of
 from forcegp.resources import announce_memory, free_memory

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy
@@ -95,6 +95,18 @@ class Learned:
     message: str
     history: list[float] = field(default_factory=list)
     doubts: tuple[str, ...] = ()
+
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """How learning went, by the fields of `FitResult`."""
+        return {
+            "converged": self.converged,
+            "evaluations": self.evaluations,
+            "seconds": self.seconds,
+            "objective": self.value,
+            "message": self.message,
+            "history": tuple(self.history),
+        }
 
 
 def reported(progress: FitProgress | None, most: int, before: int = 0) -> Progress | None:

@@ -25,8 +25,15 @@ from torch import Tensor
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.draws import MISSED_FEATURES, FunctionSamples, draw_functions
-from forcegp.gp.factor import cholesky, extended, require_resolved_noise, require_resolved_variance
-from forcegp.gp.features import Block, Features, chunked, rows_mean
+from forcegp.gp.factor import cholesky, extended
+from forcegp.gp.features import (
+    Block,
+    Features,
+    chunked,
+    require_resolved_noise,
+    require_resolved_variance,
+    rows_mean,
+)
 from forcegp.gp.kernels import Parameters, Process
 from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 

@@ -17,16 +17,14 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
 from forcegp.files import Record
-from forcegp.forces.measurements import Measurement
-from forcegp.forces.observations import Observation, measurement_of
+from forcegp.forces.measurements import Measurement, Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
-from forcegp.forces.quantities import FlatStates, affine_maps, states
+from forcegp.forces.quantities import FlatStates, ForceField, affine_maps, states
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model, PointwiseFit
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.robot.parameters import AnalyticalParameters
-from forcegp.rollout.law import ForceField
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.options import Window
 from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
@@ -113,7 +111,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         theta.load_state_dict(learned.tensors)
         with torch.no_grad():
             system = self.system.with_robot(theta())
-        return AnalyticalFit(system, theta, self.window, self.seed, FitResult.of(learned))
+        return AnalyticalFit(system, theta, self.window, self.seed, FitResult(**learned.outcome))
 
     def nominal(self) -> AnalyticalFit:
         """The equations of motion with the parameters of the robot file; nothing is learned."""

@@ -11,8 +11,8 @@ from typing import Any
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import SceneError, UnknownNameError, near_names
+from forcegp.forces.measurements import NoiseStd
 from forcegp.forces.noise import Noise
-from forcegp.forces.observations import NoiseStd
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.gp.optimise import LearningOptions
@@ -22,9 +22,9 @@ from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import DEEP, SHALLOW, NeuralNetwork
 from forcegp.models.registry import MODELS, create
 from forcegp.models.sensed import with_sensor
+from forcegp.models.structured_file import CLASSES
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
-from forcegp.models.structured_spec import CLASSES
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.scene import ModelTable
 from forcegp.scene.sections import NoiseSection

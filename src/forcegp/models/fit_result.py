@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.gp.optimise import Learned
 from forcegp.notebook import html_table
 
 
@@ -92,19 +91,6 @@ class FitResult:
     missed: float | None = None
     more_points_would_help: bool | None = None
     comparison: tuple[Compared, ...] = ()
-
-    @classmethod
-    def of(cls, learned: Learned, **more: Any) -> FitResult:
-        """The result of an optimisation, with what else is known."""
-        return cls(
-            converged=learned.converged,
-            evaluations=learned.evaluations,
-            seconds=learned.seconds,
-            objective=learned.value,
-            message=learned.message,
-            history=tuple(learned.history),
-            **more,
-        )
 
 
 T = TypeVar("T")

@@ -23,7 +23,7 @@ import torch
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.priors.inertial import PayloadPrior
-from forcegp.gp.bound import bound_of
+from forcegp.gp.likelihood import bound_of
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.structured_fit import StructuredFit
 

@@ -19,12 +19,12 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError
 from forcegp.files import Record
-from forcegp.forces.inference import require_double
+from forcegp.forces.measurements import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.noise import Noise
-from forcegp.forces.observations import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.problem import require_double
 from forcegp.forces.quantities import FlatStates
-from forcegp.forces.start import box_around, doubts_at_bounds, initial_hyperparameters, negative_log_prior
+from forcegp.forces.search import box_around, doubts_at_bounds, initial_hyperparameters, negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Standardization
 from forcegp.gp.likelihood import negative_log_likelihood

@@ -14,7 +14,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.files import Record
-from forcegp.forces.observations import Observation, measurement_of
+from forcegp.forces.measurements import Observation, measurement_of
 from forcegp.forces.quantities import FlatStates
 from forcegp.gp.features import Standardization
 from forcegp.models.base import AccelerationFit, FitProgress, Model
@@ -101,7 +101,7 @@ class NeuralNetwork(Model["NetworkFit"]):
         start = dict(network.named_parameters())
         learned = train(loss, start, len(x), options, generator, progress, checkpoint, (self.seed, x, y))
         network.load_state_dict(learned.tensors)
-        result = FitResult.of(learned, constant_inputs=inputs.constant)
+        result = FitResult(**learned.outcome, constant_inputs=inputs.constant)
         network.requires_grad_(False)
         return NetworkFit(self.system, self.hidden, self.seed, network, inputs, outputs, result)
 

@@ -15,13 +15,11 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.data.fields import AXES
 from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, UnknownNameError
+from forcegp.forces.measurements import COLUMNS
 from forcegp.forces.noise import warnings_beyond
-from forcegp.forces.observations import COLUMNS
-from forcegp.forces.quantities import ForceLinearization, linearize_field
-from forcegp.gp.factor import require_semidefinite
+from forcegp.forces.quantities import ForceField, ForceLinearization, linearize_field
 from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Torque
-from forcegp.rollout.law import ForceField
 from forcegp.rollout.trajectory import Rollout
 
 if TYPE_CHECKING:
@@ -33,6 +31,12 @@ CHUNK = 2000
 """States that are predicted at once, to bound the memory."""
 MOST_SAMPLES = 2000
 """Samples that are predicted and drawn: more cannot be told apart."""
+
+
+NEGATIVE = 0.01
+"""An eigenvalue below minus this fraction of the variances is no rounding of zero."""
+ROUNDING = 1e-12
+"""Variances below this fraction of the largest of a sample are compared with this fraction of it."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -379,3 +383,31 @@ class Predictor(ABC):
             ModelError: a part of the model is Python code.
             OSError: the place cannot be written.
         """
+
+
+def require_semidefinite(covariance: Tensor) -> None:
+    """Refuse covariances with a clearly negative eigenvalue, of variables in units of their own deviation.
+
+    Args:
+        covariance: `(*batch, d, d)`.
+
+    Raises:
+        NumericalError: a variance or an eigenvalue is below −`NEGATIVE`.
+    """
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    if not variance.numel():
+        return
+    largest = variance.amax(-1, keepdim=True)
+    scale = variance.clamp(min=ROUNDING * largest.clamp(min=0.0)).sqrt()
+    scale = torch.where(scale > 0.0, scale, 1.0)
+    shifted = covariance / scale[..., :, None] / scale[..., None, :]
+    shifted.diagonal(dim1=-2, dim2=-1).add_(NEGATIVE)
+    negative = torch.linalg.cholesky_ex(shifted).info != 0
+    if bool(negative.any()):
+        worst = float(torch.linalg.eigvalsh(covariance[negative]).min())
+        raise NumericalError(
+            f"{int(negative.sum())} of {negative.numel()} covariances of a prediction are not positive "
+            "semidefinite",
+            got=f"an eigenvalue of {worst:.2g}",
+            hint="the posterior is rounding: state a larger noise, or leave out outliers",
+        )

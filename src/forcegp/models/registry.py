@@ -9,8 +9,8 @@ from typing import Any
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import UnknownNameError
+from forcegp.forces.measurements import NoiseStd
 from forcegp.forces.noise import Noise
-from forcegp.forces.observations import NoiseStd
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.sets import PAPER, contact_priors, default_priors
 from forcegp.gp.kernels import Kernel

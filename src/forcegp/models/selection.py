@@ -25,16 +25,22 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.errors import NumericalError
 from forcegp.forces.inertia import Inertia
-from forcegp.forces.inference import is_finite
-from forcegp.forces.measurements import Training
-from forcegp.forces.observations import Observation, scaled, training_of
+from forcegp.forces.measurements import Observation, Training, scaled, training_of
 from forcegp.forces.priors.sets import FEW, SETS, PriorSet
+from forcegp.forces.problem import is_finite
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress
 from forcegp.models.fit_result import Compared
 from forcegp.models.structured_fit import StructuredFit, conditioned
-from forcegp.models.structured_learning import Task, identified, in_motion, prepared, search_of, solve
-from forcegp.models.structured_spec import Specification
+from forcegp.models.structured_learning import (
+    Specification,
+    Task,
+    identified,
+    in_motion,
+    prepared,
+    search_of,
+    solve,
+)
 
 FEWEST = 100
 """Samples below which the set `FEW` is taken."""

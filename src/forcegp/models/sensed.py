@@ -14,7 +14,7 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
-from forcegp.forces.observations import Observation
+from forcegp.forces.measurements import Observation
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robust import MAD_TO_STD
 

@@ -18,19 +18,28 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError
 from forcegp.files import Record
-from forcegp.forces.learn import Problem, analytical_parameters, kernel_parameters
-from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.measurements import Measurement, Training, plain
 from forcegp.forces.noise import Noise
-from forcegp.forces.observations import plain
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ANALYTICAL
-from forcegp.forces.priors.joint import AnalyticalMean
+from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
+from forcegp.forces.priors.joint import (
+    AnalyticalMean,
+    CoregionalPrior,
+    DisturbancePrior,
+    JointForcePrior,
+    JointFrictionPrior,
+)
+from forcegp.forces.problem import Problem, analytical_parameters, kernel_parameters
 from forcegp.forces.quantities import states
+from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
+from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.fit_result import FitResult
-from forcegp.models.structured_spec import CLASSES, Specification, constant_inputs
+from forcegp.models.structured_learning import Specification, constant_inputs
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode, encode
 from forcegp.storage.model_file import ModelHeader
@@ -39,6 +48,26 @@ from forcegp.storage.system import robot_tensors, take_robot
 
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
 """A noise that may be zero, as one number or one per joint."""
+CLASSES: dict[str, type] = {
+    "squared_exponential": kernels.SquaredExponential,
+    "matern32": kernels.Matern32,
+    "matern52": kernels.Matern52,
+    "linear": kernels.Linear,
+    "sum": kernels.Sum,
+    "product": kernels.Product,
+    "constant": kernels.Constant,
+    "ornstein_uhlenbeck": OrnsteinUhlenbeck,
+    "joint": JointForcePrior,
+    "joint_friction": JointFrictionPrior,
+    "disturbance": DisturbancePrior,
+    "coregional": CoregionalPrior,
+    "inertial": InertialPrior,
+    "normal": NormalForcePrior,
+    "payload": PayloadPrior,
+    "contact": ContactForcePrior,
+    "sliding_friction": SlidingFrictionPrior,
+}
+"""What can be saved, by the name in the file."""
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """What is kept of each measurement."""
 IN_TIME = ("segment", "t")

@@ -14,10 +14,7 @@ from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.files import Record
-from forcegp.forces.identifiability import doubts_of
-from forcegp.forces.inference import forces_and_constant, is_sparse, log_likelihood, lost_by_inducing
-from forcegp.forces.learn import Problem, typical
-from forcegp.forces.measurements import Training
+from forcegp.forces.measurements import Observation, Training
 from forcegp.forces.noise import (
     LOW,
     STICK_NOISE,
@@ -26,11 +23,18 @@ from forcegp.forces.noise import (
     learned_slopes,
     unknown_variance,
 )
-from forcegp.forces.observations import Observation
-from forcegp.forces.posterior import ForcePosterior, draw_samples
+from forcegp.forces.posterior import ForcePosterior, doubts_of, draw_samples
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.quantities import AffineMap, affine_map, affine_maps, states_at
+from forcegp.forces.problem import (
+    Problem,
+    forces_and_constant,
+    is_sparse,
+    log_likelihood,
+    lost_by_inducing,
+    typical,
+)
+from forcegp.forces.quantities import AffineMap, ForceField, affine_map, affine_maps, states_at
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
@@ -38,9 +42,7 @@ from forcegp.models.base import FittedModel
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_file import pack, unpack
-from forcegp.models.structured_learning import prepared, training_for
-from forcegp.models.structured_spec import Specification, constant_inputs
-from forcegp.rollout.law import ForceField
+from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
 from forcegp.storage.model_file import ModelHeader
 
 KIND = "structured_gp"
@@ -383,8 +385,8 @@ def conditioned(
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     training, system = problem.training, problem.system_at(hyperparameters)
     doubts = doubts_of(posterior, system, training)
-    result = FitResult.of(
-        learned,
+    result = FitResult(
+        **learned.outcome,
         log_marginal_likelihood=likelihood,
         jitter=jitter,
         constant_inputs=constant_inputs(problem),

@@ -16,24 +16,24 @@ from torch import nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError
-from forcegp.forces.inference import require_double
+from forcegp.forces.measurements import NoiseStd, Observation
 from forcegp.forces.noise import Noise, state_std_of
-from forcegp.forces.observations import NoiseStd, Observation
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.joint import AnalyticalMean, mean_of
 from forcegp.forces.priors.sets import priors_of
+from forcegp.forces.problem import require_double
 from forcegp.gp.inducing import LIMIT
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.selection import with_priors
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import (
+    Specification,
     check_learned,
     learned,
     search_of,
     task_of,
 )
-from forcegp.models.structured_spec import Specification
 from forcegp.models.structured_stream import Pass, Sample, sample_of
 from forcegp.storage.options import StructuredOptions
 

@@ -1,4 +1,4 @@
-"""How a structured Gaussian process is learned: on which samples, with which inference, in which steps.
+"""What a structured Gaussian process is made of, and how it is learned: on which samples, in which steps.
 
 1. Samples at rest say nothing but that friction is below a limit, and impacts break the equations of motion;
    robots that are measured learn from motion without impacts.
@@ -17,33 +17,47 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import calibrated_noise, likelihood_power, residual_times
-from forcegp.forces.inertia import with_updated_robot
-from forcegp.forces.inference import (
+from forcegp.forces.inertia import Inertia, inertia_of, with_updated_robot
+from forcegp.forces.inverse_dynamics import LEAST
+from forcegp.forces.measurements import (
+    Observation,
+    Training,
+    observations_of,
+    states_noise,
+    training_of,
+    without_impacts,
+)
+from forcegp.forces.noise import REGION, TORQUE_NOISE, Noise, state_std_of
+from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
+from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.joint import (
+    AnalyticalMean,
+    JointFrictionPrior,
+)
+from forcegp.forces.priors.sets import PriorSet
+from forcegp.forces.problem import (
+    Problem,
     is_finite,
     is_sparse,
     with_inducing,
     without_inducing,
 )
-from forcegp.forces.learn import Problem
-from forcegp.forces.measurements import Training, without_impacts
-from forcegp.forces.noise import REGION, TORQUE_NOISE
-from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
-from forcegp.forces.observations import Observation, training_of
-from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE
-from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.start import Search, initial
+from forcegp.forces.search import Search, initial
 from forcegp.gp.exact import require_exact_fits
 from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, Progress, reported
-from forcegp.models.structured_spec import Specification
 from forcegp.robot.model import RobotModel
 from forcegp.storage.checkpoint import Evaluations
+from forcegp.storage.options import StructuredOptions
 from forcegp.storage.system import pack_system
 
 OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
@@ -58,6 +72,92 @@ FEWEST_MOVING = 20
 """With fewer samples in motion, samples at rest are kept."""
 FIRST_POWER = 0.25
 """Power of the likelihood before the correlation of its residuals is known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Specification:
+    """What a structured Gaussian process is made of before it sees data.
+
+    Attributes:
+        system: robot and contacts.
+        mean: prior mean of Q.
+        priors: on the unknown forces.
+        noise: of measured accelerations, torques and states.
+        analytical_parameters: module whose `forward()` gives the robot at θ_A, or `None`.
+        automatic: whether the data choose the priors among `SETS`.
+        options: plain values.
+    """
+
+    system: ConstrainedSystem
+    mean: AnalyticalMean
+    priors: tuple[ForcePrior, ...]
+    noise: Noise
+    analytical_parameters: nn.Module | None = None
+    automatic: bool = False
+    options: StructuredOptions = field(default_factory=StructuredOptions)
+
+    def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
+        """The specification with the noise that was left to the data.
+
+        The noise of accelerations is learned with that of the torque, or to compare sets of priors, if nobody
+        states it.
+        """
+        learns = self.noise.learns_torque or self.automatic
+        if learns and self.noise.acceleration is None and not states_noise(observations_of(data)):
+            return dataclasses.replace(self, noise=dataclasses.replace(self.noise, learn=True))
+        return self
+
+    def with_options(self, **changed: Any) -> Specification:
+        """The specification with other options."""
+        return dataclasses.replace(self, options=self.options.model_copy(update=changed))
+
+    def with_set(self, chosen: PriorSet) -> Specification:
+        """The specification with a set of priors, and the noise of the torque that goes with it."""
+        priors, noise = chosen.priors(self.system), self.noise
+        if isinstance(noise.torque, str) and noise.torque == "auto":
+            noise = noise.for_priors(priors)
+        return dataclasses.replace(self, priors=priors, noise=noise, automatic=False)
+
+    def inertia_of(self, training: Training) -> Inertia:
+        """The robot that the training samples ask for, where the model is to find it."""
+        friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
+        asks = (
+            self.options.inertia == "auto"
+            and "actuation" in self.mean.terms
+            and self.analytical_parameters is None
+        )
+        if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
+            return Inertia(self.system.robot)
+        if training.free_motions < LEAST:
+            return Inertia(self.system.robot, doubts=_unchecked_masses(training))
+        return inertia_of(self.system, friction, self.mean, training)
+
+    def problem(self, training: Training) -> Problem:
+        """The learning problem of training data."""
+        robot, noise = self.system.robot, self.noise
+        std = None
+        if noise.torque is not None and not isinstance(noise.torque, str):
+            std = torch.as_tensor(noise.torque, dtype=robot.dtype, device=robot.device).expand(robot.nq)
+        state_std, theta = state_std_of(noise.state, robot), self.analytical_parameters
+        return Problem(self.system, self.priors, self.mean, training, theta, std, state_std=state_std)
+
+
+def _unchecked_masses(training: Training) -> tuple[str, ...]:
+    """The warning for a log in contact with neither free motion nor a measured force."""
+    closed = sum(int(m.active.any(-1).sum()) for m in training.measurements)
+    if not closed or set(training.quantities) != {"qdd"}:
+        return ()
+    return (
+        f"{training.free_motions} samples in free motion are too few to check the masses of the robot file "
+        f"(expected: {LEAST} or more), and any error of the masses biases the multiplier: add a few seconds "
+        "of free motion to the log, or measure the contact force",
+    )
+
+
+def constant_inputs(problem: Problem) -> tuple[str, ...]:
+    """Inputs of priors that do not vary in the training data."""
+    pairs = zip(problem.priors, problem.training.scales, strict=True)
+    return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
 
 
 @dataclass(frozen=True)
@@ -326,8 +426,9 @@ def solve(
         part = dataclasses.replace(part, power=likelihood_power(part, search.values(learned)))
         learned = search.solve(part, progress, learned.tensors)
     values = search.values(learned)
-    if calibrated:
+    if calibrated and any(isinstance(prior, InertialPrior) for prior in part.priors):
         part = with_updated_robot(part, values)
+    if calibrated:
         values |= calibrated_noise(part, values)
     if correlated:
         part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)

@@ -19,19 +19,16 @@ from forcegp.data import Dataset
 from forcegp.data.stream import Keep, StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
 from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
-from forcegp.forces.inference import Totals, basis_of, posterior_of, total_over
-from forcegp.forces.learn import Problem
-from forcegp.forces.measurements import Training
-from forcegp.forces.observations import Observation, training_of
+from forcegp.forces.measurements import Observation, Training, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.problem import Problem, Totals, basis_of, posterior_of, total_over
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.features import Standardization
 from forcegp.gp.kernels import sub
 from forcegp.gp.sums import Sums, share_basis
 from forcegp.models.base import FitProgress
-from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, identity
-from forcegp.models.structured_spec import Specification
+from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, Specification, identity
 from forcegp.storage.checkpoint import Checkpoint, beside
 
 SAMPLE_ROWS = 20_000

@@ -104,7 +104,7 @@ class RobotModel:
         ]
         return html_table(repr(self).strip("<>"), head, rows, self.remarks)
 
-    @property
+    @cached_property
     def nq(self) -> int:
         """Number of joints."""
         return len(self.joint_names)

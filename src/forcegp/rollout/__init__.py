@@ -1,10 +1,11 @@
 """Forward in time: trajectories that stay on the surface, with uncertainty, and contact that can be lost."""
 
+from forcegp.forces.quantities import ForceField
 from forcegp.rollout.comparison import Comparison, beside_log, compare, widening
 from forcegp.rollout.events import ContactEvent, contact_loss_probability
 from forcegp.rollout.forward import RolloutOptions, rollout, rollout_model
 from forcegp.rollout.inputs import Feedback, ForwardModel, Inputs, Sampled, TaskSpaceControl, Torque
-from forcegp.rollout.law import AccelerationLaw, ForceField, ForceLaw, Law, law_of
+from forcegp.rollout.law import AccelerationLaw, ForceLaw, Law, law_of
 from forcegp.rollout.trajectory import Bands, DivergedError, Divergence, Rollout
 
 __all__ = [

@@ -15,7 +15,7 @@ from forcegp.control.plan import Plan
 from forcegp.control.task_space import Gains, Target, control_torque
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
-from forcegp.forces.dry_friction import ForceField
+from forcegp.forces.quantities import ForceField
 from forcegp.kinematics import point_motion
 
 INTERPOLATIONS = ("hold", "linear")

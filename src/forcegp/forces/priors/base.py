@@ -36,7 +36,7 @@ class ForcePrior(ABC):
 
     The generalized force is E(x) f(x); `target` says whether it is part of Q, of Q_z, or of Q along the
     constraint. A subclass has a `name`, a `kernel` and a `target`, and implements `outputs`, `features` and
-    `operator`; a saved model knows the classes among `CLASSES` in `models/structured_spec.py`.
+    `operator`; a saved model knows the classes among `CLASSES` in `models/structured_file.py`.
     """
 
     name: str

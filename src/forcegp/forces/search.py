@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError
-from forcegp.forces.coulomb import below_jamming, initial_coulomb
-from forcegp.forces.learn import OWN, Problem, Tensors, kernel_parameters, noise_key, typical
 from forcegp.forces.noise import initial_torque_noise
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, ForcePrior
+from forcegp.forces.priors.contact import below_jamming, initial_coulomb
+from forcegp.forces.problem import OWN, Problem, Tensors, kernel_parameters, noise_key, typical
 from forcegp.forces.projection import WhitenedRows
 from forcegp.gp.features import Block
 from forcegp.gp.kernels import Parameters
