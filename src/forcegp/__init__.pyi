@@ -19,8 +19,8 @@ from .data import SavitzkyGolay as SavitzkyGolay
 from .data import StreamedDataset as StreamedDataset
 from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
+from .forces.measurements import Observation as Observation
 from .forces.noise import Noise as Noise
-from .forces.observations import Observation as Observation
 from .forces.priors.base import OperatorForcePrior as OperatorForcePrior
 from .forces.priors.contact import ContactForcePrior as ContactForcePrior
 from .forces.priors.contact import NormalForcePrior as NormalForcePrior
