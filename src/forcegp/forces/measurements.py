@@ -293,6 +293,18 @@ def states_noise(observations: Sequence[Observation]) -> bool:
     )
 
 
+@torch.no_grad()
+def unmeasured_forces(system: ConstrainedSystem, observations: Sequence[Observation]) -> dict[str, float]:
+    """Root mean square of M q̈ − Q_C − Q_G of the joints whose torque a log does not have, by name [N m, N]."""
+    sizes: dict[str, float] = {}
+    for data in (o.data for o in observations if o.data.header.unmeasured_torques):
+        eom = system.equations(data.q, data.qd, contact_table(data, system.contact_names))
+        force = (eom.M @ data.qdd[..., None])[..., 0] - eom.Q_C - eom.Q_G
+        rms = force.square().mean(0).sqrt().tolist()
+        sizes |= {joint: rms[data.joint_names.index(joint)] for joint in data.header.unmeasured_torques}
+    return sizes
+
+
 def _by_contact(name: str) -> Callable[[Dataset, ConstrainedSystem], Tensor]:
     def values(data: Dataset, system: ConstrainedSystem) -> Tensor:
         logged = data.contact_extras.get(name, {})

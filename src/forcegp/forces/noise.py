@@ -1,6 +1,6 @@
 """The noise of what a log measures: accelerations, motor torques, and the state.
 
-**Torques that are no function of the state.** Inside its static friction, the friction of a joint is whatever
+**Forces that are no function of the state.** Inside its static friction, the friction of a joint is whatever
 balances the other forces. A joint that hardly moves therefore has an unknown force of variance
 σ_s² e^{−(q̇/v_s)²} more. And noise learned where nothing moves says little about a jump: beyond the range of
 speeds and torques that a joint was trained on, its force has a standard deviation g D more, with D the
@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError
+from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.measurements import Measurement, NoiseStd, Training
 from forcegp.forces.priors.base import NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
@@ -47,6 +47,9 @@ class Noise:
             one per joint; `None` for none. It counts to first order (`forces/noise.py`).
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
             impacts and other outliers; `None` for Gaussian noise (`forces/noise_learning.py`).
+        external: standard deviation of an unknown force on some joints, by name [N m, N]: of a joint without a
+            torque sensor, or one that somebody moves by hand. Joints whose torque the log does not have get
+            the size of the force that moves them.
 
     Example:
         >>> Noise(0.1, torque="learn").learns_torque
@@ -61,9 +64,17 @@ class Noise:
     torque: NoiseStd | str | None = "auto"
     state: tuple[NoiseStd, NoiseStd] | None = None
     degrees_of_freedom: float | None = None
+    external: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         torque, nu = self.torque, self.degrees_of_freedom
+        for joint, size in (self.external or {}).items():
+            if not 0.0 < size < math.inf:
+                raise ModelError(
+                    f"the unknown force on joint {joint!r} has no such size",
+                    expected="a positive finite standard deviation [N m, N]",
+                    got=size,
+                )
         valid = torque is None or (isinstance(torque, str) and torque in ("auto", "learn"))
         if not valid and (isinstance(torque, str) or not bool((torch.as_tensor(torque) > 0.0).all())):
             raise ModelError(
@@ -100,6 +111,8 @@ TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
 """Name of the learned noise of the motor torque."""
 STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
 """Names of the learned σ_s and v_s of each joint."""
+EXTERNAL = f"{NOISE}.external.std"
+"""Name of the standard deviation of unknown forces on the joints `(nq,)`, which is not learned."""
 STICKING = 0.02
 """v_s where learning begins [rad/s, m/s]."""
 REGION = f"{NOISE}.region."
@@ -125,12 +138,28 @@ def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
     }
 
 
-def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of the friction of joints that stick, `(n, nq)`; zero where it is not learned."""
-    if STICK_NOISE not in tensors:
-        return torch.zeros_like(at.q)
-    std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
-    return std**2 * torch.exp(-((at.qd / speed) ** 2))
+def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> dict[str, Tensor]:
+    """The standard deviation of unknown forces on the joints, by its name; nothing where there are none.
+
+    Raises:
+        UnknownNameError: the robot has no such joint.
+    """
+    if not external:
+        return {}
+    for joint in external:
+        if joint not in robot.joint_names:
+            raise UnknownNameError("joint with an unknown force", joint, robot.joint_names)
+    return {EXTERNAL: robot.mass.new_tensor([external.get(joint, 0.0) for joint in robot.joint_names])}
+
+
+def hidden_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
+    """Variance of forces that neither the state nor a torque sensor tells, `(n, nq)`: of joints that stick,
+    and of unknown forces of stated size."""
+    variance = torch.zeros_like(at.q)
+    if STICK_NOISE in tensors:
+        std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
+        variance = std**2 * torch.exp(-((at.qd / speed) ** 2))
+    return variance + tensors[EXTERNAL] ** 2 if EXTERNAL in tensors else variance
 
 
 def trained_region(qd: Tensor, tau: Tensor, load: Tensor) -> dict[str, Tensor]:
@@ -176,9 +205,9 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def unknown_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of forces that only a prediction has: of joints that stick, and beyond the trained region
-    `(n, nq)`."""
-    variance = stick_variance(tensors, at)
+    """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and those beyond the
+    trained region."""
+    variance = hidden_variance(tensors, at)
     if GROWTH not in tensors:
         return variance
     return variance + (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()

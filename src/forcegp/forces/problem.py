@@ -18,7 +18,14 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Training
-from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian, stick_variance
+from forcegp.forces.noise import (
+    EXTERNAL,
+    TORQUE_NOISE,
+    ForceNoise,
+    SampleNoise,
+    hidden_variance,
+    state_jacobian,
+)
 from forcegp.forces.posterior import ForcePosterior, ForceProcess
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
@@ -138,7 +145,10 @@ class Problem:
         """Variance of the white noise on the joint force, or `None` for none."""
         learned = tensors.get(TORQUE_NOISE)
         std = self.torque_std if learned is None else learned.exp()
-        return None if std is None else lambda at: std**2 + stick_variance(tensors, at)
+        if std is None and EXTERNAL not in tensors:
+            return None
+        white = 0.0 if std is None else std**2
+        return lambda at: white + hidden_variance(tensors, at)
 
     def state_factor(self, system: ConstrainedSystem, measurement: int) -> Tensor | None:
         """G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` where no noise of the state reaches it."""

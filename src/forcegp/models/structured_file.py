@@ -91,6 +91,7 @@ class NoiseSettings(Record):
     torque: PositiveFloat | tuple[PositiveFloat, ...] | Literal["learn"] | None
     state: tuple[Stated, Stated] | None
     degrees_of_freedom: float | None = Field(gt=2.0)
+    external: dict[str, PositiveFloat] | None = None
 
 
 class StructuredSettings(StructuredOptions):

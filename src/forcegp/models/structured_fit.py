@@ -17,7 +17,6 @@ from forcegp.files import Record
 from forcegp.forces.measurements import Observation, Training
 from forcegp.forces.noise import (
     LOW,
-    STICK_NOISE,
     TORQUE_NOISE,
     distance_beyond,
     learned_slopes,
@@ -135,8 +134,7 @@ class StructuredFit(FittedModel):
         else:
             mean, spread = self.posterior.read(system, at, z)
             z = self.posterior.process.coupled(system, at, z)
-            if STICK_NOISE in self.hyperparameters:
-                spread = spread + _carried(z, unknown_variance(self.hyperparameters, at))
+            spread = spread + _carried(z, unknown_variance(self.hyperparameters, at))
             if noise:
                 spread = spread + self._noise_covariance(z, parts)
         beyond = self.beyond(at.qd, at.tau)

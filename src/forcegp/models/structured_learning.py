@@ -36,7 +36,7 @@ from forcegp.forces.measurements import (
     training_of,
     without_impacts,
 )
-from forcegp.forces.noise import REGION, TORQUE_NOISE, Noise, state_std_of
+from forcegp.forces.noise import REGION, TORQUE_NOISE, Noise, external_std, state_std_of
 from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
@@ -100,12 +100,16 @@ class Specification:
         """The specification with the noise that was left to the data.
 
         The noise of accelerations is learned with that of the torque, or to compare sets of priors, if nobody
-        states it.
+        states it. Joints without a measured torque carry an unknown force.
         """
-        learns = self.noise.learns_torque or self.automatic
-        if learns and self.noise.acceleration is None and not states_noise(observations_of(data)):
-            return dataclasses.replace(self, noise=dataclasses.replace(self.noise, learn=True))
-        return self
+        observations, noise = observations_of(data), self.noise
+        learns = noise.learns_torque or self.automatic
+        if learns and noise.acceleration is None and not states_noise(observations):
+            noise = dataclasses.replace(noise, learn=True)
+        unmeasured = unmeasured_forces(self.system, observations)
+        if unmeasured:
+            noise = dataclasses.replace(noise, external={**unmeasured, **(noise.external or {})})
+        return dataclasses.replace(self, noise=noise)
 
     def with_options(self, **changed: Any) -> Specification:
         """The specification with other options."""
@@ -296,6 +300,7 @@ def search_of(
         return name in problem.pinned or (chosen is not None and name not in chosen)
 
     held = {key: value for key, value in current.items() if is_held(key.split(".")[0])}
+    held |= external_std(spec.noise.external, spec.system.robot)
     return Search({key: value for key, value in start.items() if key not in held}, held, options)
 
 

@@ -58,6 +58,7 @@ class NoiseSection(Section):
     torque: PositiveFloat | tuple[PositiveFloat, ...] | Literal["auto", "learn", "none"] = "auto"
     state: tuple[State, State] | None = None
     degrees_of_freedom: PositiveFloat | None = None
+    external: dict[str, PositiveFloat] | None = None
 
 
 class ModelSection(Section, StructuredOptions):
