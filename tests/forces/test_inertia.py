@@ -222,15 +222,16 @@ def test_a_log_that_cannot_check_the_inertia_says_so(file: RobotModel, free: int
     """In contact the multiplier takes what the masses of the file are wrong by."""
     wire = forcegp.SurfaceContact("wire", "tip", (0.0, 0.0, 0.0), forcegp.Plane(offset=-0.2))
     system, prior, data = forcegp.ConstrainedSystem(file, [wire]), JointFrictionPrior(), log(file)
+    model = forcegp.StructuredGP(system, "analytical", [prior], inertia="auto")
     data = data.replace(contact={"wire": torch.arange(len(data)) >= free})
     training = training_of(data, system, (prior,), None, {})
-    doubts = inertia_of(system, prior, AnalyticalMean(), training).doubts
+    doubts = model.specification.inertia_of(training).doubts
     assert any(f"{free} samples in free motion are too few" in doubt for doubt in doubts) == warns
     force = Observation(
         data.replace(contact_extras={"multiplier": {"wire": data.t}}), "multiplier", noise_std=0.5
     )
     sensed = training_of([Observation(data), force], system, (prior,), None, {})
-    doubts = inertia_of(system, prior, AnalyticalMean(), sensed).doubts
+    doubts = model.specification.inertia_of(sensed).doubts
     assert not any("in free motion" in doubt for doubt in doubts), "a measured force tells"
 
 
