@@ -7,8 +7,9 @@ import pytest
 import torch
 
 import forcegp
+from forcegp.constraints.gauss import tangent_frame
 from forcegp.errors import ModelError, UnknownNameError
-from forcegp.forces.priors.contact import TERMS, ContactForcePrior, SlidingFrictionPrior, tangent_frame
+from forcegp.forces.priors.contact import TERMS, ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.quantities import States, states
 from random_data import random_data, table_system
 

@@ -5,6 +5,7 @@ Differentiating twice gives A q̈ = b with A = ∂c/∂q and b = −Ȧ q̇ (eq. 
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.linalg import vecdot
 
-from forcegp.constraints.gauss import ContactPoint
+from forcegp.constraints.gauss import ContactPoint, tangent_frame
 from forcegp.constraints.surface import Surface, check_point
 from forcegp.errors import ParameterError
 from forcegp.kinematics import Anchor, PointMotion, skew
@@ -29,12 +30,14 @@ class ConstraintTerms(NamedTuple):
         A: `(*batch, rows, nq)` Jacobian of c.
         b: `(*batch, rows)` with A q̈ = b, no stabilization.
         point: the touching point, for a contact with a surface.
+        holds: `(*batch, rows)` bool, rows that hold at this state; all where `None`.
     """
 
     c: Tensor
     A: Tensor
     b: Tensor
     point: ContactPoint | None = None
+    holds: Tensor | None = None
 
 
 class Constraint(ABC):
@@ -70,15 +73,23 @@ class SurfaceContact(Constraint):
     tip is a ball of radius r around p. It touches in p − r n, whose material velocity is ṗ + ω × (−r n), so
     J_E = J_p + r [n]ₓ J_ω: friction at a rounded tip has the lever arm −r n, the normal force has none.
 
+    A contact that may stick has two more rows, (t_1, t_2)ᵀ J_E q̇ = 0 with the tangent frame of the surface,
+    which hold while the touching point moves along it by less than `stick_speed`. Their multipliers are
+    the components of a tangential force that no law of sliding gives. They have no limit: no friction cone
+    ends sticking in a rollout.
+
     Args:
         name: name of the contact, as in `contact.<name>` of a data set.
         frame: link or frame that carries the point.
         point: coordinates in that frame [m]; of a rounded tip, its centre.
         surface: the surface, in the world.
         radius: r of a rounded tip; 0 is a sharp one [m].
+        stick_speed: speed along the surface below which the touching point sticks [m/s]; `None` for a contact
+            that always slides.
 
     Raises:
-        ParameterError: the radius is negative, or the surface is not a signed distance.
+        ParameterError: the radius is negative, the surface is not a signed distance, or the speed is not
+            positive.
 
     Example:
         >>> from forcegp import Plane
@@ -91,10 +102,19 @@ class SurfaceContact(Constraint):
     frame: str
     point: Sequence[float]
     surface: Surface
-    rows: int = 1
+    rows: int = field(default=1, init=False)
     radius: float = field(default=0.0, kw_only=True)
+    stick_speed: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        if self.stick_speed is not None:
+            if not 0.0 < self.stick_speed < float("inf"):
+                raise ParameterError(
+                    f"contact {self.name!r} cannot stick below such a speed",
+                    expected="a positive finite speed [m/s], or None for a contact that always slides",
+                    got=self.stick_speed,
+                )
+            object.__setattr__(self, "rows", 3)
         if not 0.0 <= self.radius < float("inf"):
             raise ParameterError(
                 f"the tip of contact {self.name!r} has no such radius",
@@ -124,17 +144,30 @@ class SurfaceContact(Constraint):
         J, velocity = tip.jacobian[..., 3:, :], tip.twist[..., 3:]
         A = vecdot(normal[..., None], J, dim=-2)[..., None, :]
         b = -(vecdot(normal, tip.bias[..., 3:]) + surface.curvature(tip.position, velocity))
-        touching = ContactPoint(tip.position, velocity, J, normal)
+        touching, bias = ContactPoint(tip.position, velocity, J, normal), tip.bias[..., 3:]
         if self.radius:
             # The touching material point p − r n has the velocity ṗ + ω × (−r n) and J_E = J_p + r [n]ₓ J_ω.
-            arm = -self.radius * normal
+            arm, omega = -self.radius * normal, tip.twist[..., :3]
             touching = ContactPoint(
                 tip.position + arm,
-                velocity + torch.linalg.cross(tip.twist[..., :3], arm),
+                velocity + torch.linalg.cross(omega, arm),
                 J - skew(arm) @ tip.jacobian[..., :3, :],
                 normal,
             )
-        return ConstraintTerms(c[..., None], A, b[..., None], touching)
+            # J̇_E q̇ = J̇_p q̇ + J̇_ω q̇ × (−r n) + ω × (−r ṅ), ṅ = ∇²c ṗ
+            turning = torch.func.jvp(surface.gradient, (tip.position,), (velocity,))[1]
+            bias = bias + torch.linalg.cross(tip.bias[..., :3], arm)
+            bias = bias - self.radius * torch.linalg.cross(omega, turning)
+        if self.stick_speed is None:
+            return ConstraintTerms(c[..., None], A, b[..., None], touching)
+        # A = (∇c, t_1, t_2)ᵀ J_E; where the point rests, the tangent frame may be taken to stand still.
+        along, speed = tangent_frame(touching.unit_normal), touching.sliding[1].norm(dim=-1, keepdim=True)
+        sticks = speed < self.stick_speed
+        touching = dataclasses.replace(touching, sticks=sticks[..., 0])
+        A = torch.cat([A, along.mT @ touching.jacobian], dim=-2)
+        b = torch.cat([b[..., None], -(along.mT @ bias[..., None])[..., 0]], dim=-1)
+        holds = torch.cat([torch.ones_like(sticks), sticks, sticks], dim=-1)
+        return ConstraintTerms(torch.nn.functional.pad(c[..., None], (0, 2)), A, b, touching, holds)
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,24 @@ def rank_tolerance(dtype: torch.dtype) -> float:
     return max(RANK_TOLERANCE, ROUNDING * torch.finfo(dtype).eps)
 
 
+FACING_DOWN = 1e-6
+"""A normal is −e_z where 1 + n_z is below this; the smallest rotation has no direction there."""
+
+
+def tangent_frame(n: Tensor) -> Tensor:
+    """Two unit vectors along the surface at unit normals n `(*batch, 3)`, `(*batch, 3, 2)`.
+
+    The columns are R e_x and R e_y with R e_z = n and the smallest rotation R = 1 + [w]ₓ + [w]ₓ²/(1 + n_z),
+    w = e_z × n; at n = −e_z, half a turn about e_x.
+    """
+    x, y, z = n.unbind(-1)
+    down = 1.0 + z < FACING_DOWN
+    share = torch.where(down, 0.0, 1.0 / torch.where(down, 1.0, 1.0 + z))
+    first = torch.stack([1.0 - x * x * share, -x * y * share, -x], dim=-1)
+    second = torch.stack([-x * y * share, torch.where(down, -1.0, 1.0) - y * y * share, -y], dim=-1)
+    return torch.stack([first, second], dim=-1)
+
+
 @dataclass(frozen=True, eq=False)
 class ContactPoint:
     """The point of the robot that touches a surface; of a rounded tip, the material point that touches now.
@@ -51,12 +69,14 @@ class ContactPoint:
         position, velocity: `(*batch, 3)` in the world [m], [m/s].
         jacobian: J_E `(*batch, 3, nq)`, world axes.
         normal: ∇c `(*batch, 3)` at the point.
+        sticks: `(*batch,)` bool, whether it rests on the surface; `None` where the contact always slides.
     """
 
     position: Tensor
     velocity: Tensor
     jacobian: Tensor
     normal: Tensor
+    sticks: Tensor | None = None
 
     @cached_property
     def unit_normal(self) -> Tensor:
@@ -69,6 +89,12 @@ class ContactPoint:
         surface."""
         n, J, v = self.unit_normal, self.jacobian, self.velocity
         return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
+
+    def directions(self, rows: int) -> Tensor:
+        """Directions of the multipliers `(*batch, 3, rows)`: ∇c, and the tangent frame of a contact that may
+        stick."""
+        normal = self.normal[..., None]
+        return normal if rows == 1 else torch.cat([normal, tangent_frame(self.unit_normal)], dim=-1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -287,6 +287,9 @@ class ConstrainedSystem:
         cd = vecdot(A, qd[..., None, :])
         if self.baumgarte is not None:
             b = self.baumgarte.stabilized(b, c, cd)
-        # A = 0 and b = 0 for open contacts
+        # A = 0 and b = 0 for open contacts, and along the surface where a contact slides
         open_ = self.active_rows(active, q.shape[:-1]).logical_not()
+        if any(term.holds is not None for term in terms):
+            holds = [torch.ones_like(t.b, dtype=torch.bool) if t.holds is None else t.holds for t in terms]
+            open_ = open_ | torch.cat(holds, dim=-1).logical_not()
         return c, cd, A.masked_fill(open_[..., None], 0.0), b.masked_fill(open_, 0.0)

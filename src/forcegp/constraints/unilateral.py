@@ -104,7 +104,7 @@ def rows_of(system: ContactSystem, active: Tensor) -> Tensor:
 
 
 def any_row(system: ContactSystem, rows: Array) -> Array:
-    """Whether any row of each contact is set: `(*batch, n_contacts)` bool from `(*batch, m)` bool."""
+    """Whether any row of each constraint is set: `(*batch, n_contacts)` bool from `(*batch, m)` bool."""
     if system.m == len(system.contacts):
         return rows
     ends = np.cumsum([contact.rows for contact in system.contacts])
@@ -112,14 +112,20 @@ def any_row(system: ContactSystem, rows: Array) -> Array:
     return torch.stack(parts, -1) if isinstance(rows, Tensor) else np.stack(parts, -1)
 
 
+def normal_rows(system: ContactSystem, rows: Array) -> Array:
+    """The first row of each contact, that of its normal: `(*batch, n_contacts)` from `(*batch, m)`."""
+    first = [sum(contact.rows for contact in system.contacts[:i]) for i in range(len(system.contacts))]
+    return rows[..., first]
+
+
 def pulling(system: ContactSystem, active: Array, multiplier: Array) -> Array:
     """Closed contacts `(*batch, n_contacts)` that would have to pull, λ `(*batch, m)` < 0, and that open."""
-    return any_row(system, multiplier < -PULL) & can_open(system, active) & active
+    return normal_rows(system, multiplier < -PULL) & can_open(system, active) & active
 
 
 def reached(system: ContactSystem, active: Array, c: Array, cd: Array) -> Array:
     """Open contacts `(*batch, n_contacts)` that the robot has reached, c ≤ 0 while ċ < 0, and that close."""
-    return any_row(system, (c <= 0.0) & (cd < -APPROACH)) & can_open(system, active) & ~active
+    return normal_rows(system, (c <= 0.0) & (cd < -APPROACH)) & can_open(system, active) & ~active
 
 
 def project_velocity(eom: Any, qd: Array) -> Array:

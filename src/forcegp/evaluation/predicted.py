@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.unilateral import normal_rows
 from forcegp.data import Dataset
 from forcegp.evaluation.scores import share
 from forcegp.models.base import Predictor
@@ -117,7 +118,7 @@ class MultiplierScore:
 
 @torch.no_grad()
 def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Compare λ with what a simulator or another sensor logged as `multiplier`, for contacts of one row each.
+    """Compare λ with what a simulator or another sensor logged as `multiplier`, each normal force.
 
     There is one score per contact with a logged multiplier and at least two samples in contact.
     """
@@ -125,10 +126,11 @@ def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore,
     def predict(part: Dataset) -> Moments:
         states, active = (part.q, part.qd, part.tau), part.active(model.system.contact_names)
         predicted = model.predict(*states, "multiplier", active=active)
-        variance = predicted.variance
+        mean, variance = predicted.mean, predicted.variance
         if variance is not None and isinstance(model, StructuredFit):
             variance = variance + model.noise_variance(*states, "multiplier", active, sensor=False)
-        return predicted.mean, None if variance is None else variance.clamp(min=0.0).sqrt()
+        mean = normal_rows(model.system, mean)
+        return mean, None if variance is None else normal_rows(model.system, variance).clamp(min=0.0).sqrt()
 
     return _scores(model, data, *in_chunks(predict, data)) if _comparable(model, data) else ()
 
@@ -149,9 +151,9 @@ def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...
 
 
 def _comparable(model: Predictor, data: Dataset) -> bool:
-    """Whether λ has one row per contact and was logged for one of them."""
-    logged, names = data.contact_extras.get("multiplier", {}), model.system.contact_names
-    return model.system.m == len(names) and any(name in logged for name in names)
+    """Whether the normal force was logged for one of the contacts."""
+    logged = data.contact_extras.get("multiplier", {})
+    return any(name in logged for name in model.system.contact_names)
 
 
 def _scores(model: Predictor, data: Dataset, mean: Tensor, std: Tensor | None) -> tuple[MultiplierScore, ...]:

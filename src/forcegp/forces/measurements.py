@@ -295,7 +295,7 @@ def states_noise(observations: Sequence[Observation]) -> bool:
 
 @torch.no_grad()
 def unmeasured_forces(system: ConstrainedSystem, observations: Sequence[Observation]) -> dict[str, float]:
-    """Root mean square of M q̈ − Q_C − Q_G of the joints whose torque a log does not have, by name [N m, N]."""
+    """Root mean square of M q̈ − Q_C − Q_G of the joints whose torque a log lacks, by name [N m, N]."""
     sizes: dict[str, float] = {}
     for data in (o.data for o in observations if o.data.header.unmeasured_torques):
         eom = system.equations(data.q, data.qd, contact_table(data, system.contact_names))
@@ -311,6 +311,13 @@ def _by_contact(name: str) -> Callable[[Dataset, ConstrainedSystem], Tensor]:
         for contact in system.contact_names:
             if contact not in logged:
                 raise UnknownNameError(f"contact with a logged {name}", contact, logged)
+            if name == "multiplier" and logged[contact].ndim < system.contact(contact).rows - 1:
+                raise ModelError(
+                    f"contact {contact!r} may stick, and only its normal force is logged",
+                    expected="three components",
+                    got="one",
+                    hint='observe "contact_force", with a large noise_std of what was not measured',
+                )
         columns = [logged[contact] for contact in system.contact_names]
         return torch.cat([x[:, None] if x.ndim == 1 else x for x in columns], dim=-1)
 

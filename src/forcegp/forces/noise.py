@@ -47,9 +47,9 @@ class Noise:
             one per joint; `None` for none. It counts to first order (`forces/noise.py`).
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
             impacts and other outliers; `None` for Gaussian noise (`forces/noise_learning.py`).
-        external: standard deviation of an unknown force on some joints, by name [N m, N]: of a joint without a
-            torque sensor, or one that somebody moves by hand. Joints whose torque the log does not have get
-            the size of the force that moves them.
+        external: standard deviation of an unknown force on some joints, by name [N m, N]: of a joint without
+            a torque sensor, or one that somebody moves by hand. Joints whose torque the log does not have
+            get the size of the force that moves them.
 
     Example:
         >>> Noise(0.1, torque="learn").learns_torque
@@ -111,8 +111,6 @@ TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
 """Name of the learned noise of the motor torque."""
 STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
 """Names of the learned σ_s and v_s of each joint."""
-EXTERNAL = f"{NOISE}.external.std"
-"""Name of the standard deviation of unknown forces on the joints `(nq,)`, which is not learned."""
 STICKING = 0.02
 """v_s where learning begins [rad/s, m/s]."""
 REGION = f"{NOISE}.region."
@@ -138,28 +136,26 @@ def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
     }
 
 
-def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> dict[str, Tensor]:
-    """The standard deviation of unknown forces on the joints, by its name; nothing where there are none.
+def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Tensor | None:
+    """Standard deviation of unknown forces on the joints `(nq,)`; `None` where there are none.
 
     Raises:
         UnknownNameError: the robot has no such joint.
     """
-    if not external:
-        return {}
-    for joint in external:
+    for joint in external or {}:
         if joint not in robot.joint_names:
             raise UnknownNameError("joint with an unknown force", joint, robot.joint_names)
-    return {EXTERNAL: robot.mass.new_tensor([external.get(joint, 0.0) for joint in robot.joint_names])}
+    if not external:
+        return None
+    return robot.mass.new_tensor([external.get(joint, 0.0) for joint in robot.joint_names])
 
 
-def hidden_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of forces that neither the state nor a torque sensor tells, `(n, nq)`: of joints that stick,
-    and of unknown forces of stated size."""
-    variance = torch.zeros_like(at.q)
-    if STICK_NOISE in tensors:
-        std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
-        variance = std**2 * torch.exp(-((at.qd / speed) ** 2))
-    return variance + tensors[EXTERNAL] ** 2 if EXTERNAL in tensors else variance
+def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
+    """Variance of the friction of joints that stick, `(n, nq)`; zero where it is not learned."""
+    if STICK_NOISE not in tensors:
+        return torch.zeros_like(at.q)
+    std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
+    return std**2 * torch.exp(-((at.qd / speed) ** 2))
 
 
 def trained_region(qd: Tensor, tau: Tensor, load: Tensor) -> dict[str, Tensor]:
@@ -204,13 +200,11 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-def unknown_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and those beyond the
-    trained region."""
-    variance = hidden_variance(tensors, at)
+def beyond_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
+    """Variance of forces beyond the trained region, g² D² `(n, nq)`; zero where it is not learned."""
     if GROWTH not in tensors:
-        return variance
-    return variance + (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
+        return torch.zeros_like(at.q)
+    return (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
 
 
 ForceNoise = Callable[[States], Tensor]

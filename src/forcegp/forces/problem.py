@@ -19,17 +19,18 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import (
-    EXTERNAL,
     TORQUE_NOISE,
     ForceNoise,
     SampleNoise,
-    hidden_variance,
+    beyond_variance,
     state_jacobian,
+    stick_variance,
 )
 from forcegp.forces.posterior import ForcePosterior, ForceProcess
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
+from forcegp.forces.quantities import States
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.exact import ExactPosterior, require_exact_fits
 from forcegp.gp.features import Features, Standardization
@@ -46,6 +47,8 @@ MIXED = "." + MIXING
 """End of the names of what operators learn."""
 SHOWN = 10.0
 """Independent samples at which accelerations show the torque of a joint, from which its noise is learned."""
+UNSHOWN = 0.1
+"""Part of its load by which the torque of a joint is uncertain, with its friction, where nothing shows it."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -82,6 +85,7 @@ class Problem:
             minus this value, its posterior mean zero, and the others are conditioned on that.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
         state_std: standard deviation of the noise of q and q̇, `(2 nq,)`, or `None` for none.
+        external_std: standard deviation of unknown forces on the joints `(nq,)`, or `None` for none.
     """
 
     system: ConstrainedSystem
@@ -95,6 +99,7 @@ class Problem:
     inducing: tuple[Features, ...] | None = None
     pinned: Mapping[str, Tensor] = field(default_factory=dict)
     state_std: Tensor | None = None
+    external_std: Tensor | None = None
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """The system with the robot at the analytical parameters among the tensors."""
@@ -145,10 +150,21 @@ class Problem:
         """Variance of the white noise on the joint force, or `None` for none."""
         learned = tensors.get(TORQUE_NOISE)
         std = self.torque_std if learned is None else learned.exp()
-        if std is None and EXTERNAL not in tensors:
+        if std is None and self.external_std is None:
             return None
         white = 0.0 if std is None else std**2
-        return lambda at: white + hidden_variance(tensors, at)
+        return lambda at: white + self.hidden_variance(tensors, at)
+
+    def hidden_variance(self, tensors: Mapping[str, Tensor], at: States) -> Tensor:
+        """Variance of forces that neither the state nor a torque sensor tells, `(n, nq)`: of joints that
+        stick, and unknown ones of stated size."""
+        variance = stick_variance(tensors, at)
+        return variance if self.external_std is None else variance + self.external_std**2
+
+    def unknown_variance(self, tensors: Mapping[str, Tensor], at: States) -> Tensor:
+        """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and those beyond
+        the trained region."""
+        return self.hidden_variance(tensors, at) + beyond_variance(tensors, at)
 
     def state_factor(self, system: ConstrainedSystem, measurement: int) -> Tensor | None:
         """G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` where no noise of the state reaches it."""
@@ -207,13 +223,15 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Root mean square of what may act on joints that accelerations hardly show, 0 for others `(nq,)`.
+        """Standard deviation of what may act on joints that accelerations hardly show, 0 for others `(nq,)`.
 
         In contact, a force along the constraint changes no acceleration. A joint that pushes there has P_ii
         near zero, and neither its noise nor its friction can be told from that of other joints. At most, it
-        explains all of the residual of its acceleration at such samples, s² = Σ r_i² / Σ H_ii². That counts
-        for joints with P_ii below a half at most samples and above it at fewer than `SHOWN` independent ones,
-        unless forces were measured too.
+        explains all of the residual of its acceleration at such samples that unknown forces e of stated size
+        leave, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii². At least, it is `UNSHOWN` of the load of such
+        joints: friction goes with the size of a drive rather than with its load. That counts for joints with
+        P_ii below a half at most samples and above it at fewer than `SHOWN` independent ones, unless forces
+        were measured too.
         """
         if set(self.training.quantities) != {"qdd"}:
             return torch.zeros_like(self.system.robot.mass)
@@ -222,14 +240,19 @@ class Problem:
             at = m.at(self.system)
             residual = m.values - at.eom.acceleration(self.mean(self.system, at))
             H, P = (X.diagonal(dim1=-2, dim2=-1) for X in (at.eom.H, at.eom.P))
-            squares.append(residual**2)
+            stated = 0.0 if self.external_std is None else at.eom.H**2 @ self.external_std**2
+            squares.append(residual**2 - stated)
             responses.append(H**2)
             shown.append((P > 0.5).to(P))
         r2, H2, visible = (torch.cat(x) for x in (squares, responses, shown))
         unseen = 1.0 - visible
         most = (unseen * r2).sum(0) / (unseen * H2).sum(0).clamp(min=1e-300)
         hidden = (visible.mean(0) < 0.5) & (self.power * visible.sum(0) < SHOWN)
-        return torch.where(hidden, most.sqrt(), 0.0)
+        turns = self.system.robot.revolute > 0.0
+        load, least = self.typical_load(), torch.zeros_like(most)
+        for alike in (hidden & turns, hidden & ~turns):
+            least[alike] = UNSHOWN * load[alike].square().mean().sqrt()
+        return torch.where(hidden, most.clamp(min=0.0).sqrt().maximum(least), 0.0)
 
     @torch.no_grad()
     def typical_load(self) -> Tensor:

@@ -179,23 +179,17 @@ def _constraint_force(system: ConstrainedSystem, at: States) -> AffineMap:
 
 
 def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
-    """F_I = ∇c λ of each surface contact, three Cartesian components per contact, in the order of the
-    contacts."""
+    """F_I = ∇c λ of each surface contact, and (t_1, t_2) λ_t where it sticks: three Cartesian components per
+    contact, in the order of the contacts."""
     multiplier = _multiplier(system, at)
-    rows, columns = [], []
-    first = 0
+    # F_I = N λ, with the directions of each contact in its rows and columns of N
+    blocks, first = [at.q.new_zeros(len(at.q), 0, system.m)], 0
     for contact in system.contacts:
         if contact.name in at.eom.contact_points:
-            rows.append(first)
-            columns.append(at.eom.contact_points[contact.name].normal)
+            own = at.eom.contact_points[contact.name].directions(contact.rows)
+            blocks.append(torch.nn.functional.pad(own, (first, system.m - first - contact.rows)))
         first += contact.rows
-    # F_I = N λ, with ∇c of each contact in its rows and column of N
-    normals = at.q.new_zeros(len(at.q), 3 * len(rows), system.m)
-    for i, (row, normal) in enumerate(zip(rows, columns, strict=True)):
-        normals = normals.slice_scatter(
-            normals[:, 3 * i : 3 * i + 3].select_scatter(normal, 2, row), 1, 3 * i, 3 * i + 3
-        )
-    return _times(normals, multiplier)
+    return _times(torch.cat(blocks, dim=1), multiplier)
 
 
 def _total_force(system: ConstrainedSystem, at: States) -> AffineMap:

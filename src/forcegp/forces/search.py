@@ -72,7 +72,9 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     if problem.has_coulomb:
         start = _with_friction(few, noise)
     else:
-        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks)
+        start = initial_hyperparameters(
+            problem.priors, few.fixed_rows.blocks, problem.external_std is not None
+        )
     for prior in problem.priors:
         parameters = prior.initial_parameters(problem.system.robot)
         start |= {f"{prior.name}.{name}": value for name, value in parameters.items()}
@@ -103,7 +105,10 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
             for key, value in friction.items()
         }
         rows = few.rows({**trial, **noise})
-        return {**initial_hyperparameters(few.priors, rows.blocks), **trial}, rows
+        return {
+            **initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None),
+            **trial,
+        }, rows
 
     def value(x: float) -> float:
         start, rows = start_at(x)
@@ -115,19 +120,27 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     return start_at(float(optimum.x))[0]
 
 
-def initial_hyperparameters(priors: Sequence[ForcePrior], blocks: Sequence[Block]) -> dict[str, Tensor]:
-    """Initial log-hyperparameters, by `<prior>.<name>`."""
+def initial_hyperparameters(
+    priors: Sequence[ForcePrior], blocks: Sequence[Block], beyond_noise: bool = False
+) -> dict[str, Tensor]:
+    """Initial log-hyperparameters, by `<prior>.<name>`.
+
+    Args:
+        priors: force priors.
+        blocks: whitened rows.
+        beyond_noise: whether the noise of the rows explains its share, as where unknown forces are stated.
+    """
     params: dict[str, Tensor] = {}
     # Some priors share the hyperparameters of another one.
     for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
-        scale = _force_scale(p, blocks, prior.commensurate)
+        scale = _force_scale(p, blocks, prior.commensurate, beyond_noise)
         initial = prior.kernel.initial(len(scale), widths, scale.log().cpu().double())
         params |= {f"{prior.name}.{name}": value.to(scale.device) for name, value in initial.items()}
     return params
 
 
-def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool) -> Tensor:
+def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool) -> Tensor:
     """Root mean square of the least-squares force of prior p, `(components,)`.
 
     Rows tell only the sum of components that act along one direction. The least norm divides it evenly where
@@ -142,11 +155,13 @@ def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool) -> Tensor:
     weight = torch.zeros_like(total)
     for block in blocks:
         W = block.operators[p]
-        force = torch.zeros_like(W[:, 0])
-        force[:, groups] = (torch.linalg.pinv(W[..., groups], rtol=1e-6) @ block.target[..., None])[..., 0]
+        inverse, square = torch.linalg.pinv(W[..., groups], rtol=1e-6), torch.zeros_like(W[:, 0])
+        square[:, groups] = (inverse @ block.target[..., None])[..., 0] ** 2
+        if beyond_noise:
+            square[:, groups] -= inverse.square().sum(-1)
         size = torch.where(alone, 1.0, W.square().sum(1))
-        total, weight = total + (force**2 * size)[:, first].sum(0), weight + size.sum(0)
-    return (total / weight.clamp(min=1e-300)).sqrt().clamp(1e-3, 1e4)
+        total, weight = total + (square * size)[:, first].sum(0), weight + size.sum(0)
+    return (total.clamp(min=0.0) / weight.clamp(min=1e-300)).sqrt().clamp(1e-3, 1e4)
 
 
 def _first_parallel(operators: Sequence[Tensor]) -> Tensor:

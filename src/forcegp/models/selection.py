@@ -70,9 +70,11 @@ class Candidate:
 
 
 def candidates_of(spec: Specification) -> list[Candidate]:
-    """The candidates for a model, simplest first."""
+    """The candidates for a model, simplest first; with unknown forces on joints, those with noise of the
+    torque."""
     candidates = []
-    for chosen in (each for each in SETS.values() if each.fits(spec.system)):
+    sets = [each for each in SETS.values() if each.fits(spec.system)]
+    for chosen in sets if not spec.noise.external else [each for each in sets if each.has_joint_friction]:
         asks = (
             spec.options.inertia != "file"
             and chosen.has_joint_friction

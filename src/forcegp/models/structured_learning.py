@@ -34,6 +34,7 @@ from forcegp.forces.measurements import (
     observations_of,
     states_noise,
     training_of,
+    unmeasured_forces,
     without_impacts,
 )
 from forcegp.forces.noise import REGION, TORQUE_NOISE, Noise, external_std, state_std_of
@@ -143,7 +144,16 @@ class Specification:
         if noise.torque is not None and not isinstance(noise.torque, str):
             std = torch.as_tensor(noise.torque, dtype=robot.dtype, device=robot.device).expand(robot.nq)
         state_std, theta = state_std_of(noise.state, robot), self.analytical_parameters
-        return Problem(self.system, self.priors, self.mean, training, theta, std, state_std=state_std)
+        return Problem(
+            self.system,
+            self.priors,
+            self.mean,
+            training,
+            theta,
+            std,
+            state_std=state_std,
+            external_std=external_std(noise.external, robot),
+        )
 
 
 def _unchecked_masses(training: Training) -> tuple[str, ...]:
@@ -300,7 +310,6 @@ def search_of(
         return name in problem.pinned or (chosen is not None and name not in chosen)
 
     held = {key: value for key, value in current.items() if is_held(key.split(".")[0])}
-    held |= external_std(spec.noise.external, spec.system.robot)
     return Search({key: value for key, value in start.items() if key not in held}, held, options)
 
 

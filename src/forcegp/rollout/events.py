@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forcegp.constraints.unilateral import project_velocity, pulling, reached, rows_of
+from forcegp.constraints.unilateral import normal_rows, project_velocity, pulling, reached, rows_of
 from forcegp.errors import ModelError
 from forcegp.rollout.inputs import ForwardModel
 from forcegp.rollout.law import Instant, RolloutProblem, State, Step
@@ -46,8 +46,7 @@ def _signal(problem: RolloutProblem, state: State, now: Instant) -> tuple[Tensor
     system, active = problem.system, state.active
     crossed = pulling(system, active, now.multiplier) | reached(system, active, now.c, now.cd)
     signal = torch.where(rows_of(system, active), now.multiplier, now.c)
-    first = torch.cumsum(torch.tensor([0] + [contact.rows for contact in system.contacts]), 0)[:-1]
-    return signal[:, first.to(signal.device)], crossed
+    return normal_rows(system, signal), crossed
 
 
 def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:

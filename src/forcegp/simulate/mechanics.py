@@ -125,6 +125,8 @@ class Mechanics:
         if self._system.baumgarte is not None:
             b = self._system.baumgarte.stabilized(*(torch.from_numpy(x) for x in (b, c, cd))).numpy()
         rows = np.ones(len(b)) if active is None else np.repeat(active, self._rows)
+        holds = [np.ones(x.b.shape) if x.holds is None else x.holds.numpy() for x in terms]
+        rows = rows * np.concatenate([np.zeros(0), *holds])
         Q_D = dynamics.damping_force(self._system.robot, velocity).numpy()
         rotation, position, jacobian, bias = frames[0]
         return StateEquations(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from forcegp import kinematics
-from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.control.plan import Plan
 from forcegp.control.trajectory import Reference
 from forcegp.data.dataset import Dataset
@@ -204,10 +204,10 @@ def _dataset(
 
 
 def _multipliers(system: ConstrainedSystem, log: RunLog) -> dict[str, dict[str, Tensor]]:
-    """λ by contact, for constraints of one row."""
+    """Normal force of each contact with a surface."""
     if not system.contacts:
         return {}
     parts = log.multiplier.split([contact.rows for contact in system.contacts], dim=-1)
     named = zip(system.contacts, parts, strict=True)
-    single = {contact.name: part[:, 0] for contact, part in named if contact.rows == 1}
+    single = {contact.name: part[:, 0] for contact, part in named if isinstance(contact, SurfaceContact)}
     return {"multiplier": single} if single else {}

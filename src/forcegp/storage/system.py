@@ -61,10 +61,12 @@ class ContactFields(Record):
     point: Point = (0.0, 0.0, 0.0)
     surface: SurfaceSchema
     radius: float = 0.0
+    stick_speed: float | None = None
 
     def build(self) -> Constraint:
         """The constraint."""
-        return SurfaceContact(self.name, self.frame, self.point, self.surface, radius=self.radius)
+        further = {"radius": self.radius, "stick_speed": self.stick_speed}
+        return SurfaceContact(self.name, self.frame, self.point, self.surface, **further)
 
 
 class ConnectionFields(Record):

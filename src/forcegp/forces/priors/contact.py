@@ -37,7 +37,7 @@ from torch.linalg import vecdot
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.constraints.gauss import ContactPoint
+from forcegp.constraints.gauss import ContactPoint, tangent_frame
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, COULOMB, ForcePrior, check_inputs
@@ -49,31 +49,15 @@ from forcegp.robot.model import RobotModel
 WIDTHS = {"position": 2, "velocity": 2, "speed": 1}
 """Columns of each input: tangential coordinates of the touching point [m] and of its velocity [m/s], and how
 fast it slides [m/s]."""
-FACING_DOWN = 1e-6
-"""A normal is −e_z where 1 + n_z is below this; the smallest rotation has no direction there."""
 TERMS = ("viscous", "dry", "coulomb", "stribeck", "torsion")
 """Kinds of friction, in the order of the components of the latent function."""
 LOADED = ("coulomb", "stribeck", "torsion")
 """Kinds that are proportional to the multiplier."""
 
 
-def tangent_frame(n: Tensor) -> Tensor:
-    """Two unit vectors along the surface at unit normals n `(*batch, 3)`, `(*batch, 3, 2)`.
-
-    The columns are R e_x and R e_y with R e_z = n and the smallest rotation R = 1 + [w]ₓ + [w]ₓ²/(1 + n_z),
-    w = e_z × n; at n = −e_z, half a turn about e_x.
-    """
-    x, y, z = n.unbind(-1)
-    down = 1.0 + z < FACING_DOWN
-    share = torch.where(down, 0.0, 1.0 / torch.where(down, 1.0, 1.0 + z))
-    first = torch.stack([1.0 - x * x * share, -x * y * share, -x], dim=-1)
-    second = torch.stack([-x * y * share, torch.where(down, -1.0, 1.0) - y * y * share, -y], dim=-1)
-    return torch.stack([first, second], dim=-1)
-
-
 @dataclass(frozen=True)
 class SurfaceForcePrior(ForcePrior):
-    """A force at a contact with a surface, where it is closed."""
+    """A force at a contact with a surface, where it is closed and slides."""
 
     contact: str
     kernel: Kernel = field(default_factory=SquaredExponential)
@@ -104,13 +88,14 @@ class SurfaceForcePrior(ForcePrior):
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         if not system.contacts:
             return at.q.new_zeros(*at.q.shape, self.outputs(system.robot))
-        self._touching(system, at)
+        sticks = self._touching(system, at).sticks
         open_ = at.active[:, system.contact_names.index(self.contact)].logical_not()
+        open_ = open_ if sticks is None else open_ | sticks
         return self.directions(system, at).masked_fill(open_[:, None, None], 0.0)
 
     @abstractmethod
     def directions(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """E(x) `(n, nq, outputs)` where the contact is closed."""
+        """E(x) `(n, nq, outputs)` where the contact is closed and slides."""
 
     def _touching(self, system: ConstrainedSystem, at: States) -> ContactPoint:
         """The touching point; errors as of `check` where the contact has none."""
@@ -414,9 +399,11 @@ class CoulombErrorPrior(ForcePrior):
 
 def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tensor:
     """u = −J_Eᵀ s(v), the generalized force of a unit friction force, `(n, nq)`."""
-    # s = v/√(|v|² + ε²)
-    J, v = at.eom.contact_points[contact].sliding
-    return -(J.mT @ (v / (v.square().sum(-1, keepdim=True) + smoothing**2).sqrt())[..., None])[..., 0]
+    # s = v/√(|v|² + ε²); where the point sticks, its force is a multiplier
+    point = at.eom.contact_points[contact]
+    J, v = point.sliding
+    u = -(J.mT @ (v / (v.square().sum(-1, keepdim=True) + smoothing**2).sqrt())[..., None])[..., 0]
+    return u if point.sticks is None else u.masked_fill(point.sticks[..., None], 0.0)
 
 
 def coupled(
@@ -500,11 +487,11 @@ def _gain(system: ConstrainedSystem, at: States, friction: Sequence[CoulombFrict
     # U = (μ u of each contact, 0 without friction)
     columns = []
     for contact in system.contacts:
-        law = present.get(contact.name)
-        if law is None:
-            columns.append(at.q.new_zeros(*at.q.shape, contact.rows))
-        else:
-            columns.append((law.coefficient * against_sliding(at, contact.name, law.smoothing))[..., None])
+        column, law = at.q.new_zeros(*at.q.shape, contact.rows), present.get(contact.name)
+        if law is not None:
+            u = law.coefficient * against_sliding(at, contact.name, law.smoothing)
+            column = column.select_scatter(u, -1, 0)
+        columns.append(column)
     # G (I + LᵀU) = U
     U = torch.cat(columns, dim=-1)
     eye = torch.eye(U.shape[-1], dtype=U.dtype, device=U.device)
