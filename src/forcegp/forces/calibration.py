@@ -25,7 +25,7 @@ from forcegp.forces.noise import (
 )
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.problem import Problem, force_posterior, typical
-from forcegp.forces.quantities import affine_map
+from forcegp.forces.quantities import States, affine_map
 
 STRETCHES = 8
 """Contiguous stretches that a log of fewer than three segments is divided into."""
@@ -110,8 +110,14 @@ def _covariance(x: Tensor, segment: Tensor, lag: int) -> Tensor:
 
 
 def _motions(training: Training) -> list[int]:
-    """Measurements of accelerations."""
-    return [i for i, quantity in enumerate(training.quantities) if quantity == "qdd"]
+    """Measurements of accelerations, or of the joint forces that they and a force sensor show."""
+    return [i for i, quantity in enumerate(training.quantities) if quantity in ("qdd", "joint_force")]
+
+
+def _of_force(at: States, quantity: str) -> Tensor:
+    """From an error of a measured quantity to that of a force `(n, nq, nq)`: M of accelerations."""
+    M = at.eom.M
+    return M if quantity == "qdd" else torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand_as(M)
 
 
 def likelihood_power(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> float:
@@ -182,19 +188,19 @@ def _torque_noise(
     """Estimated torque noise of each joint over its standard deviation, and the variance that white noise of
     the accelerations has in it, `(n, nq)` each.
 
-    Residuals of accelerations are r = H ε + e with torque noise ε ~ N(0, S) and white e ~ N(0, Σ), which
-    hides the correlation of ε. In E[ε | r] = G r it has the least share.
+    Residuals are r = B ε + e with torque noise ε ~ N(0, S), B = H of accelerations, and white e ~ N(0, Σ),
+    which hides the correlation of ε. In E[ε | r] = G r it has the least share.
     """
     system, force_noise = problem.system, problem.force_noise(hyperparameters)
     assert force_noise is not None
     at = m.at(system)
-    z = affine_map(system, at, "qdd")
+    z = affine_map(system, at, m.quantity)
     r = m.values - posterior.read_mean(system, at, z)
-    # G = S Hᵀ (H S Hᵀ + Σ)⁻¹
-    S, H = force_noise(at), at.eom.H
+    # G = S Bᵀ (B S Bᵀ + Σ)⁻¹
+    S, B = force_noise(at), z.B_Q
     white = std.square().expand_as(r)
-    SH = S[..., None] * H.mT
-    G = torch.linalg.solve(H @ SH + torch.diag_embed(white), SH, left=False)
+    SB = S[..., None] * B.mT
+    G = torch.linalg.solve(B @ SB + torch.diag_embed(white), SB, left=False)
     return (G @ r[..., None])[..., 0] / S.sqrt(), (G.square() @ white[..., None])[..., 0] / S
 
 
@@ -293,8 +299,8 @@ def _held_out(
         dataclasses.replace(problem, training=training.without(i, own)), hyperparameters
     )
     at = m.at(system)
-    z = affine_map(system, at, "qdd")
-    M, P = at.eom.M, at.eom.P
+    z, M = affine_map(system, at, m.quantity), _of_force(at, m.quantity)
+    P = M @ z.B_Q
     mean, covariance = posterior.read(system, at, z)
     residual = (M @ (m.values - mean)[..., None])[..., 0]
     if training.weights is not None:

@@ -211,15 +211,18 @@ class Problem:
 
     @torch.no_grad()
     def torque_residual(self) -> Tensor:
-        """Root mean square of M times the residual of accelerations, `(nq,)` [N m, N]."""
-        total, count = torch.zeros_like(self.system.robot.mass), 0
+        """Root mean square of M times the residual of accelerations, and of that of joint forces `(nq,)`
+        [N m, N]."""
+        squares = [torch.zeros_like(self.system.robot.mass)[None]]
         for m in self.training.measurements:
+            at = m.at(self.system)
+            mean = self.mean(self.system, at)
             if m.quantity == "qdd":
-                at = m.at(self.system)
-                residual = m.values - at.eom.acceleration(self.mean(self.system, at))
-                force = (at.eom.M @ residual[..., None])[..., 0]
-                total, count = total + (force**2).sum(0), count + len(force)
-        return (total / max(count, 1)).sqrt()
+                residual = m.values - at.eom.acceleration(mean)
+                squares.append((at.eom.M @ residual[..., None])[..., 0] ** 2)
+            if m.quantity == "joint_force":
+                squares.append((m.values - mean) ** 2)
+        return (torch.cat(squares).sum(0) / max(sum(map(len, squares)) - 1, 1)).sqrt()
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:

@@ -139,9 +139,9 @@ class Mechanics:
             Q_D=Q_D,
             Q_K=Q_C + Q_G + Q_D,
             contact_points={
-                contact.name: TouchingPoint(*(getattr(at, name).numpy() for name in TouchingPoint._fields))
-                for contact, (*_, at) in zip(self.contacts, terms, strict=True)
-                if at is not None
+                contact.name: TouchingPoint(*(getattr(x.point, f).numpy() for f in TouchingPoint._fields))
+                for contact, x in zip(self.contacts, terms, strict=True)
+                if x.point is not None
             },
             tool=PointMotion(rotation, position, jacobian @ qd, jacobian, bias),
         )
