@@ -21,9 +21,18 @@ from forcegp.forces.external_wrench import WrenchFrame, momentum_force
 from forcegp.robot.model import RobotModel
 
 
-def wrench_of(J: Tensor, force: Tensor) -> Tensor:
-    """The shortest w with the least |force − Jᵀ w|, `(n, k)`, from J `(n, k, nq)` and forces `(n, nq)`."""
-    return (torch.linalg.pinv(J.mT) @ force[..., None])[..., 0]
+def wrench_of(J: Tensor, force: Tensor, damping: float = 0.0) -> Tensor:
+    """w = (J Jᵀ + δ²)⁺ J force, which has the least |force − Jᵀ w|² + δ² |w|², `(n, k)`.
+
+    Args:
+        J: `(n, k, nq)`.
+        force: `(n, nq)` external joint force.
+        damping: δ, which keeps w finite near singular poses [m].
+    """
+    eye = torch.eye(J.shape[-2], dtype=J.dtype, device=J.device)
+    if not damping:
+        return (torch.linalg.pinv(J.mT) @ force[..., None])[..., 0]
+    return torch.linalg.solve(J @ J.mT + damping**2 * eye, J @ force[..., None])[..., 0]
 
 
 def quasi_static(robot: RobotModel, data: Dataset, frame: WrenchFrame) -> Tensor:

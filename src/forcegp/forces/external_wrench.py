@@ -39,6 +39,8 @@ FORCES, MOMENTS = ("fx", "fy", "fz"), ("mx", "my", "mz")
 AXES = (*FORCES, *MOMENTS)
 FORCE_STD, MOMENT_STD = 50.0, 10.0
 """Standard deviation of each force [N] and moment [N m] before the data: wide beside pushes by hand."""
+FORCE_CHANGE, MOMENT_CHANGE = 20.0, 2.0
+"""By how much they change within a second, in the momentum filter."""
 MULTIPLIER_STD = 1e4
 """Of the multipliers of declared contacts [N], which are left open."""
 ROWS = {name: row for row, name in enumerate((*MOMENTS, *FORCES))}
@@ -55,6 +57,8 @@ class WrenchFrame:
         axes: components of `AXES` that are estimated, in this order; the others are zero.
         point: where the force acts, and what moments refer to, in coordinates of the frame [m].
         prior_std: standard deviation of forces [N] and moments [N m] before the data.
+        change: by how much a force [N] and a moment [N m] change within a second (a standard deviation), for
+            the momentum filter: it follows faster, with more noise, where that is more.
 
     Example:
         >>> WrenchFrame("tool", axes=("fx", "fz")).prior.tolist()
@@ -70,6 +74,7 @@ class WrenchFrame:
     axes: tuple[str, ...] = AXES
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
     prior_std: tuple[float, float] = (FORCE_STD, MOMENT_STD)
+    change: tuple[float, float] = (FORCE_CHANGE, MOMENT_CHANGE)
 
     def __post_init__(self) -> None:
         if self.reference not in ("world", "local"):
@@ -79,17 +84,26 @@ class WrenchFrame:
                 raise UnknownNameError("component of a wrench", axis, AXES)
         if not self.axes or len(set(self.axes)) < len(self.axes):
             raise ParameterError("invalid components of a wrench", expected="some of AXES", got=self.axes)
-        if len(self.prior_std) != 2 or not all(0.0 < std < math.inf for std in self.prior_std):
-            raise ParameterError(
-                "invalid prior of a wrench",
-                expected="two positive standard deviations, of forces [N] and moments [N m]",
-                got=self.prior_std,
-            )
+        for name, pair in (("prior_std", self.prior_std), ("change", self.change)):
+            if len(pair) != 2 or not all(0.0 < std < math.inf for std in pair):
+                raise ParameterError(
+                    f"invalid {name} of a wrench",
+                    expected="two positive standard deviations, of forces [N] and moments [N m]",
+                    got=pair,
+                )
 
     @property
     def prior(self) -> Tensor:
         """Prior standard deviation of each component `(k,)` [N, N m]."""
-        force, moment = self.prior_std
+        return self._each(self.prior_std)
+
+    @property
+    def changes(self) -> Tensor:
+        """Change of each component within a second `(k,)` [N, N m]."""
+        return self._each(self.change)
+
+    def _each(self, pair: tuple[float, float]) -> Tensor:
+        force, moment = pair
         return torch.tensor([force if axis in FORCES else moment for axis in self.axes], dtype=torch.float64)
 
     def jacobian(self, robot: RobotModel, q: Tensor) -> Tensor:
@@ -145,7 +159,8 @@ class MomentumLog:
         t: `(n,)` time [s].
         p: M q̇ `(n, nq)`, with covariance `p_noise` `(n, nq, nq)` of its noise.
         u: `(n, nq)` mean of ṗ without the wrench.
-        J: `(n, k, nq)` of the unknown components, with `prior` `(k,)` their standard deviations.
+        J: `(n, k, nq)` of the unknown components.
+        prior, change: `(k,)` their standard deviations, and how much they change within a second.
         factor: `(n, nq, nq)` lower Cholesky factor of S.
         correlation: `(nq,)` integral of the autocorrelation of the forces' error over all lags [s].
     """
@@ -156,21 +171,19 @@ class MomentumLog:
     u: Array
     J: Array
     prior: Array
+    change: Array
     factor: Array
     correlation: Array
 
 
-def observe(log: MomentumLog, bandwidth: float) -> tuple[Array, Array]:
+def observe(log: MomentumLog) -> tuple[Array, Array]:
     """Filtered wrench of one trajectory: its mean `(n, k)` and covariance `(n, k, k)`; causal, in one pass.
 
-    State x = (p, w, η): w is an Ornstein-Uhlenbeck process with the prior's variance and corner frequency
-    `bandwidth`; S½ η is the error of the learned forces, η of unit variance. Over a step h,
+    State x = (p, w, η): w is an Ornstein-Uhlenbeck process with the variance W of the prior, which changes by
+    `change` within a second; S½ η is the error of the learned forces, η of unit variance. Over a step h,
     p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε, η⁺ = ψ η + √(1 − ψ²) ε, with
-    ψ = (c − h)/(c + h), which keeps the spectral density c of η at low frequencies.
-
-    Args:
-        log: the samples.
-        bandwidth: [Hz].
+    φ = exp(−h change²/2 W), and ψ = (c − h)/(c + h), which keeps the spectral density c of η at low
+    frequencies.
     """
     n, nq = log.p.shape
     k = len(log.prior)
@@ -182,9 +195,9 @@ def observe(log: MomentumLog, bandwidth: float) -> tuple[Array, Array]:
     means[0], covariances[0] = x[w], P[w, w]
     for i in range(1, n):
         h = log.t[i] - log.t[i - 1]
-        phi, psi = math.exp(-2.0 * math.pi * bandwidth * h), (log.correlation - h) / (log.correlation + h)
-        psi = np.maximum(psi, 0.0)
-        decay = np.concatenate([np.ones(nq), np.full(k, phi), psi])
+        phi = np.exp(-0.5 * h * (log.change / log.prior) ** 2)
+        psi = np.maximum((log.correlation - h) / (log.correlation + h), 0.0)
+        decay = np.concatenate([np.ones(nq), phi, psi])
         F = np.diag(decay)
         F[:nq, w], F[:nq, eta] = h * log.J[i - 1].T, h * log.factor[i - 1]
         x = F @ x

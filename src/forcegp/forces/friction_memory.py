@@ -1,10 +1,10 @@
 """Dry friction with memory, in what a fit leaves of its training torques.
 
 Friction that is a function of the velocity jumps where a joint reverses. Real friction develops over a
-distance: Dahl's model is dz/dt = q̇/δ − |q̇| z/δ, friction ∝ z (Dahl 1976, *Solid friction damping of mechanical
-vibrations*). Force priors depend on the state alone, so around each reversal they are wrong by up to the whole
-friction. In a log in order of time the bristles z follow from the velocities, and a ridge regression of the
-torque that a fit leaves on z for some δ, and on functions of the velocity, corrects that. A joint is corrected
+distance δ: in Dahl's model it is proportional to z, dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction damping
+of mechanical vibrations*). Force priors depend on the state alone, so around each reversal they are wrong by
+up to the whole friction. In a log in order of time z follows from the velocities. A ridge regression, of the
+torque that a fit leaves, on z for some δ and on functions of the velocity corrects that. A joint is corrected
 only if that explains stretches of the training log that the regression has not seen.
 """
 
@@ -22,6 +22,7 @@ from forcegp.forces.inference import force_posterior
 from forcegp.forces.inverse_dynamics import Timed, bristles
 from forcegp.forces.learn import Problem
 from forcegp.forces.measurements import Training
+from forcegp.forces.noise import TORQUE_NOISE, stick_variance
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.priors.joint import SPEEDS
 from forcegp.forces.quantities import affine_map
@@ -51,7 +52,7 @@ class FrictionMemory:
 
     Attributes:
         weights: of the features, `(nq, f)` [N m, N].
-        share: variance of the torque that the correction leaves over that before, `(nq,)`.
+        share: variance of the joint force that the correction leaves over that of the fit, `(nq,)`.
         correlation: integral of the autocorrelation of what is left over all lags, `(nq,)` [s].
     """
 
@@ -96,23 +97,26 @@ def memory_of(
         part = m[rows]
         at = part.at(problem.system)
         M, z = at.eom.M, affine_map(problem.system, at, "total_force")
-        residual = (M @ part.values[..., None])[..., 0] - posterior.read_mean(problem.system, at, z)
+        mean, S = posterior.read(problem.system, at, z)
+        expected = S.diagonal(dim1=-2, dim2=-1) + hyperparameters[TORQUE_NOISE].exp().square()
+        expected = expected + stick_variance(hyperparameters, at)
         # Noise of q̈ in the residual: diag(M Σ Mᵀ)
-        parts.append((residual, (M.square() @ std[rows].square()[..., None])[..., 0]))
-    residual, white = (torch.cat(columns) for columns in zip(*parts, strict=True))
-    memory = learn_memory(m[free], residual, white)
+        white = (M.square() @ std[rows].square()[..., None])[..., 0]
+        parts.append(((M @ part.values[..., None])[..., 0] - mean, white, expected))
+    memory = learn_memory(m[free], *(torch.cat(columns) for columns in zip(*parts, strict=True)))
     if memory is None:
         return {}
     return {WEIGHTS: memory.weights, SHARE: memory.share, CORRELATION: memory.correlation}
 
 
-def learn_memory(motion: Timed, residual: Tensor, white: Tensor) -> FrictionMemory | None:
+def learn_memory(motion: Timed, residual: Tensor, white: Tensor, expected: Tensor) -> FrictionMemory | None:
     """Learn the correction from training samples in free motion.
 
     Args:
         motion: of the samples.
         residual: joint force that the fit leaves, M q̈ − E Q̄ `(n, nq)`.
         white: its variance that noise of the accelerations explains, `(n, nq)`.
+        expected: its variance that the fit expects besides, `(n, nq)`.
 
     Returns:
         The correction, or `None` if the samples are too far apart.
@@ -133,8 +137,8 @@ def learn_memory(motion: Timed, residual: Tensor, white: Tensor) -> FrictionMemo
         w = torch.linalg.solve(gram.sum(0) - gram[i] + ridge, right.sum(0) - right[i])
         remaining[group == g] -= (X[group == g] * w).sum(-1)
     before, after = ((x.square() - white).mean(0) for x in (residual, remaining))
-    share = (after / before.clamp(min=1e-300)).clamp(min=LEAST_SHARE)
-    better = (after < before) & (share < 1.0)
+    share = (after / expected.mean(0)).clamp(min=LEAST_SHARE, max=1.0)
+    better = after < before
     weights = torch.linalg.solve(gram.sum(0) + ridge, right.sum(0)) * better[:, None]
     left = torch.where(better, remaining, residual)
     times = autocorrelation_time(left, motion.segment, white.mean(0))

@@ -15,7 +15,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -174,6 +174,7 @@ def free_rows(
     return None
 
 
+@runtime_checkable
 class Timed(Protocol):
     """Velocities `(n, nq)` with the time `(n,)` [s] and the trajectory `(n,)` of each sample."""
 

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.stats
@@ -33,8 +33,6 @@ from forcegp.models.prediction import CHUNK, Prediction
 from forcegp.robust import MAD_TO_STD
 
 METHODS = ("acceleration", "momentum")
-BANDWIDTH = 2.0
-"""Corner frequency of the spectrum of a wrench before the data [Hz]."""
 LEAST_NOISE = 1e-9
 """Smallest noise of a velocity, beyond rounding [rad/s, m/s]."""
 THRESHOLD = 5.0
@@ -100,6 +98,7 @@ def false_alarm_rate(threshold: float) -> float:
     return math.erfc(threshold / math.sqrt(2.0))
 
 
+@runtime_checkable
 class LearnedForces(Protocol):
     """What a fit knows of the forces: its posterior, the noise beside it, and the robot."""
 
@@ -118,9 +117,7 @@ class LearnedForces(Protocol):
 
 
 @torch.no_grad()
-def external_wrench(
-    fit: LearnedForces, data: Dataset, frame: WrenchFrame, method: str, bandwidth: float
-) -> ExternalWrench:
+def external_wrench(fit: LearnedForces, data: Dataset, frame: WrenchFrame, method: str) -> ExternalWrench:
     """The external wrench at the samples of a log; see `StructuredFit.external_wrench`."""
     if method not in METHODS:
         raise UnknownNameError("method of estimating a wrench", method, METHODS)
@@ -128,7 +125,7 @@ def external_wrench(
     if method == "acceleration":
         mean, covariance = reading.from_accelerations()
     else:
-        mean, covariance = reading.from_momenta(bandwidth)
+        mean, covariance = reading.from_momenta()
     k = len(frame.axes)
     return ExternalWrench(
         mean[:, :k],
@@ -162,7 +159,7 @@ def joint_forces(
         states: q, q̇ and τ.
         active: `(n, n_contacts)` which contacts are closed.
         qdd: `(n, nq)` accelerations at which errors of the inertia act.
-        memory: whose share of the noise remains; its force is not added.
+        memory: whose share of the variance remains; its force is not added.
     """
     at, _ = states_at(fit.system, *states, active)
     at = dataclasses.replace(at, qdd=qdd)
@@ -171,8 +168,11 @@ def joint_forces(
     beyond = unknown_variance(fit.hyperparameters, at) - white
     if fit.torque_std is not None:
         white = white + fit.torque_std**2
-    white = white if memory is None else white * memory.share
-    return JointForces(mean, S + torch.diag_embed(white + beyond), at.eom)
+    S = S + torch.diag_embed(white)
+    if memory is not None:
+        D = memory.share.sqrt()
+        S = D[:, None] * S * D
+    return JointForces(mean, S + torch.diag_embed(beyond), at.eom)
 
 
 @dataclass(frozen=True)
@@ -222,10 +222,8 @@ class Reading:
         mean, covariance = zip(*parts, strict=True)
         return torch.cat(mean), torch.cat(covariance)
 
-    def from_momenta(self, bandwidth: float) -> tuple[Tensor, Tensor]:
+    def from_momenta(self) -> tuple[Tensor, Tensor]:
         """Mean and covariance by the momentum filter, trajectory by trajectory."""
-        if not 0.0 < bandwidth < math.inf:
-            raise ParameterError("invalid bandwidth of a wrench", expected="above 0 [Hz]", got=bandwidth)
         if not self.data.header.ordered:
             raise DataError("the momentum filter needs a log in order of time", got="points in another order")
         correlation = self.fit.problem.correlation if self.memory is None else self.memory.correlation
@@ -239,7 +237,7 @@ class Reading:
             self.momenta((segment == own).nonzero()[:, 0], noise, correlation)
             for own in segment.unique_consecutive()
         ]
-        mean, covariance = zip(*(observe(log, bandwidth) for log in logs), strict=True)
+        mean, covariance = zip(*(observe(log) for log in logs), strict=True)
         return torch.from_numpy(np.concatenate(mean)), torch.from_numpy(np.concatenate(covariance))
 
     def momenta(self, trajectory: Tensor, noise: Tensor, correlation: Tensor) -> MomentumLog:
@@ -255,8 +253,9 @@ class Reading:
             factor = torch.linalg.cholesky(forces.covariance)
             columns.append((p, p_noise, forces.mean - forces.eom.Q_C + added, J, factor))
         p, p_noise, u, J, factor = (torch.cat(parts).numpy() for parts in zip(*columns, strict=True))
-        t = self.data.t[trajectory].numpy()
-        return MomentumLog(t, p, p_noise, u, J, prior.numpy(), factor, correlation.numpy())
+        t, open_ = self.data.t[trajectory].numpy(), prior[len(self.frame.axes) :]
+        change = torch.cat([self.frame.changes, open_])
+        return MomentumLog(t, p, p_noise, u, J, prior.numpy(), change.numpy(), factor, correlation.numpy())
 
 
 def velocity_noise(data: Dataset) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.files import Record
-from forcegp.forces.external_wrench import AXES, FORCE_STD, MOMENT_STD, WrenchFrame
+from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.identifiability import doubts_of
 from forcegp.forces.inference import forces_and_constant, is_sparse, log_likelihood, lost_by_inducing
 from forcegp.forces.learn import Problem, typical
@@ -36,7 +37,7 @@ from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel
-from forcegp.models.external_wrench import BANDWIDTH, ExternalWrench, external_wrench
+from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_file import pack, unpack
@@ -153,35 +154,29 @@ class StructuredFit(FittedModel):
         data: Dataset,
         frame: str,
         *,
-        reference: str = "world",
-        axes: Sequence[str] = AXES,
-        point: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        prior_std: tuple[float, float] = (FORCE_STD, MOMENT_STD),
         method: str = "acceleration",
-        bandwidth: float = BANDWIDTH,
+        **components: Any,
     ) -> ExternalWrench:
         """Wrench of the environment on a frame, beyond the learned forces and the contacts that are closed.
 
         M q̈ = Q̄ + Aᵀλ + Jᵀ w (`forces/external_wrench.py`). With `method="acceleration"` each sample is
         estimated by itself, by generalized least squares. With `method="momentum"` a causal Kalman filter
-        runs over each trajectory and needs no accelerations.
+        runs over each trajectory and needs no accelerations. In logs in order of time, the learned forces
+        include friction with memory.
 
         Args:
             data: a log; for the momentum filter in order of time.
             frame: frame of the robot.
-            reference: axes of the wrench, `"world"` or `"local"`.
-            axes: components that are estimated, of `fx`, `fy`, `fz`, `mx`, `my`, `mz`; others are zero.
-            point: what moments refer to, in coordinates of the frame [m].
-            prior_std: standard deviation of forces [N] and moments [N m] before the data.
             method: `"acceleration"` or `"momentum"`.
-            bandwidth: corner frequency of the wrench in the momentum filter [Hz].
+            **components: `reference` (`"world"` or `"local"` axes), `axes` (some of `fx`, `fy`, `fz`, `mx`,
+                `my`, `mz`; the others are zero), `point`, `prior_std` and `change` of `WrenchFrame`.
 
         Returns:
             Mean `(n, k)` and covariance `(n, k, k)` [N, N m], with `detect` for contacts.
 
         Raises:
             UnknownNameError: no such frame, reference, component or method.
-            ParameterError: a standard deviation or the bandwidth is out of range.
+            ParameterError: a number is out of range.
             DataError: the log does not fit the robot, or is not in order of time.
             ModelError: the fit lacks the noise of the torques, which the momentum filter needs.
 
@@ -189,8 +184,7 @@ class StructuredFit(FittedModel):
             `wrench = fit.external_wrench(log, "tool", axes=("fx", "fy", "fz"), method="momentum")`
         """
         data.check_robot(self.specified.robot)
-        where = WrenchFrame(frame, reference, tuple(axes), point, prior_std)
-        return external_wrench(self, data, where, method, bandwidth)
+        return external_wrench(self, data, WrenchFrame(frame, **components), method)
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """How far the speed and torque of each joint lie beyond those of the training data, in training
