@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 PER_CONTACT = ("multiplier", "contact_force")
 """Quantities with one value or one vector per contact; the others have one component per joint."""
+WRENCH = "external_wrench"
+"""The wrench on a frame, saved as force and moment of a contact with the name of the frame."""
 
 
 def predict(
@@ -31,10 +33,18 @@ def predict(
         typer.Option(
             "--quantity",
             "-q",
-            help="qdd, qdd_free, multiplier, constraint_force, contact_force, total_force, joint_force or "
-            "contact_friction.",
+            help="qdd, qdd_free, multiplier, constraint_force, contact_force, total_force, joint_force, "
+            "contact_friction or external_wrench.",
         ),
     ] = "qdd",
+    frame: Annotated[
+        str | None, typer.Option(help="Frame that an external_wrench acts on, without a declared contact.")
+    ] = None,
+    reference: Annotated[str, typer.Option(help="Axes of an external_wrench: world or local.")] = "world",
+    momentum: Annotated[
+        bool,
+        typer.Option("--momentum", help="external_wrench by a causal filter that reads no accelerations."),
+    ] = False,
     noise: Annotated[
         bool, typer.Option("--noise", help="Count the noise of the motor torque and of the sensor too.")
     ] = False,
@@ -57,6 +67,8 @@ def predict(
     forcegp predict --model model --data test.parquet --out predicted.parquet
 
     forcegp predict -m model -d test.parquet --quantity multiplier -o force.parquet
+
+    forcegp predict -m model -d test.parquet -q external_wrench --frame tool -o wrench.parquet
     """
     from forcegp.destination import write_or_keep
     from forcegp.errors import ModelError
@@ -66,6 +78,11 @@ def predict(
     check_data_destination(out, data)
     regression = load_model(model)
     test = read_data(data, regression.system.robot)
+    if quantity == WRENCH:
+        test, result = _with_wrench(regression, test, frame, reference, momentum)
+        write_or_keep(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
+        show({"quantity": quantity, "samples": len(test), **result, "file": str(out)}, as_json)
+        return
     if sensor and quantity != "multiplier":
         raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
     with progress_bar(f"predicting {quantity}", len(test)) as progress:
@@ -100,6 +117,31 @@ def _predicted(model: Predictor, part: Dataset, quantity: str, noise: bool, sens
     else:
         prediction = model.predict(*states, quantity, active=active)
     return prediction.mean, prediction.std
+
+
+def _with_wrench(
+    model: Predictor, test: Dataset, frame: str | None, reference: str, momentum: bool
+) -> tuple[Dataset, dict[str, object]]:
+    """The data set with the external wrench on a frame and whether a contact is detected, as if the frame
+    were a contact; the share of the samples with a contact."""
+    from forcegp.errors import ModelError
+    from forcegp.models.structured_fit import StructuredFit
+
+    if not isinstance(model, StructuredFit):
+        raise ModelError("an external wrench needs a structured Gaussian process", got=model.kind)
+    if frame is None:
+        names = ", ".join(model.system.robot.frame_names)
+        raise ModelError("an external wrench acts on a frame", expected=f"--frame, one of {names}")
+    method = "momentum" if momentum else "acceleration"
+    wrench = model.external_wrench(test, frame, method=method, reference=reference)
+    assert wrench.std is not None
+    found, columns = wrench.detect(), {}
+    for part, rows in (("force", slice(0, 3)), ("moment", slice(3, 6))):
+        columns[f"predicted_external_{part}"] = {frame: wrench.mean[:, rows]}
+        columns[f"predicted_external_{part}_std"] = {frame: wrench.std[:, rows]}
+    contact = {**test.contact, frame: test.contact.get(frame, found)}
+    test = test.replace(contact=contact, contact_extras={**test.contact_extras, **columns})
+    return test, {"frame": frame, "detected": float(found.double().mean())}
 
 
 def _with_columns(

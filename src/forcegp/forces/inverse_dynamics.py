@@ -15,6 +15,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -170,13 +171,25 @@ def free_rows(
     return _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
 
 
-def _in_time(m: Measurement) -> Tensor:
+@runtime_checkable
+class Timed(Protocol):
+    """Velocities `(n, nq)` with the time `(n,)` [s] and the trajectory `(n,)` of each sample."""
+
+    @property
+    def t(self) -> Tensor: ...
+    @property
+    def qd(self) -> Tensor: ...
+    @property
+    def segment(self) -> Tensor: ...
+
+
+def _in_time(m: Timed) -> Tensor:
     """Indices of samples in the order of segment and time."""
     order = torch.argsort(m.t, stable=True)
     return order[torch.argsort(m.segment[order], stable=True)]
 
 
-def bristles(m: Measurement) -> Tensor:
+def bristles(m: Timed) -> Tensor:
     """Friction with memory: z of Dahl's model dz/dt = q̇/δ − |q̇| z/δ for some distances δ, `(n, nq, k)`.
 
     Within δ of a reversal this friction is a spring, and its torque is about proportional to −q̈: without

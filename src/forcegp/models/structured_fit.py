@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.files import Record
+from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.measurements import Observation, Training
 from forcegp.forces.noise import (
     LOW,
@@ -37,6 +39,7 @@ from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel
+from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_file import pack, unpack
@@ -144,6 +147,43 @@ class StructuredFit(FittedModel):
             None if beyond is None else beyond.reshape(*batch, system.robot.nq),
             system.robot.joint_names,
         )
+
+    def external_wrench(
+        self,
+        data: Dataset,
+        frame: str,
+        *,
+        method: str = "acceleration",
+        **components: Any,
+    ) -> ExternalWrench:
+        """Wrench of the environment on a frame, beyond the learned forces and the contacts that are closed.
+
+        M q̈ = Q̄ + Aᵀλ + Jᵀ w (`forces/external_wrench.py`). With `method="acceleration"` each sample is
+        estimated by itself, by generalized least squares. With `method="momentum"` a causal Kalman filter
+        runs over each trajectory and needs no accelerations. In logs in order of time, the learned forces
+        include friction with memory.
+
+        Args:
+            data: a log; for the momentum filter in order of time.
+            frame: frame of the robot.
+            method: `"acceleration"` or `"momentum"`.
+            **components: `reference` (`"world"` or `"local"` axes), `axes` (some of `fx`, `fy`, `fz`, `mx`,
+                `my`, `mz`; the others are zero), `point`, `prior_std` and `change` of `WrenchFrame`.
+
+        Returns:
+            Mean `(n, k)` and covariance `(n, k, k)` [N, N m], with `detect` for contacts.
+
+        Raises:
+            UnknownNameError: no such frame, reference, component or method.
+            ParameterError: a number is out of range.
+            DataError: the log does not fit the robot, or is not in order of time.
+            ModelError: the fit lacks the noise of the torques, which the momentum filter needs.
+
+        Example:
+            `wrench = fit.external_wrench(log, "tool", axes=("fx", "fy", "fz"), method="momentum")`
+        """
+        data.check_robot(self.specified.robot)
+        return external_wrench(self, data, WrenchFrame(frame, **components), method)
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """How far the speed and torque of each joint lie beyond those of the training data, in training

@@ -7,7 +7,8 @@
    unless a `DisturbancePrior` explains them.
 4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
 5. The noise of the torque is enlarged to what held-out stretches of the training log ask for, and how it
-   grows beyond the trained speeds and torques is learned from held-out regimes.
+   grows beyond the trained speeds and torques is learned from held-out regimes; dry friction with memory is
+   learned from what is left, for logs in order of time.
 6. The posterior is conditioned on all samples.
 """
 
@@ -26,6 +27,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import calibrated_noise, likelihood_power, residual_times
+from forcegp.forces.friction_memory import MEMORY, memory_of
 from forcegp.forces.inertia import Inertia, inertia_of, with_updated_robot
 from forcegp.forces.inverse_dynamics import LEAST
 from forcegp.forces.measurements import (
@@ -303,7 +305,7 @@ def search_of(
     known = {} if chosen is None else known
     current = {key: known.get(key, value) for key, value in start.items()}
     if chosen is not None and NOISE not in chosen:
-        current |= {key: value for key, value in known.items() if key.startswith(REGION)}
+        current |= {key: value for key, value in known.items() if key.startswith((REGION, MEMORY))}
 
     def is_held(name: str) -> bool:
         # Residuals of a robot that contains a force do not show the scale of that force.
@@ -446,6 +448,8 @@ def solve(
         values |= calibrated_noise(part, values)
     if correlated:
         part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
+    if calibrated:
+        values |= memory_of(part, values, neighbours or problem.training)
     training = dataclasses.replace(problem.training, slopes=part.training.slopes)
     whole = dataclasses.replace(part, training=training, inducing=None)
     whole = prepared(spec, whole, values)

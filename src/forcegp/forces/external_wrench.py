@@ -1,0 +1,219 @@
+"""The external wrench on a frame of the robot, from the equations of motion beyond the learned forces.
+
+A wrench w that nobody declared acts on a frame with Jacobian J:
+
+    M q̈ = Q̄ + Aᵀλ + Jᵀ w,   Q̄ ~ N(E Q̄, S).
+
+S is the posterior covariance of the learned forces with the noise of the torques.
+
+- **From accelerations** (`least_squares`): r = M q̈ − E Q̄ = Jᵀ w + e with Cov(e) = S + M Σ_q̈ Mᵀ and a prior
+  w ~ N(0, W), by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r. Along a
+  direction that the arm cannot feel, the covariance is that of the prior.
+- **From momenta** (`observe`), without accelerations: p = M q̇ obeys ṗ = Q̄ − Q_C + ½ ∂(q̇ᵀM q̇)/∂q + Jᵀ w. A
+  Kalman filter estimates p, w, and the error of the learned forces, whose correlation in time is that of the
+  torque residuals in the training log. The observer of De Luca and Mattone (*Sensorless robot collision
+  detection and hybrid force/motion control*, ICRA 2005) is the steady filter without errors of the forces.
+
+The wrench is that of the environment on the robot. Multipliers of closed contacts are unknown too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from forcegp import dynamics, kinematics
+from forcegp.errors import ParameterError, UnknownNameError
+from forcegp.robot.model import RobotModel
+
+Array = NDArray[np.float64]
+
+FORCES, MOMENTS = ("fx", "fy", "fz"), ("mx", "my", "mz")
+"""Components of a wrench; moments are about the point."""
+AXES = (*FORCES, *MOMENTS)
+FORCE_STD, MOMENT_STD = 50.0, 10.0
+"""Standard deviation of each force [N] and moment [N m] before the data: wide beside pushes by hand."""
+FORCE_CHANGE, MOMENT_CHANGE = 20.0, 2.0
+"""By how much they change within a second, in the momentum filter."""
+MULTIPLIER_STD = 1e4
+"""Of the multipliers of declared contacts [N], which are left open."""
+ROWS = {name: row for row, name in enumerate((*MOMENTS, *FORCES))}
+"""Row of each component in `frame_jacobian`, which has rotations first."""
+
+
+@dataclass(frozen=True)
+class WrenchFrame:
+    """A frame on which an unknown wrench acts, and the components that it may have.
+
+    Args:
+        frame: frame of the robot.
+        reference: axes of the components, `"world"` or `"local"` (those of the frame).
+        axes: components of `AXES` that are estimated, in this order; the others are zero.
+        point: where the force acts, and what moments refer to, in coordinates of the frame [m].
+        prior_std: standard deviation of forces [N] and moments [N m] before the data.
+        change: by how much a force [N] and a moment [N m] change within a second (a standard deviation), for
+            the momentum filter: it follows faster, with more noise, where that is more.
+
+    Example:
+        >>> WrenchFrame("tool", axes=("fx", "fz")).prior.tolist()
+        [50.0, 50.0]
+
+    Raises:
+        UnknownNameError: no such reference or component.
+        ParameterError: no component, one twice, or a standard deviation that is not positive and finite.
+    """
+
+    frame: str
+    reference: str = "world"
+    axes: tuple[str, ...] = AXES
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    prior_std: tuple[float, float] = (FORCE_STD, MOMENT_STD)
+    change: tuple[float, float] = (FORCE_CHANGE, MOMENT_CHANGE)
+
+    def __post_init__(self) -> None:
+        if self.reference not in ("world", "local"):
+            raise UnknownNameError("reference of a wrench", self.reference, ("world", "local"))
+        for axis in self.axes:
+            if axis not in AXES:
+                raise UnknownNameError("component of a wrench", axis, AXES)
+        if not self.axes or len(set(self.axes)) < len(self.axes):
+            raise ParameterError("invalid components of a wrench", expected="some of AXES", got=self.axes)
+        for name, pair in (("prior_std", self.prior_std), ("change", self.change)):
+            if len(pair) != 2 or not all(0.0 < std < math.inf for std in pair):
+                raise ParameterError(
+                    f"invalid {name} of a wrench",
+                    expected="two positive standard deviations, of forces [N] and moments [N m]",
+                    got=pair,
+                )
+
+    @property
+    def prior(self) -> Tensor:
+        """Prior standard deviation of each component `(k,)` [N, N m]."""
+        return self._each(self.prior_std)
+
+    @property
+    def changes(self) -> Tensor:
+        """Change of each component within a second `(k,)` [N, N m]."""
+        return self._each(self.change)
+
+    def _each(self, pair: tuple[float, float]) -> Tensor:
+        force, moment = pair
+        return torch.tensor([force if axis in FORCES else moment for axis in self.axes], dtype=torch.float64)
+
+    def jacobian(self, robot: RobotModel, q: Tensor) -> Tensor:
+        """J of the components at q `(*batch, nq)`: the joints feel Jᵀ w, `(*batch, k, nq)`.
+
+        Raises:
+            UnknownNameError: no such frame.
+        """
+        J = kinematics.frame_jacobian(robot, q, self.frame, self.point)
+        if self.reference == "local":
+            # w = diag(R, R) w_local
+            R, _ = kinematics.frame_pose(robot, q, self.frame)
+            J = torch.cat([R.mT @ J[..., :3, :], R.mT @ J[..., 3:, :]], dim=-2)
+        return J[..., [ROWS[axis] for axis in self.axes], :]
+
+
+def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
+    """Generalized least squares of r = Jᵀ w + e, e ~ N(0, S), w ~ N(0, diag prior²).
+
+    Args:
+        J: `(n, k, nq)`.
+        r: `(n, nq)` joint force that the model leaves.
+        S: `(n, nq, nq)` its covariance for w = 0.
+        prior: `(k,)` or `(n, k)` standard deviations.
+
+    Returns:
+        Mean `(n, k)` and covariance `(n, k, k)` of w.
+    """
+    # With S = L Lᵀ and w = diag(prior) v: V = (B Bᵀ + 1)⁻¹ with B = diag(prior) J L⁻ᵀ, E v = V B L⁻¹ r
+    L = torch.linalg.cholesky(S)
+    B = torch.linalg.solve_triangular(L, J.mT * prior[..., None, :], upper=False).mT
+    e = torch.linalg.solve_triangular(L, r[..., None], upper=False)
+    V = torch.cholesky_inverse(torch.linalg.cholesky(B @ B.mT + torch.eye(J.shape[-2]).to(B)))
+    mean = (V @ (B @ e))[..., 0] * prior
+    return mean, V * prior[..., :, None] * prior[..., None, :]
+
+
+def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+    """M `(n, nq, nq)` and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, what inertia adds to ṗ besides forces."""
+    with torch.enable_grad():
+        x = q.detach().clone().requires_grad_()
+        M = dynamics.mass_matrix(robot, x)
+        energy = 0.5 * (qd[..., None, :] @ M @ qd[..., None]).sum()
+        (slope,) = torch.autograd.grad(energy, x)
+    return M.detach(), slope
+
+
+@dataclass(frozen=True)
+class MomentumLog:
+    """What the filter reads of a log, as arrays over n samples in order of time.
+
+    Attributes:
+        t: `(n,)` time [s].
+        p: M q̇ `(n, nq)`, with covariance `p_noise` `(n, nq, nq)` of its noise.
+        u: `(n, nq)` mean of ṗ without the wrench.
+        J: `(n, k, nq)` of the unknown components.
+        prior, change: `(k,)` their standard deviations, and how much they change within a second.
+        factor: `(n, nq, nq)` lower Cholesky factor of S.
+        correlation: `(nq,)` integral of the autocorrelation of the forces' error over all lags [s].
+    """
+
+    t: Array
+    p: Array
+    p_noise: Array
+    u: Array
+    J: Array
+    prior: Array
+    change: Array
+    factor: Array
+    correlation: Array
+
+
+def observe(log: MomentumLog) -> tuple[Array, Array]:
+    """Filtered wrench of one trajectory: its mean `(n, k)` and covariance `(n, k, k)`; causal, in one pass.
+
+    State x = (p, w, η): w is an Ornstein-Uhlenbeck process with the variance W of the prior, which changes by
+    `change` within a second; S½ η is the error of the learned forces, η of unit variance. Over a step h,
+    p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε, η⁺ = ψ η + √(1 − ψ²) ε, with
+    φ = exp(−h change²/2 W), and ψ = (c − h)/(c + h), which keeps the spectral density c of η at low
+    frequencies.
+    """
+    n, nq = log.p.shape
+    k = len(log.prior)
+    w, eta = slice(nq, nq + k), slice(nq + k, None)
+    x, P = np.zeros(2 * nq + k), np.zeros((2 * nq + k, 2 * nq + k))
+    x[:nq], P[:nq, :nq] = log.p[0], log.p_noise[0]
+    P[w, w], P[eta, eta] = np.diag(log.prior**2), np.eye(nq)
+    means, covariances = np.empty((n, k)), np.empty((n, k, k))
+    means[0], covariances[0] = x[w], P[w, w]
+    for i in range(1, n):
+        h = log.t[i] - log.t[i - 1]
+        phi = np.exp(-0.5 * h * (log.change / log.prior) ** 2)
+        psi = np.maximum((log.correlation - h) / (log.correlation + h), 0.0)
+        decay = np.concatenate([np.ones(nq), phi, psi])
+        F = np.diag(decay)
+        F[:nq, w], F[:nq, eta] = h * log.J[i - 1].T, h * log.factor[i - 1]
+        x = F @ x
+        x[:nq] += 0.5 * h * (log.u[i - 1] + log.u[i])
+        P = F @ P @ F.T
+        added = np.concatenate([np.zeros(nq), (1.0 - phi**2) * log.prior**2, 1.0 - psi**2])
+        P[np.diag_indices_from(P)] += added
+        # y = p + noise
+        K = np.linalg.solve(P[:nq, :nq] + log.p_noise[i], P[:nq]).T
+        x = x + K @ (log.p[i] - x[:nq])
+        P = P - K @ P[:nq]
+        P = 0.5 * (P + P.T)
+        means[i], covariances[i] = x[w], P[w, w]
+    return means, covariances
+
+
+def component_names(frame: str, axes: Sequence[str]) -> list[str]:
+    """Names of the components of a wrench, for plots."""
+    return [f"{frame} {axis}" for axis in axes]

@@ -1,0 +1,144 @@
+"""Dry friction with memory, in what a fit leaves of its training torques.
+
+Friction that is a function of the velocity jumps where a joint reverses. Real friction develops over a
+distance δ: in Dahl's model it is proportional to z, dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction damping
+of mechanical vibrations*). Force priors depend on the state alone, so around each reversal they are wrong by
+up to the whole friction. In a log in order of time z follows from the velocities. A ridge regression, of the
+torque that a fit leaves, on z for some δ and on functions of the velocity corrects that. A joint is corrected
+only if that explains stretches of the training log that the regression has not seen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.forces.calibration import CHUNK_STATES, autocorrelation_time, stretches
+from forcegp.forces.inverse_dynamics import Timed, bristles
+from forcegp.forces.measurements import Training
+from forcegp.forces.noise import TORQUE_NOISE, stick_variance
+from forcegp.forces.priors.base import NOISE
+from forcegp.forces.priors.joint import SPEEDS
+from forcegp.forces.problem import Problem, force_posterior
+from forcegp.forces.quantities import affine_map
+
+MEMORY = f"{NOISE}.memory."
+WEIGHTS, SHARE, CORRELATION = (MEMORY + name for name in ("weights", "share", "correlation"))
+"""Names of the correction among the hyperparameters."""
+FEWEST = 200
+"""Training samples in free motion that are needed."""
+RIDGE = 1e-3
+"""Of features of size 1, relative to the number of samples."""
+LONGEST_STEP = 0.05
+"""Time between training samples beyond which they do not show what the velocities were between [s]."""
+LEAST_SHARE = 0.01
+"""Smallest share of the variance that is believed to remain."""
+
+
+def _features(m: Timed) -> Tensor:
+    """Bristles of all distances, and friction without memory, `(n, nq, f)`."""
+    v = m.qd[..., None]
+    return torch.cat([bristles(m), *(torch.tanh(v / speed) for speed in SPEEDS), v], dim=-1)
+
+
+@dataclass(frozen=True)
+class FrictionMemory:
+    """What a fit corrects of its torques.
+
+    Attributes:
+        weights: of the features, `(nq, f)` [N m, N].
+        share: variance of the joint force that the correction leaves over that of the fit, `(nq,)`.
+        correlation: integral of the autocorrelation of what is left over all lags, `(nq,)` [s].
+    """
+
+    weights: Tensor
+    share: Tensor
+    correlation: Tensor
+
+    @classmethod
+    def of(cls, hyperparameters: Mapping[str, Tensor]) -> FrictionMemory | None:
+        """What a fit has learned, if its log shows it."""
+        if WEIGHTS not in hyperparameters:
+            return None
+        return cls(*(hyperparameters[name] for name in (WEIGHTS, SHARE, CORRELATION)))
+
+    def force(self, log: Timed) -> Tensor:
+        """Joint force of the correction in a log in order of time, `(n, nq)` [N m, N]."""
+        return (_features(log) * self.weights).sum(-1)
+
+
+@torch.no_grad()
+def memory_of(
+    problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
+) -> dict[str, Tensor]:
+    """The correction as hyperparameters, from samples in free motion; empty where these are too few or too
+    far apart in time.
+
+    Args:
+        problem: what was learned.
+        hyperparameters: learned tensors.
+        training: samples whose residuals are looked at.
+    """
+    if not training.period or "qdd" not in training.quantities:
+        return {}
+    i = training.quantities.index("qdd")
+    m = training.measurements[i]
+    free = (~m.active.any(-1)).nonzero()[:, 0]
+    if len(free) < FEWEST:
+        return {}
+    std = dataclasses.replace(problem, training=training).noise_at(hyperparameters, i).expand_as(m.values)
+    posterior, parts = force_posterior(problem, hyperparameters), []
+    for rows in free.split(CHUNK_STATES):
+        part = m[rows]
+        at = part.at(problem.system)
+        M, z = at.eom.M, affine_map(problem.system, at, "total_force")
+        mean, S = posterior.read(problem.system, at, z)
+        expected = S.diagonal(dim1=-2, dim2=-1) + hyperparameters[TORQUE_NOISE].exp().square()
+        expected = expected + stick_variance(hyperparameters, at)
+        # Noise of q̈ in the residual: diag(M Σ Mᵀ)
+        white = (M.square() @ std[rows].square()[..., None])[..., 0]
+        parts.append(((M @ part.values[..., None])[..., 0] - mean, white, expected))
+    memory = learn_memory(m[free], *(torch.cat(columns) for columns in zip(*parts, strict=True)))
+    if memory is None:
+        return {}
+    return {WEIGHTS: memory.weights, SHARE: memory.share, CORRELATION: memory.correlation}
+
+
+def learn_memory(motion: Timed, residual: Tensor, white: Tensor, expected: Tensor) -> FrictionMemory | None:
+    """Learn the correction from training samples in free motion.
+
+    Args:
+        motion: of the samples.
+        residual: joint force that the fit leaves, M q̈ − E Q̄ `(n, nq)`.
+        white: its variance that noise of the accelerations explains, `(n, nq)`.
+        expected: its variance that the fit expects besides, `(n, nq)`.
+
+    Returns:
+        The correction, or `None` if the samples are too far apart.
+    """
+    steps = motion.t.diff()[motion.segment[1:] == motion.segment[:-1]]
+    if not len(steps) or not 0.0 < float(steps.median()) <= LONGEST_STEP or float(steps.min()) <= 0.0:
+        return None
+    X, group = _features(motion), stretches(motion.segment)
+    grams, rights = [], []
+    for g in group.unique():
+        x = X[group == g].transpose(0, 1)
+        grams.append(x.mT @ x)
+        rights.append((x.mT @ residual[group == g].mT[..., None])[..., 0])
+    gram, right = torch.stack(grams), torch.stack(rights)
+    ridge = RIDGE * len(X) * torch.eye(X.shape[-1]).to(X)
+    remaining = residual.clone()
+    for i, g in enumerate(group.unique()):
+        w = torch.linalg.solve(gram.sum(0) - gram[i] + ridge, right.sum(0) - right[i])
+        remaining[group == g] -= (X[group == g] * w).sum(-1)
+    before, after = ((x.square() - white).mean(0) for x in (residual, remaining))
+    share = (after / expected.mean(0)).clamp(min=LEAST_SHARE, max=1.0)
+    better = after < before
+    weights = torch.linalg.solve(gram.sum(0) + ridge, right.sum(0)) * better[:, None]
+    left = torch.where(better, remaining, residual)
+    times = autocorrelation_time(left, motion.segment, white.mean(0))
+    return FrictionMemory(weights, torch.where(better, share, 1.0), steps.median() * times)

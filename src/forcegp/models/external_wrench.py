@@ -1,0 +1,278 @@
+"""The external wrench that a fitted model reads off a log, and the contacts that it detects."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import scipy.stats
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem, Equations
+from forcegp.data import Dataset
+from forcegp.errors import DataError, ModelError, ParameterError, UnknownNameError
+from forcegp.forces.external_wrench import (
+    MULTIPLIER_STD,
+    MomentumLog,
+    WrenchFrame,
+    least_squares,
+    momentum_force,
+    observe,
+)
+from forcegp.forces.friction_memory import FrictionMemory
+from forcegp.forces.noise import distance_beyond, stick_variance
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.problem import Problem
+from forcegp.forces.quantities import affine_map, states_at
+from forcegp.models.prediction import CHUNK, Prediction
+from forcegp.robust import MAD_TO_STD
+
+METHODS = ("acceleration", "momentum")
+LEAST_NOISE = 1e-9
+"""Smallest noise of a velocity, beyond rounding [rad/s, m/s]."""
+THRESHOLD = 5.0
+"""σ beyond which a contact is detected."""
+
+
+@dataclass(frozen=True, repr=False)
+class ExternalWrench(Prediction):
+    """An external wrench at each sample of a log: `mean` `(n, k)` and `covariance` `(n, k, k)`.
+
+    The covariance counts the uncertainty of the learned forces, the noise of torques and of motion, and the
+    prior on the wrench; along directions that the arm cannot feel it is that of the prior.
+
+    Attributes:
+        frame: the frame, and the components that were estimated.
+    """
+
+    frame: WrenchFrame | None = None
+
+    def detect(self, threshold: float = THRESHOLD, hold: int = 1) -> Tensor:
+        """Whether a wrench acts at each sample, `(n,)` bool.
+
+        Without a wrench, d² = ŵᵀ C⁻¹ ŵ is at most a χ² variable with k degrees of freedom. A contact is
+        detected where d² exceeds the quantile of χ² that belongs to a Gaussian beyond ± `threshold` standard
+        deviations, at `hold` samples in a row.
+
+        Args:
+            threshold: [σ]; `false_alarm_rate(threshold)` is the probability of a false alarm at a sample.
+            hold: samples in a row, this one and those before it.
+
+        Raises:
+            ParameterError: the threshold is not positive, or no sample is asked for.
+        """
+        if not threshold > 0.0 or hold < 1:
+            raise ParameterError(
+                "invalid detection", expected="threshold > 0 [σ] and hold ≥ 1", got=(threshold, hold)
+            )
+        quantile = scipy.stats.chi2.isf(false_alarm_rate(threshold), self.mean.shape[-1])
+        far = self.distance_squared > quantile
+        held = far.clone()
+        for lag in range(1, hold):
+            held[lag:] &= far[:-lag]
+            held[:lag] = False
+        return held
+
+    @property
+    def distance_squared(self) -> Tensor:
+        """d² = ŵᵀ C⁻¹ ŵ, the squared Mahalanobis distance from no wrench `(n,)`."""
+        assert self.covariance is not None
+        scale = self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        correlation = self.covariance / (scale[..., :, None] * scale[..., None, :])
+        z = self.mean / scale
+        return (z * torch.linalg.solve(correlation, z[..., None])[..., 0]).sum(-1)
+
+
+def false_alarm_rate(threshold: float) -> float:
+    """Probability that a Gaussian variable lies beyond ± `threshold` standard deviations.
+
+    Example:
+        >>> round(false_alarm_rate(2.0), 4)
+        0.0455
+    """
+    return math.erfc(threshold / math.sqrt(2.0))
+
+
+@runtime_checkable
+class LearnedForces(Protocol):
+    """What a fit knows of the forces: its posterior, the noise beside it, and the robot."""
+
+    @property
+    def system(self) -> ConstrainedSystem: ...
+    @property
+    def posterior(self) -> ForcePosterior: ...
+    @property
+    def hyperparameters(self) -> Mapping[str, Tensor]: ...
+    @property
+    def noise(self) -> Mapping[str, Tensor]: ...
+    @property
+    def torque_std(self) -> Tensor | None: ...
+    @property
+    def problem(self) -> Problem: ...
+
+
+@torch.no_grad()
+def external_wrench(fit: LearnedForces, data: Dataset, frame: WrenchFrame, method: str) -> ExternalWrench:
+    """The external wrench at the samples of a log; see `StructuredFit.external_wrench`."""
+    if method not in METHODS:
+        raise UnknownNameError("method of estimating a wrench", method, METHODS)
+    reading = Reading.of(fit, data, frame)
+    if method == "acceleration":
+        mean, covariance = reading.from_accelerations()
+    else:
+        mean, covariance = reading.from_momenta()
+    k = len(frame.axes)
+    return ExternalWrench(
+        mean[:, :k],
+        covariance[:, :k, :k],
+        {"external_wrench": slice(0, k)},
+        distance_beyond(fit.hyperparameters, data.qd, data.tau),
+        fit.system.robot.joint_names,
+        frame,
+    )
+
+
+class JointForces(NamedTuple):
+    """At n states: mean of Q̄ `(n, nq)`, its covariance `(n, nq, nq)`, and the equations of motion."""
+
+    mean: Tensor
+    covariance: Tensor
+    eom: Equations
+
+
+def joint_forces(
+    fit: LearnedForces,
+    states: Sequence[Tensor],
+    active: Tensor,
+    qdd: Tensor,
+    memory: FrictionMemory | None = None,
+) -> JointForces:
+    """Q̄ with the noise of the torques, at states (q, q̇, τ) of shape `(n, nq)`.
+
+    Args:
+        fit: the learned forces.
+        states: q, q̇ and τ.
+        active: `(n, n_contacts)` which contacts are closed.
+        qdd: `(n, nq)` accelerations at which errors of the inertia act.
+        memory: whose share of the variance remains; its force is not added.
+    """
+    at, _ = states_at(fit.system, *states, active)
+    at = dataclasses.replace(at, qdd=qdd)
+    mean, S = fit.posterior.read(fit.system, at, affine_map(fit.system, at, "total_force"))
+    white = stick_variance(fit.hyperparameters, at)
+    beyond = fit.problem.unknown_variance(fit.hyperparameters, at) - white
+    if fit.torque_std is not None:
+        white = white + fit.torque_std**2
+    S = S + torch.diag_embed(white)
+    if memory is not None:
+        D = memory.share.sqrt()
+        S = D[:, None] * S * D
+    return JointForces(mean, S + torch.diag_embed(beyond), at.eom)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A log in which a wrench is looked for.
+
+    Attributes:
+        fit, data, frame: the learned forces, the log, and what is estimated.
+        memory: friction with memory, for logs in order of time.
+        remembered: its force `(n, nq)`, or zero.
+    """
+
+    fit: LearnedForces
+    data: Dataset
+    frame: WrenchFrame
+    memory: FrictionMemory | None
+    remembered: Tensor
+
+    @classmethod
+    def of(cls, fit: LearnedForces, data: Dataset, frame: WrenchFrame) -> Reading:
+        """A log, with the friction with memory that the fit's training log shows."""
+        memory = FrictionMemory.of(fit.hyperparameters) if data.header.ordered else None
+        force = torch.zeros_like(data.q) if memory is None else memory.force(data)
+        return cls(fit, data, frame, memory, force)
+
+    def forces(self, rows: Tensor, qdd: Tensor) -> tuple[JointForces, Tensor, Tensor]:
+        """Forces at some rows, J `(n, k, nq)` of the wrench and of multipliers, and their priors `(k,)`."""
+        data, system = self.data[rows], self.fit.system
+        active = data.active(system.contact_names)
+        forces = joint_forces(self.fit, (data.q, data.qd, data.tau), active, qdd, self.memory)
+        # Multipliers of closed contacts are further unknowns.
+        A = forces.eom.A * system.active_rows(active, data.q.shape[:-1])[..., None]
+        prior = torch.cat([self.frame.prior, data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])
+        J = torch.cat([self.frame.jacobian(system.robot, data.q), A], dim=-2)
+        return forces._replace(mean=forces.mean + self.remembered[rows]), J, prior
+
+    def from_accelerations(self) -> tuple[Tensor, Tensor]:
+        """Mean and covariance by generalized least squares."""
+        stated, parts = self.data.extras.get("qdd_std"), []
+        learned = self.fit.noise.get("qdd", self.data.q.new_zeros(self.data.nq))
+        for rows in torch.arange(len(self.data)).split(CHUNK):
+            qdd = self.data.qdd[rows]
+            forces, J, prior = self.forces(rows, qdd)
+            M, std = forces.eom.M, learned.expand_as(qdd) if stated is None else stated[rows]
+            S = forces.covariance + M @ torch.diag_embed(std**2) @ M.mT
+            parts.append(least_squares(J, (M @ qdd[..., None])[..., 0] - forces.mean, S, prior))
+        mean, covariance = zip(*parts, strict=True)
+        return torch.cat(mean), torch.cat(covariance)
+
+    def from_momenta(self) -> tuple[Tensor, Tensor]:
+        """Mean and covariance by the momentum filter, trajectory by trajectory."""
+        if not self.data.header.ordered:
+            raise DataError("the momentum filter needs a log in order of time", got="points in another order")
+        correlation = self.fit.problem.correlation if self.memory is None else self.memory.correlation
+        if self.fit.torque_std is None or correlation is None:
+            raise ModelError(
+                "this fit has not learned the noise of the torques, which the momentum filter needs",
+                hint='fit with force_priors="friction" to more samples in order of time',
+            )
+        noise, segment = velocity_noise(self.data), self.data.segment
+        logs = [
+            self.momenta((segment == own).nonzero()[:, 0], noise, correlation)
+            for own in segment.unique_consecutive()
+        ]
+        mean, covariance = zip(*(observe(log) for log in logs), strict=True)
+        return torch.from_numpy(np.concatenate(mean)), torch.from_numpy(np.concatenate(covariance))
+
+    def momenta(self, trajectory: Tensor, noise: Tensor, correlation: Tensor) -> MomentumLog:
+        """What the momentum filter reads of one trajectory, given by its rows."""
+        robot, columns, prior = self.fit.system.robot, [], self.frame.prior
+        for rows in trajectory.split(CHUNK):
+            q, qd = self.data.q[rows], self.data.qd[rows]
+            # Without accelerations, errors of the inertia count by their weight.
+            forces, J, prior = self.forces(rows, torch.zeros_like(q))
+            M, added = momentum_force(robot, q, qd)
+            p = (M @ qd[..., None])[..., 0]
+            p_noise = M @ torch.diag(noise**2) @ M.mT
+            factor = torch.linalg.cholesky(forces.covariance)
+            columns.append((p, p_noise, forces.mean - forces.eom.Q_C + added, J, factor))
+        p, p_noise, u, J, factor = (torch.cat(parts).numpy() for parts in zip(*columns, strict=True))
+        t, open_ = self.data.t[trajectory].numpy(), prior[len(self.frame.axes) :]
+        change = torch.cat([self.frame.changes, open_])
+        return MomentumLog(t, p, p_noise, u, J, prior.numpy(), change.numpy(), factor, correlation.numpy())
+
+
+def velocity_noise(data: Dataset) -> Tensor:
+    """Standard deviation of the white noise of each joint's velocity in a log, `(nq,)`.
+
+    From the departure of each sample from the cubic through its four neighbours, whose variance is 35/18 σ²;
+    its median absolute value does not see jumps.
+
+    Args:
+        data: a log in order of time, evenly sampled.
+
+    Raises:
+        DataError: no five samples follow each other.
+    """
+    whole = data.segment[4:] == data.segment[:-4]
+    if not bool(whole.any()):
+        raise DataError("velocity noise cannot be estimated", expected="five samples of one trajectory")
+    a, b, middle, c, d = (data.qd[k : len(data) - 4 + k][whole] for k in range(5))
+    departure = middle - (4.0 * (b + c) - a - d) / 6.0
+    return (MAD_TO_STD * departure.abs().median(0).values / (35.0 / 18.0) ** 0.5).clamp(min=LEAST_NOISE)
