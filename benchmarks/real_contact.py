@@ -1,11 +1,20 @@
-"""A real contact with a measured force: the defaults on a hopping leg, trained on either half of the log.
+"""A real contact with a measured force: a hopping leg on a slider, and the same leg pushed by hand.
 
-    python benchmarks/real_contact.py --json result.json      # half a minute
+    python benchmarks/real_contact.py --json result.json      # a few minutes
     python benchmarks/real_contact.py --logs path/to/real
 
-The leg stands and squats in the first half of `hopper/hopping`; it jumps, lands, squats deeper and stands in
-the second. The force sensor under the foot is never an input. All signals pass the same Savitzky-Golay
-filter. The height sensor tells where the base is, up to a constant, and when the foot is in the air.
+In `hopper/hopping` the leg stands and squats (first half), jumps, lands, squats deeper and stands (second);
+each half is learned from and the other tested. In `hopper/pushed` somebody moves the base by hand while the
+foot is held. All rows in contact count but those with a saturated torque. All signals of all methods pass the
+same Savitzky-Golay filter, whose window is cross-validated on the training half. Contact labels come from the
+height of the foot.
+
+- `static`: f = −J⁻ᵀ(τ + Q_G) of the two joints of the leg.
+- `equations of motion`: of these two joints, with the masses of the file and no friction.
+- `weighted`: of all three, the slider's missing force known to ± 1 N in motion and ± 4 N at rest.
+- `forcegp`: the external wrench at the foot, learned with a foot that sticks and no force sensor; `sensor`:
+  learned from the joint forces that sensor and accelerations show together; `vertical axis`: from the
+  sensor's vertical axis alone.
 """
 
 from __future__ import annotations
@@ -21,63 +30,104 @@ import torch
 from numpy.typing import NDArray
 from real_cases import existing
 from results_page import table
+from scipy.ndimage import binary_dilation
 from scipy.signal import savgol_filter
+from torch import Tensor
 
 import forcegp
 from forcegp import kinematics
+from forcegp.data.derivative import cross_validated_window
 from forcegp.errors import DataError
+from forcegp.models.sensed import SENSOR, with_sensed_forces
 from forcegp.models.structured_fit import StructuredFit
 
 LOGS = Path(__file__).resolve().parents[2] / "shared" / "real"
-DT, ORDER, WINDOW = 1e-3, 3, 61
-"""Sampling period [s]; degree and window of the filter [samples]."""
+DT, ORDER = 1e-3, 3
+"""Sampling period [s], and degree of the filter."""
 FIRST, SECOND = (0.03, 1.40), (1.40, 2.96)
-"""The halves [s], without half a window at the ends."""
+"""The halves of `hopping` [s], without half a window at the ends."""
 LIFTED = 0.009
 """The foot is in the air from this height above its median of the first half [m]: between the 8 mm that the
 height sensor is off in contact, and the 11 to 15 mm of the flight."""
-SIGNALS = ("height_sensors", "joint_positions", "joint_torques", "ati_force")
+NEVER_SLIDES = 1.0
+"""Speed below which the rubber foot sticks [m/s], above that of any row in contact."""
+SATURATED = 2.69
+"""Torque of the knee from which its drive is saturated [N m]."""
+HAND = 30.0
+"""Size of the unknown force on the base while somebody pushes it [N]."""
+SENSOR_STD = 0.1
+"""Resolution of the force sensor [N]."""
+UNKNOWN = 1e4
+"""Standard deviation of axes of the sensor that are not used [N]."""
+FLIGHT = 0.5
+"""Vertical force below which the sensor shows flight [N], to judge the contact labels."""
+AXES = ("fx", "fz")
+SIGNALS = ("joint_positions", "joint_torques", "ati_force")
+HEIGHT = "height_sensors"
+FORCE = "ati_force"
 
 
-def columns(folder: Path) -> dict[str, NDArray[np.float64]]:
+def columns(folder: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
     """The signals of a log in their common samples."""
-    read = {name: np.loadtxt(existing(folder / f"dg_hopper_teststand-{name}.dat")) for name in SIGNALS}
+    read = {name: np.loadtxt(existing(folder / f"dg_hopper_teststand-{name}.dat")) for name in names}
     first, last = max(x[0, 0] for x in read.values()), min(x[-1, 0] for x in read.values())
     return {name: x[(x[:, 0] >= first) & (x[:, 0] <= last), 1:] for name, x in read.items()}
 
 
-def hopping(logs: Path) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset]:
-    """The leg on its slider above the ground, and the log; `multiplier` is the measured vertical force."""
+def filtered(x: NDArray[np.float64], window: int, degree: int = 0) -> Tensor:
+    smooth = savgol_filter(x, window, ORDER, deriv=degree, delta=DT, axis=0)
+    return torch.from_numpy(np.ascontiguousarray(smooth))
+
+
+def dataset(
+    robot: forcegp.RobotModel, q: NDArray[np.float64], raw: dict[str, NDArray[np.float64]], window: int
+) -> forcegp.Dataset:
+    """A log of the leg, filtered; the slider has neither a motor nor a sensor of its force."""
+    tau = np.concatenate([np.zeros((len(q), 1)), raw["joint_torques"]], axis=1)
+    header = forcegp.data.DataHeader(unmeasured_torques=(robot.joint_names[0],))
+    return forcegp.Dataset(
+        t=DT * torch.arange(len(q), dtype=torch.float64),
+        q=filtered(q, window),
+        qd=filtered(q, window, 1),
+        qdd=filtered(q, window, 2),
+        tau=filtered(tau, window),
+        joint_names=robot.joint_names,
+        contact={"ground": torch.ones(len(q), dtype=torch.bool)},
+        contact_extras={SENSOR: {"ground": filtered(raw[FORCE], window)}},
+        header=header,
+    )
+
+
+def hopping(logs: Path, window: int) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset]:
+    """The leg on its slider with a foot that sticks to the ground, and the log."""
     robot = forcegp.load_robot(existing(logs / "hopper" / "teststand.urdf"))
-    raw = columns(logs / "hopper" / "hopping")
-    t = DT * np.arange(len(raw["height_sensors"]))
-
-    def filtered(x: NDArray[np.float64], degree: int = 0) -> torch.Tensor:
-        smooth = savgol_filter(x, WINDOW, ORDER, deriv=degree, delta=DT, axis=0)
-        return torch.from_numpy(np.ascontiguousarray(smooth))
-
-    q = np.concatenate([raw["height_sensors"], raw["joint_positions"]], axis=1)
-    foot = kinematics.frame_pose(robot, filtered(q), "contact")[1][:, 2]
-    ground = float(foot[(t >= FIRST[0]) & (t < FIRST[1])].median())
+    raw = columns(logs / "hopper" / "hopping", (HEIGHT, *SIGNALS))
+    data = dataset(robot, np.concatenate([raw[HEIGHT], raw["joint_positions"]], axis=1), raw, window)
+    foot = kinematics.frame_pose(robot, data.q, "contact")[1][:, 2]
+    ground = float(foot[(data.t >= FIRST[0]) & (data.t < FIRST[1])].median())
     contact = forcegp.SurfaceContact(
         name="ground",
         frame="contact",
         point=(0.0, 0.0, 0.0),
         surface=forcegp.Plane(normal=(0.0, 0.0, 1.0), offset=ground),
+        stick_speed=NEVER_SLIDES,
     )
-    # The slider has neither a motor nor a sensor of its force.
-    tau = np.concatenate([np.zeros_like(raw["height_sensors"]), raw["joint_torques"]], axis=1)
-    data = forcegp.Dataset(
-        t=torch.from_numpy(t),
-        q=filtered(q),
-        qd=filtered(q, 1),
-        qdd=filtered(q, 2),
-        tau=filtered(tau),
-        joint_names=robot.joint_names,
-        contact={"ground": foot < ground + LIFTED},
-        contact_extras={"multiplier": {"ground": filtered(raw["ati_force"][:, 2])}},
-    )
+    data = data.replace(contact={"ground": foot < ground + LIFTED})
     return forcegp.ConstrainedSystem(robot, [contact]), data
+
+
+def pushed(robot: forcegp.RobotModel, logs: Path, window: int) -> tuple[forcegp.Dataset, Tensor]:
+    """The log of the leg whose foot is held, and the rows that are judged `(n,)`.
+
+    Its height is not logged: the foot that stays where it is tells it.
+    """
+    raw = columns(logs / "hopper" / "pushed", SIGNALS)
+    q = np.concatenate([np.zeros((len(raw[FORCE]), 1)), raw["joint_positions"]], axis=1)
+    q[:, 0] -= kinematics.frame_pose(robot, torch.from_numpy(q), "contact")[1][:, 2].numpy()
+    saturated = binary_dilation(np.abs(raw["joint_torques"][:, 1]) > SATURATED, iterations=window // 2)
+    inside = np.arange(len(q))
+    inside = (inside >= window // 2) & (inside < len(q) - window // 2)
+    return dataset(robot, q, raw, window), torch.from_numpy(~saturated & inside)
 
 
 def between(data: forcegp.Dataset, half: tuple[float, float]) -> forcegp.Dataset:
@@ -85,21 +135,130 @@ def between(data: forcegp.Dataset, half: tuple[float, float]) -> forcegp.Dataset
     return data[(data.t >= half[0]) & (data.t < half[1])]
 
 
-def scores(fit: StructuredFit, test: forcegp.Dataset) -> dict[str, object]:
-    """Errors, error bars and coverage of the vertical force where the foot is on the ground."""
-    found = fit.predict(test.q, test.qd, test.tau, "multiplier", active=test.active(("ground",)), noise=True)
-    assert found.std is not None
-    closed = test.contact["ground"]
-    error = (found.mean[:, 0] - test.multiplier["ground"])[closed]
-    std = found.std[closed, 0]
+def window_of(logs: Path, half: tuple[float, float]) -> int:
+    """The window that the training half asks for."""
+    raw = columns(logs / "hopper" / "hopping", (HEIGHT, *SIGNALS))
+    rows = slice(round(half[0] / DT), round(half[1] / DT))
+    signals = [raw[name][rows] for name in (HEIGHT, "joint_positions", "joint_torques")]
+    return cross_validated_window(signals, ORDER)
+
+
+def classical(robot: forcegp.RobotModel, data: forcegp.Dataset) -> dict[str, Tensor]:
+    """Fore-aft and vertical force of each method without learning, `(n, 2)`."""
+    eom = forcegp.ConstrainedSystem(robot).equations(data.q, data.qd)
+    J = kinematics.frame_jacobian(robot, data.q, "contact", (0.0, 0.0, 0.0))[:, [3, 5]]
+    moving = (eom.M @ data.qdd[..., None])[..., 0] - eom.Q_K - data.tau
+    # 1/σ² of the three rows; those of the leg count most
+    weight = torch.where(data.qd[:, :1].abs() > 0.02, 1.0, 1.0 / 16.0).expand_as(moving).clone()
+    weight[:, 1:] = 1.0 / 0.03**2
+    JW = J * weight[:, None, :]
     return {
-        "samples": len(error),
-        "rmse_N": float(error.square().mean().sqrt()),
-        "bias_N": float(error.mean()),
-        "median_std_N": float(std.median()),
-        "coverage": float((error.abs() <= 2.0 * std).double().mean()),
-        "warnings": list(found.warnings),
+        "static": torch.linalg.solve(J[..., 1:].mT, -(eom.Q_G + data.tau)[:, 1:]),
+        "equations of motion": torch.linalg.solve(J[..., 1:].mT, moving[:, 1:]),
+        "weighted": torch.linalg.solve(JW @ J.mT, JW @ moving[..., None])[..., 0],
     }
+
+
+def scores(
+    force: Tensor, data: forcegp.Dataset, rows: Tensor, std: Tensor | None = None
+) -> dict[str, object]:
+    """Errors of the fore-aft and vertical force, and the coverage of their bars."""
+    error = (force - data.contact_extras[SENSOR]["ground"][:, [0, 2]])[rows]
+    score: dict[str, object] = {
+        "samples": len(error),
+        "rmse_N": error.square().mean(0).sqrt().tolist(),
+        "bias_N": error.mean(0).tolist(),
+    }
+    if std is not None:
+        score["median_std_N"] = std[rows].median(0).values.tolist()
+        score["coverage"] = (error.abs() <= 2.0 * std[rows]).double().mean(0).tolist()
+    return score
+
+
+def wrench_scores(
+    fit: StructuredFit, data: forcegp.Dataset, rows: Tensor, external: dict[str, float] | None = None
+) -> dict[str, object]:
+    """Scores of the external wrench at the foot, the contact not declared."""
+    open_ = data.replace(contact={"ground": torch.zeros_like(rows)})
+    found = fit.external_wrench(open_, "contact", axes=AXES, external=external)
+    return scores(found.mean, data, rows, found.std)
+
+
+def learned(system: forcegp.ConstrainedSystem, data: forcegp.Dataset, sensor: str = "") -> StructuredFit:
+    """A fit with the defaults, without the force sensor, with it, or with its vertical axis."""
+    if sensor == "sensor":
+        free = forcegp.ConstrainedSystem(system.robot)
+        return forcegp.StructuredGP(free, "analytical").fit(with_sensed_forces(data, system, SENSOR_STD))
+    model = forcegp.StructuredGP(system, "analytical")
+    if sensor == "vertical axis":
+        closed = data[data.contact["ground"]]
+        force = {"F_I": {"ground": closed.contact_extras[SENSOR]["ground"]}}
+        std = torch.tensor([UNKNOWN, UNKNOWN, SENSOR_STD], dtype=torch.float64)
+        sensed = forcegp.Observation(closed.replace(contact_extras=force), "contact_force", noise_std=std)
+        return model.fit([forcegp.Observation(data), sensed])
+    return model.fit(data)
+
+
+def hopping_scores(logs: Path, train: tuple[float, float], test: tuple[float, float]) -> dict[str, object]:
+    """All methods on one half, learned from the other."""
+    window = window_of(logs, train)
+    system, data = hopping(logs, window)
+    first, second = between(data, train), between(data, test)
+    rows = second.contact["ground"]
+    result: dict[str, object] = {"window": window}
+    for name, force in classical(system.robot, second).items():
+        result[name] = scores(force, second, rows)
+    for name in ("", "sensor", "vertical axis"):
+        result[f"forcegp {name}".strip()] = wrench_scores(learned(system, first, name), second, rows)
+    return result
+
+
+def pushed_scores(logs: Path) -> dict[str, object]:
+    """The pushed leg: learned on `hopping` without a sensor, and on its own first half with one."""
+    window = window_of(logs, (FIRST[0], SECOND[1]))
+    system, data = hopping(logs, window)
+    log, rows = pushed(system.robot, logs, window)
+    later = rows & (log.t >= log.t[-1] / 2.0)
+    hand = {system.robot.joint_names[0]: HAND}
+    result: dict[str, object] = {"window": window}
+    for name, force in classical(system.robot, log).items():
+        if name != "weighted":
+            result[name] = scores(force, log, rows)
+    fit = learned(system, between(data, (FIRST[0], SECOND[1])))
+    result["forcegp, learned on hopping"] = wrench_scores(fit, log, rows, hand)
+    fit = learned(system, log[rows & ~later], "sensor")
+    result["forcegp sensor, second half"] = wrench_scores(fit, log, later, hand)
+    return result
+
+
+def contact_labels(logs: Path) -> dict[str, float]:
+    """How well the height of the foot tells flight from stance, beside the force sensor."""
+    _, data = hopping(logs, window_of(logs, FIRST))
+    data = between(data, (FIRST[0], SECOND[1]))
+    flight = data.contact_extras[SENSOR]["ground"][:, 2] < FLIGHT
+    said = ~data.contact["ground"]
+    jump = said & (data.t < float(data.t[flight].max()) + 0.05)
+    times, found = (data.t[x.nonzero()[:, 0]] for x in (flight, jump))
+    return {
+        "flight_found": float((said & flight).sum() / flight.sum()),
+        "stance_called_open": float((said & ~flight).sum() / (~flight).sum()),
+        "lift_off_ms": 1e3 * float(found[0] - times[0]),
+        "landing_ms": 1e3 * float(found[-1] - times[-1]),
+    }
+
+
+def lines(name: str, result: dict[str, object]) -> list[list[str]]:
+    """Rows of the table."""
+
+    def pair(score: dict[str, list[float]], key: str, digits: int) -> str:
+        return " ".join(f"{x:.{digits}f}" for x in score[key]) if key in score else "–"
+
+    keys = ("rmse_N", "bias_N", "median_std_N", "coverage")
+    return [
+        [name, method, *(pair(score, key, 2) for key in keys)]
+        for method, score in result.items()
+        if isinstance(score, dict)
+    ]
 
 
 def main() -> None:
@@ -112,25 +271,27 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write all results to this file")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
     try:
-        system, data = hopping(options.logs)
+        result = {
+            "hopping, second half": hopping_scores(options.logs, FIRST, SECOND),
+            "hopping, first half": hopping_scores(options.logs, SECOND, FIRST),
+            "pushed": pushed_scores(options.logs),
+            "contact labels": contact_labels(options.logs),
+        }
     except DataError as error:
         sys.exit(str(error))
-    halves, result = {"first half": FIRST, "second half": SECOND}, {}
-    for train in halves:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            fit = forcegp.StructuredGP(system, "analytical").fit(between(data, halves[train]))
-        for test in halves:
-            result[f"{train} trains, {test} tests"] = scores(fit, between(data, halves[test]))
-    rows = [
-        [name, *(f"{r[key]:.2f}" for key in ("rmse_N", "bias_N", "median_std_N")), f"{r['coverage']:.3f}"]
-        for name, r in result.items()
+    head = [
+        "tested on",
+        "method",
+        "RMSE fore-aft, vertical [N]",
+        "bias [N]",
+        "median σ [N]",
+        "coverage of ±2σ",
     ]
-    print(table(["", "RMSE of λ [N]", "bias [N]", "median σ [N]", "±2σ coverage"], rows))
-    for name, found in result.items():
-        for warning in found["warnings"]:
-            print(f"{name}: {warning}")
+    print(table(head, [row for name, part in result.items() for row in lines(name, part)]))
+    print({name: part["window"] for name, part in result.items() if "window" in part})
+    print(result["contact labels"])
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,8 @@ from forcegp.errors import DataError
 from forcegp.robust import MAD_TO_STD
 from forcegp.rows import runs
 
+WINDOWS = (5, 7, 9, 11, 15, 21, 31, 41, 61, 81, 101, 121, 151, 201)
+"""Windows that cross-validation tries, in samples."""
 UNIFORM_TOLERANCE = 0.02
 """Largest departure of a time step from the median step, as a fraction: clocks jitter, gaps do not pass."""
 
@@ -40,6 +43,36 @@ class SavitzkyGolay:
                 expected="an odd window, and 2 ≤ order < window",
                 got=f"window {self.window}, order {self.order}",
             )
+
+
+def cross_validated_window(signals: Sequence[NDArray[np.float64]], order: int = 3) -> int:
+    """The window that predicts the noisiest of some signals best, each sample from the others in its window.
+
+    With h the weight of a sample in its own fit, the sample is off the fit to the others by (x − x̂)/(1 − h).
+    Each column has the window with the least mean square of that (leave-one-out cross-validation), and the
+    widest of these windows is taken, so that all signals have one bandwidth.
+
+    Args:
+        signals: logged values, `(n, d)` each, evenly spaced in time.
+        order: degree of the polynomial.
+
+    Example:
+        >>> import numpy as np
+        >>> t = np.linspace(0.0, 4.0, 1000)[:, None]
+        >>> noise = np.random.default_rng(0).normal(size=(1000, 1))
+        >>> [cross_validated_window([np.sin(t) + size * noise]) for size in (1e-6, 1e-2)]
+        [41, 151]
+    """
+    from scipy.signal import savgol_coeffs, savgol_filter
+
+    best = []
+    for x in signals:
+        windows = [w for w in WINDOWS if order < w < len(x)]
+        weights = [savgol_coeffs(w, order)[w // 2] for w in windows]
+        fits = [savgol_filter(x, w, order, axis=0) for w in windows]
+        errors = [np.square((x - fit) / (1.0 - h)).mean(0) for fit, h in zip(fits, weights, strict=True)]
+        best += [windows[i] for i in np.argmin(errors, axis=0)]
+    return max(best)
 
 
 def differentiate(

@@ -25,7 +25,7 @@ from forcegp.forces.external_wrench import (
     observe,
 )
 from forcegp.forces.friction_memory import FrictionMemory
-from forcegp.forces.noise import distance_beyond, stick_variance
+from forcegp.forces.noise import distance_beyond, external_std, stick_variance
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.problem import Problem
 from forcegp.forces.quantities import affine_map, states_at
@@ -117,11 +117,17 @@ class LearnedForces(Protocol):
 
 
 @torch.no_grad()
-def external_wrench(fit: LearnedForces, data: Dataset, frame: WrenchFrame, method: str) -> ExternalWrench:
+def external_wrench(
+    fit: LearnedForces,
+    data: Dataset,
+    frame: WrenchFrame,
+    method: str,
+    external: Mapping[str, float] | None = None,
+) -> ExternalWrench:
     """The external wrench at the samples of a log; see `StructuredFit.external_wrench`."""
     if method not in METHODS:
         raise UnknownNameError("method of estimating a wrench", method, METHODS)
-    reading = Reading.of(fit, data, frame)
+    reading = Reading.of(fit, data, frame, external)
     if method == "acceleration":
         mean, covariance = reading.from_accelerations()
     else:
@@ -183,6 +189,7 @@ class Reading:
         fit, data, frame: the learned forces, the log, and what is estimated.
         memory: friction with memory, for logs in order of time.
         remembered: its force `(n, nq)`, or zero.
+        external: standard deviation of further unknown forces on the joints `(nq,)`, or `None`.
     """
 
     fit: LearnedForces
@@ -190,19 +197,24 @@ class Reading:
     frame: WrenchFrame
     memory: FrictionMemory | None
     remembered: Tensor
+    external: Tensor | None = None
 
     @classmethod
-    def of(cls, fit: LearnedForces, data: Dataset, frame: WrenchFrame) -> Reading:
+    def of(
+        cls, fit: LearnedForces, data: Dataset, frame: WrenchFrame, external: Mapping[str, float] | None
+    ) -> Reading:
         """A log, with the friction with memory that the fit's training log shows."""
         memory = FrictionMemory.of(fit.hyperparameters) if data.header.ordered else None
         force = torch.zeros_like(data.q) if memory is None else memory.force(data)
-        return cls(fit, data, frame, memory, force)
+        return cls(fit, data, frame, memory, force, external_std(external, fit.system.robot))
 
     def forces(self, rows: Tensor, qdd: Tensor) -> tuple[JointForces, Tensor, Tensor]:
         """Forces at some rows, J `(n, k, nq)` of the wrench and of multipliers, and their priors `(k,)`."""
         data, system = self.data[rows], self.fit.system
         active = data.active(system.contact_names)
         forces = joint_forces(self.fit, (data.q, data.qd, data.tau), active, qdd, self.memory)
+        if self.external is not None:
+            forces = forces._replace(covariance=forces.covariance + torch.diag(self.external**2))
         # Multipliers of closed contacts are further unknowns.
         A = forces.eom.A * system.active_rows(active, data.q.shape[:-1])[..., None]
         prior = torch.cat([self.frame.prior, data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])

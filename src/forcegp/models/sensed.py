@@ -15,11 +15,14 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Observation
+from forcegp.forces.quantities import states_at
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robust import MAD_TO_STD
 
 SENSOR = "F_sensor"
 """Force on the robot at a contact, as `forcegp import` writes it [N]."""
+LEAST_FORCE = 1e-3
+"""Smallest noise of a sensed joint force, relative to its size."""
 TINY = 1e-12
 """Smallest variance of a predicted force [N²]."""
 
@@ -48,6 +51,44 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
     rows = torch.nonzero(closed)[:, 0]
     sensed = data.replace(contact_extras=extras)[rows]
     return [Observation(data), Observation(sensed, "multiplier", noise_std)]
+
+
+@torch.no_grad()
+def with_sensed_forces(data: Dataset, system: ConstrainedSystem, force_std: float) -> list[Observation]:
+    """The joint forces that a force sensor and the accelerations show together, Q̄ = M q̈ − J_Eᵀ F.
+
+    Both contain the same errors of the torques, which two measurements would count twice. Learn from them
+    without the contact, `StructuredGP(ConstrainedSystem(system.robot), …)`: its force is measured. A joint
+    without a measured torque has an unknown force of the size of its Q̄ − Q_C − Q_G − Q_D.
+
+    Args:
+        data: a log with `F_sensor`; where the contact is open, no force acts.
+        system: robot with a single contact with a surface.
+        force_std: standard deviation of each component of the sensed force [N].
+
+    Raises:
+        ModelError: the log has no sensor's force, or the system another number of contacts.
+    """
+    contact = _contact(system)
+    if not has_sensor(data, system):
+        raise ModelError(
+            f"the log has no sensor's force at contact {contact.name!r}",
+            expected=f"columns {SENSOR}.{contact.name}.x, .y, .z",
+        )
+    closed = data.active([contact.name])
+    at, _ = states_at(system, data.q, data.qd, data.tau, closed)
+    J, M = at.eom.contact_points[contact.name].jacobian, at.eom.M
+    F = data.contact_extras[SENSOR][contact.name] * closed
+    Q = (M @ data.qdd[..., None])[..., 0] - (J.mT @ F[..., None])[..., 0]
+    qdd_std = torch.full_like(Q, data.header.noise_std or 0.0)
+    qdd_std = data.extras.get("qdd_std", qdd_std)
+    # Σ = σ² J_EᵀJ_E + M Σ_q̈ M
+    variance = force_std**2 * J.square().sum(-2) * closed + (M.square() @ qdd_std[..., None] ** 2)[..., 0]
+    unknown = (Q - at.eom.Q_K).square().mean(0)
+    unmeasured = [name in data.header.unmeasured_torques for name in data.joint_names]
+    variance = variance + unknown * torch.tensor(unmeasured, device=Q.device)
+    std = (variance + (LEAST_FORCE * Q.square().mean(0).sqrt()) ** 2).sqrt()
+    return [Observation(data.replace(extras={**data.extras, "Q": Q}), "joint_force", std)]
 
 
 def _contact(system: ConstrainedSystem) -> SurfaceContact:

@@ -154,6 +154,7 @@ class StructuredFit(FittedModel):
         frame: str,
         *,
         method: str = "acceleration",
+        external: Mapping[str, float] | None = None,
         **components: Any,
     ) -> ExternalWrench:
         """Wrench of the environment on a frame, beyond the learned forces and the contacts that are closed.
@@ -167,6 +168,8 @@ class StructuredFit(FittedModel):
             data: a log; for the momentum filter in order of time.
             frame: frame of the robot.
             method: `"acceleration"` or `"momentum"`.
+            external: standard deviation of unknown forces on joints that the training log did not have, such
+                as a hand that pushes, by name [N m, N].
             **components: `reference` (`"world"` or `"local"` axes), `axes` (some of `fx`, `fy`, `fz`, `mx`,
                 `my`, `mz`; the others are zero), `point`, `prior_std` and `change` of `WrenchFrame`.
 
@@ -183,7 +186,7 @@ class StructuredFit(FittedModel):
             `wrench = fit.external_wrench(log, "tool", axes=("fx", "fy", "fz"), method="momentum")`
         """
         data.check_robot(self.specified.robot)
-        return external_wrench(self, data, WrenchFrame(frame, **components), method)
+        return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """How far the speed and torque of each joint lie beyond those of the training data, in training
