@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+import forcegp
 from forcegp.forces.friction_memory import learn_memory
 from forcegp.forces.measurements import Measurement
 
+ROBOT = forcegp.load_robot("double_pendulum")
 STEP, DISTANCE = 0.01, 0.05
 
 
@@ -34,19 +36,24 @@ def test_friction_with_memory_is_explained_on_another_motion() -> None:
     static = 2.0 * torch.tanh(train.qd[:, 0] / 0.02)
     residual = noise.clone()
     residual[:, 0] += 2.0 * z - static
-    memory = learn_memory(train, residual, torch.zeros_like(residual), residual.square())
+    # The fit takes the friction for noise of the torque, and expects none of sticking.
+    expected = torch.stack([residual.square().mean(0).expand_as(residual), 0.0 * residual], dim=-1)
+    memory = learn_memory(ROBOT, train, residual, 0.0 * residual, 0.0 * residual, expected)
     assert memory is not None
     expected = 2.0 * z_test - 2.0 * torch.tanh(test.qd[:, 0] / 0.02)
-    left = expected - memory.force(test)[:, 0]
+    left = expected - memory.force(ROBOT, test)[:, 0]
     # Samples of velocity integrate z to some percent.
     assert float(left[100:].std()) < 0.2 * float(expected.std())
-    assert float(memory.share[0]) < 0.1
+    assert float(memory.share[0, 0]) < 0.1
     # The second joint has noise alone.
-    assert float(memory.share[1]) > 0.95
-    assert bool((memory.force(test)[:, 1].abs() < 0.05).all())
+    assert float(memory.share[1, 0]) > 0.95
+    assert bool((memory.force(ROBOT, test)[:, 1].abs() < 0.05).all())
 
 
 def test_samples_far_apart_show_no_memory() -> None:
     train, _ = log(60.0, 1)
-    residual = torch.zeros_like(train.qd)
-    assert learn_memory(train[torch.arange(0, len(train.q), 10)], *3 * [residual[::10]]) is None
+    x = torch.zeros_like(train.qd[::10])
+    assert (
+        learn_memory(ROBOT, train[torch.arange(0, len(train.q), 10)], x, x, x, torch.stack([x, x], dim=-1))
+        is None
+    )

@@ -3,9 +3,10 @@
 Friction that is a function of the velocity jumps where a joint reverses. Real friction develops over a
 distance δ: in Dahl's model it is proportional to z, dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction damping
 of mechanical vibrations*). Force priors depend on the state alone, so around each reversal they are wrong by
-up to the whole friction. In a log in order of time z follows from the velocities. A ridge regression, of the
-torque that a fit leaves, on z for some δ and on functions of the velocity corrects that. A joint is corrected
-only if that explains stretches of the training log that the regression has not seen.
+up to the whole friction, and what else they learn is less certain. In a log in order of time z follows from
+the velocities. A ridge regression, of the torque that a fit leaves, on z for some δ, on functions of the
+velocity, and on the weight of the links corrects that. A joint is corrected only if that explains stretches
+of the training log that the regression has not seen.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import scipy.optimize
 import torch
 from torch import Tensor
 
@@ -22,9 +24,12 @@ from forcegp.forces.inverse_dynamics import Timed, bristles
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE, stick_variance
 from forcegp.forces.priors.base import NOISE
+from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import SPEEDS
 from forcegp.forces.problem import Problem, force_posterior
 from forcegp.forces.quantities import affine_map
+from forcegp.identification import regressor
+from forcegp.robot.model import RobotModel
 
 MEMORY = f"{NOISE}.memory."
 WEIGHTS, SHARE, CORRELATION = (MEMORY + name for name in ("weights", "share", "correlation"))
@@ -39,10 +44,19 @@ LEAST_SHARE = 0.01
 """Smallest share of the variance that is believed to remain."""
 
 
-def _features(m: Timed) -> Tensor:
-    """Bristles of all distances, and friction without memory, `(n, nq, f)`."""
-    v = m.qd[..., None]
-    return torch.cat([bristles(m), *(torch.tanh(v / speed) for speed in SPEEDS), v], dim=-1)
+def _features(robot: RobotModel, log: Timed) -> Tensor:
+    """Bristles of all distances, friction without memory, an offset, and weight, `(n, nq, f)`."""
+    v = log.qd[..., None]
+    friction = [bristles(log), *(torch.tanh(v / speed) for speed in SPEEDS), v, torch.ones_like(v)]
+    return torch.cat([*friction, _weight(robot, log.q)], dim=-1)
+
+
+def _weight(robot: RobotModel, q: Tensor) -> Tensor:
+    """Torque of gravity on the mass and the first moment of each link, `(n, nq, 4 nq)` [N m, N], for errors
+    as large as `InertialPrior` expects."""
+    columns, zero = torch.arange(10 * robot.nq).view(-1, 10)[:, :4].flatten(), torch.zeros_like(q)
+    Y = regressor(robot, q, zero, zero)[..., columns]
+    return Y * InertialPrior().scale(robot)[columns]
 
 
 @dataclass(frozen=True)
@@ -51,7 +65,8 @@ class FrictionMemory:
 
     Attributes:
         weights: of the features, `(nq, f)` [N m, N].
-        share: variance of the joint force that the correction leaves over that of the fit, `(nq,)`.
+        share: what remains of the variance of the torque's noise, and of that of joints that stick,
+            `(nq, 2)`.
         correlation: integral of the autocorrelation of what is left over all lags, `(nq,)` [s].
     """
 
@@ -66,9 +81,9 @@ class FrictionMemory:
             return None
         return cls(*(hyperparameters[name] for name in (WEIGHTS, SHARE, CORRELATION)))
 
-    def force(self, log: Timed) -> Tensor:
+    def force(self, robot: RobotModel, log: Timed) -> Tensor:
         """Joint force of the correction in a log in order of time, `(n, nq)` [N m, N]."""
-        return (_features(log) * self.weights).sum(-1)
+        return (_features(robot, log) * self.weights).sum(-1)
 
 
 @torch.no_grad()
@@ -92,30 +107,39 @@ def memory_of(
         return {}
     std = dataclasses.replace(problem, training=training).noise_at(hyperparameters, i).expand_as(m.values)
     posterior, parts = force_posterior(problem, hyperparameters), []
+    torque = hyperparameters[TORQUE_NOISE].exp().square()
     for rows in free.split(CHUNK_STATES):
         part = m[rows]
         at = part.at(problem.system)
         M, z = at.eom.M, affine_map(problem.system, at, "total_force")
         mean, S = posterior.read(problem.system, at, z)
-        expected = S.diagonal(dim1=-2, dim2=-1) + hyperparameters[TORQUE_NOISE].exp().square()
-        expected = expected + stick_variance(hyperparameters, at)
+        stick = stick_variance(hyperparameters, at)
+        noise = torch.stack([torque.expand_as(stick), stick], dim=-1)
         # Noise of q̈ in the residual: diag(M Σ Mᵀ)
         white = (M.square() @ std[rows].square()[..., None])[..., 0]
-        parts.append(((M @ part.values[..., None])[..., 0] - mean, white, expected))
-    memory = learn_memory(m[free], *(torch.cat(columns) for columns in zip(*parts, strict=True)))
+        residual = (M @ part.values[..., None])[..., 0] - mean
+        parts.append((residual, white, S.diagonal(dim1=-2, dim2=-1), noise))
+    memory = learn_memory(
+        problem.system.robot, m[free], *(torch.cat(columns) for columns in zip(*parts, strict=True))
+    )
     if memory is None:
         return {}
     return {WEIGHTS: memory.weights, SHARE: memory.share, CORRELATION: memory.correlation}
 
 
-def learn_memory(motion: Timed, residual: Tensor, white: Tensor, expected: Tensor) -> FrictionMemory | None:
+def learn_memory(
+    robot: RobotModel, motion: Timed, residual: Tensor, white: Tensor, forces: Tensor, noise: Tensor
+) -> FrictionMemory | None:
     """Learn the correction from training samples in free motion.
 
     Args:
+        robot: the robot.
         motion: of the samples.
         residual: joint force that the fit leaves, M q̈ − E Q̄ `(n, nq)`.
         white: its variance that noise of the accelerations explains, `(n, nq)`.
-        expected: its variance that the fit expects besides, `(n, nq)`.
+        forces: its variance that the learned forces explain, `(n, nq)`.
+        noise: its variance that noise of the torques and sticking explain, `(n, nq, 2)`, of which shares
+            remain.
 
     Returns:
         The correction, or `None` if the samples are too far apart.
@@ -123,7 +147,7 @@ def learn_memory(motion: Timed, residual: Tensor, white: Tensor, expected: Tenso
     steps = motion.t.diff()[motion.segment[1:] == motion.segment[:-1]]
     if not len(steps) or not 0.0 < float(steps.median()) <= LONGEST_STEP or float(steps.min()) <= 0.0:
         return None
-    X, group = _features(motion), stretches(motion.segment)
+    X, group = _features(robot, motion), stretches(motion.segment)
     grams, rights = [], []
     for g in group.unique():
         x = X[group == g].transpose(0, 1)
@@ -135,10 +159,19 @@ def learn_memory(motion: Timed, residual: Tensor, white: Tensor, expected: Tenso
     for i, g in enumerate(group.unique()):
         w = torch.linalg.solve(gram.sum(0) - gram[i] + ridge, right.sum(0) - right[i])
         remaining[group == g] -= (X[group == g] * w).sum(-1)
-    before, after = ((x.square() - white).mean(0) for x in (residual, remaining))
-    share = (after / expected.mean(0)).clamp(min=LEAST_SHARE, max=1.0)
-    better = after < before
+    better = remaining.square().sum(0) < residual.square().sum(0)
+    total, share = white + forces + noise.sum(-1), torch.ones_like(noise[0])
+    for j in better.nonzero()[:, 0].tolist():
+        # r² − white − forces ≈ share · noise, with weights by the variance of r²
+        rows = noise[:, j] / total[:, j, None]
+        target = (remaining[:, j].square() - white[:, j] - forces[:, j]) / total[:, j]
+        found = torch.from_numpy(scipy.optimize.nnls(rows.numpy(), target.numpy())[0])
+        share[j] = found.clamp(min=LEAST_SHARE, max=1.0)
+        # A new motion is one more stretch, so its variance scatters as that of the stretches does.
+        square = remaining[:, j].square() / (white[:, j] + forces[:, j] + noise[:, j] @ share[j])
+        by_stretch = torch.stack([square[group == g].mean() for g in group.unique()])
+        share[j] *= (by_stretch.mean() + by_stretch.std()).clamp(min=1.0)
     weights = torch.linalg.solve(gram.sum(0) + ridge, right.sum(0)) * better[:, None]
     left = torch.where(better, remaining, residual)
     times = autocorrelation_time(left, motion.segment, white.mean(0))
-    return FrictionMemory(weights, torch.where(better, share, 1.0), steps.median() * times)
+    return FrictionMemory(weights, share, steps.median() * times)

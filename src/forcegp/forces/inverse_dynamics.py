@@ -173,8 +173,10 @@ def free_rows(
 
 @runtime_checkable
 class Timed(Protocol):
-    """Velocities `(n, nq)` with the time `(n,)` [s] and the trajectory `(n,)` of each sample."""
+    """Positions and velocities `(n, nq)` with time `(n,)` [s] and trajectory `(n,)` of each sample."""
 
+    @property
+    def q(self) -> Tensor: ...
     @property
     def t(self) -> Tensor: ...
     @property

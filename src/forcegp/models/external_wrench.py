@@ -165,20 +165,17 @@ def joint_forces(
         states: q, q̇ and τ.
         active: `(n, n_contacts)` which contacts are closed.
         qdd: `(n, nq)` accelerations at which errors of the inertia act.
-        memory: whose share of the variance remains; its force is not added.
+        memory: whose shares of the noise remain; its force is not added.
     """
     at, _ = states_at(fit.system, *states, active)
     at = dataclasses.replace(at, qdd=qdd)
     mean, S = fit.posterior.read(fit.system, at, affine_map(fit.system, at, "total_force"))
-    white = stick_variance(fit.hyperparameters, at)
-    beyond = fit.problem.unknown_variance(fit.hyperparameters, at) - white
-    if fit.torque_std is not None:
-        white = white + fit.torque_std**2
-    S = S + torch.diag_embed(white)
-    if memory is not None:
-        D = memory.share.sqrt()
-        S = D[:, None] * S * D
-    return JointForces(mean, S + torch.diag_embed(beyond), at.eom)
+    stick = stick_variance(fit.hyperparameters, at)
+    beyond = fit.problem.unknown_variance(fit.hyperparameters, at) - stick
+    torque = torch.zeros_like(stick) if fit.torque_std is None else fit.torque_std.square().expand_as(stick)
+    noise = torch.stack([torque, stick], dim=-1)
+    noise = noise if memory is None else noise * memory.share
+    return JointForces(mean, S + torch.diag_embed(noise.sum(-1) + beyond), at.eom)
 
 
 @dataclass(frozen=True)
@@ -205,7 +202,7 @@ class Reading:
     ) -> Reading:
         """A log, with the friction with memory that the fit's training log shows."""
         memory = FrictionMemory.of(fit.hyperparameters) if data.header.ordered else None
-        force = torch.zeros_like(data.q) if memory is None else memory.force(data)
+        force = torch.zeros_like(data.q) if memory is None else memory.force(fit.system.robot, data)
         return cls(fit, data, frame, memory, force, external_std(external, fit.system.robot))
 
     def forces(self, rows: Tensor, qdd: Tensor) -> tuple[JointForces, Tensor, Tensor]:
