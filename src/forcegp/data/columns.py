@@ -161,13 +161,11 @@ def _fill_in(
     def derive(name: str, degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return differentiate(fields["t"], fields[name], fields["segment"], method, degree)
 
-    try:
+    with DataError.within(source):
         if "qd" in absent:
             fields["qd"], _ = derive("q", 1)
         if "qdd" in absent:
             fields["qdd"], fields["extras"]["qdd_std"] = derive(of, order)
-    except DataError as error:
-        raise DataError.at(source, error) from None
     step = f"computed {' and '.join(sorted(absent))} from the log by {method}"
     if "qdd" not in absent:
         return header.with_step(step)

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from forcegp.data.dataset import Dataset
-from forcegp.errors import DataError, UnknownNameError
+from forcegp.errors import DataError, check_name
 
 INPUTS = ("q", "qd", "tau")
 """What a regression model sees of a sample."""
@@ -112,8 +112,7 @@ def select_points(
     if method == "farthest":
         # Scaled by the whole log, so that the metric does not depend on what is held out.
         return rows[farthest_points(standardized_inputs(data)[rows], count, progress=progress)]
-    if method not in ("even", "random"):
-        raise UnknownNameError("method of selection", method, ["farthest", "even", "random"])
+    check_name("method of selection", method, ["farthest", "even", "random"])
     _check_count(count, len(rows))
     if method == "even":
         return rows[torch.linspace(0, len(rows) - 1, count, dtype=torch.float64).round().long()]

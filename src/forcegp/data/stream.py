@@ -255,17 +255,13 @@ class StreamedDataset:
             fields = parse(source, piece.columns, piece.header, self.differentiate)
         names = {name: fields["header"].__dict__[name] for name in ("joint_names", "contact_names")}
         fields["header"] = self.header.model_copy(update=names)
-        try:
+        with DataError.within(source):
             data = Dataset(**as_tensors(fields, self.dtype, torch.device(self.device)))
-        except DataError as error:
-            raise DataError.at(source, error) from None
         data = data[piece.before : piece.before + piece.rows]
         if self.joints is not None and not set(self.joints) - set(data.joint_names):
             data = data.select(self.joints)
-        try:
+        with DataError.within(str(path)):
             check_alike([data[:1] if first is None else first, data[:1]])
-        except DataError as error:
-            raise DataError.at(str(path), error) from None
         return data
 
 

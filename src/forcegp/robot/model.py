@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from forcegp.errors import ShapeError, UnknownNameError
+from forcegp.errors import ShapeError, check_name
 from forcegp.notebook import html_table
 
 JointType = Literal["revolute", "prismatic"]
@@ -86,7 +86,7 @@ class RobotModel:
 
     def __repr__(self) -> str:
         """One line that says which robot it is, without the numbers."""
-        moving = sum(1 for kind in self.joint_types if kind == "prismatic")
+        moving = self.joint_types.count("prismatic")
         kinds = f", {moving} of them prismatic" if moving else ""
         mass = float(self.mass.detach().sum())
         kind = str(self.dtype).removeprefix("torch.")
@@ -167,8 +167,7 @@ class RobotModel:
         Raises:
             UnknownNameError: no such frame; the message lists the frames and the nearest one.
         """
-        if frame not in self.frame_names:
-            raise UnknownNameError(f"frame of robot {self.name!r}", frame, self.frame_names)
+        check_name(f"frame of robot {self.name!r}", frame, self.frame_names)
         return self.frame_names.index(frame)
 
     def joint_index(self, joint: str) -> int:
@@ -177,8 +176,7 @@ class RobotModel:
         Raises:
             UnknownNameError: no such joint; the message lists the joints and the nearest one.
         """
-        if joint not in self.joint_names:
-            raise UnknownNameError(f"joint of robot {self.name!r}", joint, self.joint_names)
+        check_name(f"joint of robot {self.name!r}", joint, self.joint_names)
         return self.joint_names.index(joint)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RobotModel:
@@ -200,8 +198,7 @@ class RobotModel:
         """
         names = [field.name for field in dataclasses.fields(self)]
         for name, value in fields.items():
-            if name not in names:
-                raise UnknownNameError("robot field", name, names)
+            check_name("robot field", name, names)
             old = getattr(self, name)
             if isinstance(old, Tensor) and isinstance(value, Tensor) and value.shape != old.shape:
                 raise ShapeError(

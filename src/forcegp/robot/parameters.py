@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from forcegp.batchlast import skew
-from forcegp.errors import InertiaError, ModelError, UnknownNameError
+from forcegp.errors import InertiaError, ModelError, check_name
 from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, log_cholesky, pseudo_inertia
 from forcegp.robot.model import RobotModel
 
@@ -134,8 +134,7 @@ class AnalyticalParameters(nn.Module):
 
 
 def _joints(robot: RobotModel, quantity: str, names: Sequence[str] | Literal["all"]) -> tuple[str, ...]:
-    if quantity not in QUANTITIES:
-        raise UnknownNameError("quantity to learn", quantity, QUANTITIES)
+    check_name("quantity to learn", quantity, QUANTITIES)
     chosen = robot.joint_names if names == "all" else tuple(names)
     for name in chosen:
         robot.joint_index(name)

@@ -12,7 +12,7 @@ from torch import Tensor
 from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.constraints.unilateral import any_row, can_open
-from forcegp.errors import ForceGPError, ModelError, UnknownNameError
+from forcegp.errors import ForceGPError, ModelError, check_name
 from forcegp.resources import one_thread
 from forcegp.rollout.inputs import Disturbed, ForwardModel, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
@@ -83,12 +83,10 @@ class RolloutOptions:
                 raise ForceGPError(
                     f"the rollout's {name} is out of range", expected="a positive finite number", got=value
                 )
-        if self.method not in METHODS:
-            raise UnknownNameError("method of integration", self.method, METHODS)
-        if self.on_divergence not in ON_DIVERGENCE:
-            raise UnknownNameError("on_divergence", self.on_divergence, ON_DIVERGENCE)
-        if not isinstance(self.stabilization, Baumgarte) and self.stabilization not in STABILIZATIONS:
-            raise UnknownNameError("stabilization", self.stabilization, STABILIZATIONS)
+        check_name("method of integration", self.method, METHODS)
+        check_name("on_divergence", self.on_divergence, ON_DIVERGENCE)
+        if not isinstance(self.stabilization, Baumgarte):
+            check_name("stabilization", self.stabilization, STABILIZATIONS)
 
     def stabilized(self, system: ConstrainedSystem) -> ConstrainedSystem:
         """The system with the stabilization terms of the rollout in its right-hand side."""

@@ -14,7 +14,7 @@ from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import Gains, Target, control_torque
 from forcegp.data import Dataset
-from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
+from forcegp.errors import DataError, ModelError, ShapeError, check_name
 from forcegp.forces.dry_friction import ForceField
 from forcegp.kinematics import point_motion
 
@@ -32,30 +32,24 @@ class ForwardModel(Protocol):
     @property
     def kind(self) -> str:
         """Name of the class of models."""
-        ...
 
     @property
     def system(self) -> ConstrainedSystem:
         """Robot and contacts that the model was made for."""
-        ...
 
     @property
     def has_function_samples(self) -> bool:
         """Whether `force_samples` draws functions from a posterior over forces."""
-        ...
 
     def force_field(self) -> ForceField | None:
         """The mean impressed force, or `None` for a model of accelerations alone."""
-        ...
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         """Force functions drawn from the posterior, on `(samples * k, nq)` states."""
-        ...
 
     @property
     def torque_disturbance(self) -> Tensor | None:
         """Root of the spectral density of the logged torques' noise `(nq,)` [N m √s], `None` for none."""
-        ...
 
     def predict(
         self,
@@ -68,7 +62,6 @@ class ForwardModel(Protocol):
         covariance: bool = True,
     ) -> Any:
         """`mean` and `std` `(*batch, d)` of a quantity at states `(*batch, nq)`; `std` may be `None`."""
-        ...
 
 
 class Reached(NamedTuple):
@@ -218,8 +211,7 @@ def inputs_of(
         ModelError: the sampling period of an array is missing.
         DataError: the log is not one trajectory with a constant sampling period.
     """
-    if interpolation not in INTERPOLATIONS:
-        raise UnknownNameError("interpolation", interpolation, INTERPOLATIONS)
+    check_name("interpolation", interpolation, INTERPOLATIONS)
     if isinstance(tau, Inputs):
         return tau
     if isinstance(tau, Dataset):

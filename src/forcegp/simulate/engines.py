@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.errors import MissingDependencyError, UnknownNameError, UnsupportedRobotError, optional_module
+from forcegp.errors import MissingDependencyError, UnsupportedRobotError, check_name, optional_module
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.engine import Engine
 from forcegp.simulate.urdf import write_urdf
@@ -218,8 +218,7 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
         UnknownNameError: no such engine.
         MissingDependencyError: the engine's package is not installed.
     """
-    if name != "auto" and name not in MAKERS:
-        raise UnknownNameError("engine", name, ["auto", *MAKERS])
+    check_name("engine", name, ["auto", *MAKERS])
     if name != "auto":
         return MAKERS[name](robot, dt)
     try:

@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from forcegp.errors import ForceGPError, ModelError, UnknownNameError, near_names
+from forcegp.errors import ModelError, check_name, near_names
 
 Classes = Mapping[str, type]
 """The classes that may be written and read, by the name in the file."""
@@ -63,8 +63,7 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bo
     if not isinstance(json, dict):
         return json
     name = str(json.get("type"))
-    if name not in classes:
-        raise UnknownNameError(f"type in {place}", name, classes)
+    check_name(f"type in {place}", name, classes)
     kind = classes[name]
     assert is_dataclass(kind)
     members = {key: value for key, value in json.items() if key != "type"}
@@ -76,10 +75,8 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bo
         )
         for key, value in members.items()
     }
-    try:
+    with ModelError.within(place):
         return kind(**values)
-    except ForceGPError as cause:
-        raise ModelError.at(place, cause) from cause
 
 
 def _written(kind: Any) -> list[Field[Any]]:
