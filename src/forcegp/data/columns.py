@@ -27,10 +27,9 @@ def unparse(data: Fields) -> tuple[Columns, DataHeader]:
     for name, value in named_columns(data).items():
         parts = component_names(name, value, data.joint_names)
         columns |= dict(zip(parts, value.reshape(len(data), len(parts)).unbind(-1), strict=True))
-    header = data.header.model_copy(
-        update={"joint_names": data.joint_names, "contact_names": tuple(data.contact)}
-    )
-    return {name: value.detach().cpu().numpy() for name, value in columns.items()}, header
+    names = {"joint_names": data.joint_names, "contact_names": tuple(data.contact)}
+    arrays = {name: value.detach().cpu().numpy() for name, value in columns.items()}
+    return arrays, data.header.model_copy(update=names)
 
 
 def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Arrays:

@@ -196,9 +196,7 @@ class Dataset:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Dataset:
         """The same data on another device or in another precision."""
-        return self._map(
-            lambda value: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-        )
+        return self._map(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
 
     def select(self, joints: Sequence[str]) -> Dataset:
         """The data set with its joints reordered, or only some of them, such as `robot.joint_names`.

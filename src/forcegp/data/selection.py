@@ -258,12 +258,7 @@ def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset
         raise DataError("the noise is not valid", expected="a finite standard deviation ≥ 0", got=std)
     clean = data.extras.get("qdd_clean", data.qdd)
     noise = torch.randn(clean.shape, dtype=clean.dtype, device=generator.device, generator=generator)
-    header = data.header.with_step(
-        f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}",
-        noise_std=std,
-        filtered=False,
-        filter_span=None,
-    )
-    return data.replace(
-        qdd=clean + std * noise.to(clean.device), extras={**data.extras, "qdd_clean": clean}, header=header
-    )
+    step = f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}"
+    header = data.header.with_step(step, noise_std=std, filtered=False, filter_span=None)
+    qdd, extras = clean + std * noise.to(clean.device), {**data.extras, "qdd_clean": clean}
+    return data.replace(qdd=qdd, extras=extras, header=header)

@@ -6,6 +6,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -127,20 +128,17 @@ def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], Data
 
 
 def _check_count(file: Path, columns: int) -> None:
-    most = f"at most {limits.COLUMNS}"
     if columns > limits.COLUMNS:
-        hint = "write only the columns of the robot"
+        most, hint = f"at most {limits.COLUMNS}", "write only the columns of the robot"
         raise DataError(f"{file}: too many columns", expected=most, got=columns, hint=hint)
 
 
 def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
     """Check that no list or struct lies inside a column of numbers: a name also selects what is inside it."""
     names = set(usable)
-    for path in paths:
-        parts = path.split(".") if path not in names else []
-        outer = next(
-            (".".join(parts[:n]) for n in range(1, len(parts)) if ".".join(parts[:n]) in names), None
-        )
+    for path in (path for path in paths if path not in names):
+        prefixes = accumulate(path.split("."), "{}.{}".format)
+        outer = next((prefix for prefix in prefixes if prefix in names), None)
         if outer is not None:
             raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
 

@@ -26,28 +26,36 @@ class Engine(Protocol):
     @property
     def name(self) -> str:
         """Name and version, for the record."""
+        ...
 
     @property
     def dt(self) -> float:
         """Step [s]."""
+        ...
 
     def reset(self, q: JointVector, qd: JointVector) -> None:
         """Put the robot at q `(nq,)` moving at qd `(nq,)`."""
+        ...
 
     def state(self) -> tuple[JointVector, JointVector]:
         """The present q and qd, `(nq,)` each [rad, rad/s]."""
+        ...
 
     def step(self, force: JointVector) -> None:
         """Advance by dt under the generalized force `(nq,)` [N m], all but gravity and bias forces."""
+        ...
 
     def mass_matrix(self, q: JointVector) -> JointMatrix:
         """The engine's own M(q) `(nq, nq)`, an oracle for ours."""
+        ...
 
     def inverse_dynamics(self, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
         """The engine's own M q̈ − Q_C − Q_G `(nq,)`, an oracle for ours."""
+        ...
 
     def close(self) -> None:
         """Release the engine's resources; it is not used afterwards."""
+        ...
 
 
 @dataclass(frozen=True)
