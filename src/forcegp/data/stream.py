@@ -99,15 +99,14 @@ def _columns(file: Path, table: pa.Table) -> Columns:
 
 def _with_context(before: Columns, columns: Columns, after: Columns) -> tuple[Columns, int]:
     """A piece with the rows around it of its first and last trajectory, and the number of those before it."""
-    parts = [columns]
-    if before:
-        same = before["segment"] == columns["segment"][0]
-        parts.insert(0, {name: values[same] for name, values in before.items()})
-    if after:
-        same = after["segment"] == columns["segment"][-1]
-        parts.append({name: values[same] for name, values in after.items()})
-    whole = {name: np.concatenate([part[name] for part in parts]) for name in columns}
-    return whole, len(parts[0]["segment"]) if before else 0
+    own = columns["segment"]
+    parts = [
+        {name: values[part["segment"] == number] for name, values in part.items()}
+        for part, number in ((before, own[0]), (after, own[-1]))
+    ]
+    parts.insert(1, columns)
+    whole = {name: np.concatenate([part[name] for part in parts if part]) for name in columns}
+    return whole, len(parts[0].get("segment", ()))
 
 
 class _Trajectories:

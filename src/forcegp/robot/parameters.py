@@ -104,9 +104,8 @@ class AnalyticalParameters(nn.Module):
     def _initial(self, quantity: str) -> nn.Parameter:
         robot, rows = self.start, self._rows[quantity]
         if quantity == "inertia":
-            bodies = zip(
-                self.joints[quantity], robot.mass[rows], robot.com[rows], robot.inertia[rows], strict=True
-            )
+            parts = (x[rows] for x in (robot.mass, robot.com, robot.inertia))
+            bodies = zip(self.joints[quantity], *parts, strict=True)
             return nn.Parameter(torch.stack([_log_cholesky(*body) for body in bodies]))
         if quantity == "com":
             return nn.Parameter(robot.com[rows].clone())
@@ -120,9 +119,8 @@ class AnalyticalParameters(nn.Module):
 
     def _fields(self, quantity: str, x: Tensor) -> dict[str, Tensor]:
         if quantity == "inertia":
-            return dict(
-                zip(("mass", "com", "inertia"), from_pseudo_inertia(from_log_cholesky(x)), strict=True)
-            )
+            parts = from_pseudo_inertia(from_log_cholesky(x))
+            return dict(zip(("mass", "com", "inertia"), parts, strict=True))
         if quantity == "offset":
             rows = self._rows[quantity]
             turn = torch.linalg.matrix_exp(skew(x[:, :3].T).permute(2, 0, 1))

@@ -32,24 +32,30 @@ class ForwardModel(Protocol):
     @property
     def kind(self) -> str:
         """Name of the class of models."""
+        ...
 
     @property
     def system(self) -> ConstrainedSystem:
         """Robot and contacts that the model was made for."""
+        ...
 
     @property
     def has_function_samples(self) -> bool:
         """Whether `force_samples` draws functions from a posterior over forces."""
+        ...
 
     def force_field(self) -> ForceField | None:
         """The mean impressed force, or `None` for a model of accelerations alone."""
+        ...
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         """Force functions drawn from the posterior, on `(samples * k, nq)` states."""
+        ...
 
     @property
     def torque_disturbance(self) -> Tensor | None:
         """Root of the spectral density of the logged torques' noise `(nq,)` [N m √s], `None` for none."""
+        ...
 
     def predict(
         self,
@@ -62,6 +68,7 @@ class ForwardModel(Protocol):
         covariance: bool = True,
     ) -> Any:
         """`mean` and `std` `(*batch, d)` of a quantity at states `(*batch, nq)`; `std` may be `None`."""
+        ...
 
 
 class Reached(NamedTuple):
