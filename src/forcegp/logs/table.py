@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
+from forcegp.data.table import damaged
 from forcegp.errors import DataError, ForceGPError, did_you_mean
 from forcegp.resources import announce_memory
 
@@ -134,12 +135,7 @@ def foreign(source: str, kind: str) -> Iterator[None]:
         what = "no such file" if isinstance(cause, FileNotFoundError) else "the file may not be read"
         raise DataError(f"{source}: {what}", got=str(cause)) from cause
     except (Exception, RecursionError, MemoryError) as cause:
-        lines = str(cause).splitlines()
-        raise DataError(
-            f"{source}: the file is damaged, truncated or not {kind}",
-            got=lines[0][:300] if lines else type(cause).__name__,
-            hint="write it again from its source; an interrupted copy is the usual cause",
-        ) from cause
+        raise damaged(source, kind, cause) from cause
 
 
 def table_of_arrays(
