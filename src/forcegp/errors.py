@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from itertools import islice
@@ -43,6 +44,15 @@ class ForceGPError(Exception):
         error = cls.__new__(cls)
         ForceGPError.__init__(error, message, expected=cause.expected, got=cause.got, hint=cause.hint)
         return error
+
+    @classmethod
+    @contextmanager
+    def within(cls, place: str) -> Iterator[None]:
+        """Errors of the library in the block as errors of this class that name a place (a file, a line)."""
+        try:
+            yield
+        except ForceGPError as cause:
+            raise cls.at(place, cause) from cause
 
     def __reduce__(self) -> tuple[Any, ...]:
         """How to copy the error, or to send it to another process: its text and plain values."""
@@ -104,6 +114,12 @@ class UnknownNameError(ForceGPError, LookupError):
             expected="one of " + _listed(names) if names else "none are defined",
             hint=did_you_mean(name, names),
         )
+
+
+def check_name(kind: str, name: object, valid: Collection[str]) -> None:
+    """Raise `UnknownNameError` unless a name is one of the valid ones."""
+    if name not in valid:
+        raise UnknownNameError(kind, name, valid)
 
 
 class ParameterError(ForceGPError, ValueError):

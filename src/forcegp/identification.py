@@ -137,9 +137,8 @@ def base_parameters(robot: RobotModel, samples: int = 100, seed: int = 0) -> Bas
     B[:, rest] = K * scale[rest] / scale[lead][:, None]
     order = np.argsort(lead)
     B, lead = B[order], lead[order]
-    return BaseParameters(
-        tuple(lead.tolist()), B, tuple(_name(robot, i, row) for i, row in zip(lead.tolist(), B, strict=True))
-    )
+    columns = tuple(lead.tolist())
+    return BaseParameters(columns, B, tuple(_name(robot, i, x) for i, x in zip(columns, B, strict=True)))
 
 
 def _name(robot: RobotModel, column: int, row: np.ndarray) -> str:

@@ -41,10 +41,8 @@ def text(value: object, digits: int = 4) -> str:
 
 
 def _row(cells: Sequence[str], tag: str) -> str:
-    styles = [_FIRST, *[_CELL] * len(cells)][: len(cells)]
-    parts = (
-        f'<{tag} style="{style}">{escape(cell)}</{tag}>' for style, cell in zip(styles, cells, strict=True)
-    )
+    styled = zip([_FIRST, *[_CELL] * len(cells)], cells, strict=False)
+    parts = (f'<{tag} style="{style}">{escape(cell)}</{tag}>' for style, cell in styled)
     return f"<tr>{''.join(parts)}</tr>"
 
 

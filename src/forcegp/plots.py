@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from torch import Tensor
 
-from forcegp.errors import ParameterError, UnknownNameError
+from forcegp.errors import ParameterError, check_name
 
 MEASURED = "#222222"
 PREDICTED = "#0072b2"
@@ -230,6 +230,5 @@ def _draw(axes: Axes, curve: Curve, time: Timeline) -> None:
 def chosen(wanted: Sequence[str] | None, names: Sequence[str], kind: str) -> list[int]:
     """Indices of the wanted names, by default all; an unknown name raises `UnknownNameError`."""
     for name in wanted or ():
-        if name not in names:
-            raise UnknownNameError(kind, name, names)
+        check_name(kind, name, names)
     return [list(names).index(name) for name in (names if wanted is None else wanted)]

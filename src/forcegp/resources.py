@@ -40,7 +40,6 @@ def announce_memory(
     say: Callable[[str], None] | None = None,
     *,
     certain: int | None = None,
-    hint: str = "use less data or a smaller model, or free memory",
 ) -> None:
     """Announce work that needs more than half of the free memory, and refuse what needs more than all of it.
 
@@ -51,7 +50,6 @@ def announce_memory(
         what: the work, as the subject of a sentence: "the covariance of 20,000 points".
         say: what to do with the sentence, by default a `MemoryNeedWarning`.
         certain: what it needs in any case [bytes], where `needed` is a rough bound; by default `needed`.
-        hint: what to do where there is too little.
 
     Raises:
         MemoryLimitError: it certainly needs more than is free.
@@ -65,7 +63,7 @@ def announce_memory(
             f"{what} needs more memory than is free",
             expected=f"at most {_gib(free)}",
             got=_gib(least),
-            hint=hint,
+            hint="use less data or a smaller model, or free memory",
         )
     bound = "" if certain is None else "up to "
     sentence = f"{what} needs {bound}{_gib(needed)} of {_gib(free)} of free memory"

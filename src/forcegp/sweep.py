@@ -109,10 +109,8 @@ def sweep(
     root, scores = str(Path(out).resolve()), {}
     with ExitStack() as stack:
         if address is None:
-            cluster = stack.enter_context(
-                dask.LocalCluster(n_workers=processes, threads_per_worker=1, dashboard_address=None)
-            )
-            address = cluster.scheduler_address
+            local = dask.LocalCluster(n_workers=processes, threads_per_worker=1, dashboard_address=None)
+            address = stack.enter_context(local).scheduler_address
         client = stack.enter_context(dask.Client(address))
         futures = client.map(run_fit, fits, out=root, pure=False)
         place = {future.key: i for i, future in enumerate(futures)}

@@ -38,6 +38,12 @@ RUN_SECONDS = 0.02
 MISSED_SECONDS, MISSED_DISTANCE = 0.1, 2e-3
 """Shortest time [s] and way [m] along the surface that count as a contact that was not labelled."""
 LEAST_ROWS = 20
+OFF = {
+    "contact-early": "labelled closed before the tip touches",
+    "contact-late": "labelled closed after the tip has left",
+    "contact-far": "labelled closed while the tip is off the surface",
+}
+"""Rows that are labelled closed off the surface, by kind of finding."""
 
 
 @dataclass(frozen=True)
@@ -163,18 +169,13 @@ def _labels(
     touch = max(TOUCH, ROUGH * float(robust_std(c[closed])))
     moving = closed & (np.linalg.norm(path.v, axis=1) > CREEP)
     slow = max(CREEP, ROUGH * float(robust_std(path.approach[moving])) if moving.any() else 0.0)
-    texts = {
-        "contact-early": "labelled closed before the tip touches",
-        "contact-late": "labelled closed after the tip has left",
-        "contact-far": "labelled closed while the tip is off the surface",
-    }
     findings = []
     for kind, spans in _runs_off(path.approach, closed, c, touch, slow, log).items():
         if spans:
             rows: Intervals = tuple(spans)
             most = max(float(np.abs(c[a:b]).max()) for a, b in rows)
             where = f"by up to {1e3 * most:.3g} mm, in {describe(rows)}"
-            text = f"contact {contact.name!r} is {texts[kind]}, {where}"
+            text = f"contact {contact.name!r} is {OFF[kind]}, {where}"
             findings.append(Finding(kind, text, rows, contact=contact.name, evidence={"distance_m": most}))
     slides = usable & ~closed & (path.approach <= slow)
     return [*findings, *_missed(contact, path, slides, c, touch, log)]
@@ -190,7 +191,7 @@ def _runs_off(
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     off = closed & (np.abs(c) > touch)
-    runs: dict[str, list[tuple[int, int]]] = {"contact-early": [], "contact-late": [], "contact-far": []}
+    runs: dict[str, list[tuple[int, int]]] = {kind: [] for kind in OFF}
     for start, stop in intervals(closed):
         for a, b in intervals(off[start:stop], join=least):
             if b - a < least:
@@ -300,9 +301,8 @@ def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Findi
         return []
     name = finding.keywords["contact"]
     text = f"friction at {name!r} is {100 * mean:.2g} % of the normal force while it slides"
-    return [
-        finding("contact-friction", text, evidence={"friction_coefficient": mean, "standard_error": error})
-    ]
+    evidence = {"friction_coefficient": mean, "standard_error": error}
+    return [finding("contact-friction", text, evidence=evidence)]
 
 
 def _directions(finding: partial[Finding], v: Array) -> list[Finding]:

@@ -68,9 +68,8 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     few = (turns < REVERSALS) & ~still
     if few.any():
         joints = log.named(few)
-        text = (
-            f"{', '.join(joints)}: fewer than {REVERSALS} changes of direction: friction looks like an offset"
-        )
+        few_turns = f"fewer than {REVERSALS} changes of direction"
+        text = f"{', '.join(joints)}: {few_turns}: friction looks like an offset"
         findings.append(log.finding("few-reversals", text, joints))
     return findings, log
 
@@ -87,14 +86,11 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
     joints = sorted({int(columns[k]) // 10 for k in np.flatnonzero(weak)})
     listed = ", ".join(names[k] for k in np.flatnonzero(weak)[:6])
     more = f" and {weak.sum() - 6} more" if weak.sum() > 6 else ""
-    missing = _missing(system, log, joints)
     count = f"{weak.sum()} of {len(weak)} base parameters are not identified"
-    text = f"{count}: {listed}{more}; missing: {missing}"
-    concerned, identified = tuple(log.joint_names[j] for j in joints), int((~weak).sum())
-    finding = log.finding(
-        "poor-excitation", text, concerned, identified=identified, base_parameters=len(weak)
-    )
-    return [finding], log
+    text = f"{count}: {listed}{more}; missing: {_missing(log, joints)}"
+    concerned = tuple(log.joint_names[j] for j in joints)
+    numbers = {"identified": int((~weak).sum()), "base_parameters": len(weak)}
+    return [log.finding("poor-excitation", text, concerned, **numbers)], log
 
 
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
@@ -118,7 +114,7 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     return np.sqrt(np.diag(after)), base.names, columns
 
 
-def _missing(system: ConstrainedSystem, log: Log, joints: list[int]) -> str:
+def _missing(log: Log, joints: list[int]) -> str:
     """The motion that would show the parameters of some links, in words."""
     q, qdd = log.q[log.usable], log.qdd[log.usable]
     reach, push = np.ptp(q, axis=0), np.sqrt((qdd**2).mean(axis=0))

@@ -68,9 +68,8 @@ class Explanation:
 
     def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
         """The problem on a log that a hypothesis has changed, with the present weights of the joints."""
-        return hypotheses.problem_of(
-            self.system, log, self.rows if rows is None else rows, self.problem.scale
-        )
+        rows = self.rows if rows is None else rows
+        return hypotheses.problem_of(self.system, log, rows, self.problem.scale)
 
     def weighed(self) -> Explanation:
         """The same with joints weighed by the noise that it leaves."""
@@ -120,12 +119,8 @@ def _round(model: Explanation) -> Explanation | None:
         return None
     best = min((fit for _, fit in good), key=lambda fit: fit.score.mean())
     most = gain_of(best.score, null.score)[0]
-    losses = [gain_of(best.score, fit.score) for _, fit in good]
-    near = [
-        one
-        for one, (loss, error) in zip(good, losses, strict=True)
-        if loss <= max(error, SHARE * most) + 1e-9
-    ]
+    losses = ((one, *gain_of(best.score, one[1].score)) for one in good)
+    near = [one for one, loss, error in losses if loss <= max(error, SHARE * most) + 1e-9]
     chosen, fit = min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
     # The errors of an arm and of its mirror image are equal but for rounding.
     alike = [
@@ -198,9 +193,8 @@ def _currents(model: Explanation) -> Iterator[Tried]:
     determined = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[:nq])
     # A current has the sign of its torque, so gains of both signs have another cause.
     if 2 * len(determined) > nq and (gains[determined] > 0.0).all():
-        hypothesis = hypotheses.current_hypothesis(
-            log, rows, model.problem, tuple(int(j) for j in determined)
-        )
+        joints = tuple(determined.tolist())
+        hypothesis = hypotheses.current_hypothesis(log, rows, model.problem, joints)
         yield hypothesis, model.with_(hypothesis)
 
 

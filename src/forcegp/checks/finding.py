@@ -9,7 +9,7 @@ from typing import Any, Literal, SupportsFloat
 import numpy as np
 from numpy.typing import NDArray
 
-from forcegp.errors import UnknownNameError
+from forcegp.errors import check_name
 from forcegp.rows import Intervals, describe, intervals
 
 Severity = Literal["note", "warning", "error"]
@@ -146,8 +146,7 @@ class Finding:
     told_apart_by: str | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise UnknownNameError("kind of finding", self.kind, KINDS)
+        check_name("kind of finding", self.kind, KINDS)
 
     @property
     def severity(self) -> Severity:

@@ -88,9 +88,8 @@ def sharper_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarr
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """Viscous and dry friction of each contact of which only the normal force is taken out, `(n, nq, p)`."""
-    touching = [c for c in labelled_contacts(system, log) if isinstance(c, SurfaceContact)]
-    if takes_friction_out(system, log):
-        touching = []
+    contacts = [] if takes_friction_out(system, log) else labelled_contacts(system, log)
+    touching = [c for c in contacts if isinstance(c, SurfaceContact)]
     empty = np.zeros((len(rows), log.nq, 0))
     return np.concatenate([empty, *(_sliding_columns(system, c, log, rows) for c in touching)], axis=-1)
 

@@ -85,9 +85,8 @@ def match(log: Log, value: str, rate: str) -> Match | None:
         return None
     whole = np.concatenate(changes), np.concatenate(integrals)
     change, integral = _without_jumps(*whole)
-    cross, integral_square, change_square = (
-        (a * b).sum(axis=0) for a, b in ((change, integral), (integral, integral), (change, change))
-    )
+    cross = (change * integral).sum(axis=0)
+    integral_square, change_square = (integral**2).sum(axis=0), (change**2).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         low, high = cross / integral_square, change_square / cross
         correlation = cross / np.sqrt(integral_square * change_square)
@@ -287,14 +286,14 @@ NOISE_ROWS = 100
 
 def noise_levels(log: Log) -> tuple[Array, Array] | None:
     """Standard deviation `(nq,)` of white noise as neighbours at distance 1 and at distance 3 show it."""
+    from scipy.ndimage import correlate1d
+
     levels = []
     for k in (1, DEPARTURE_STRIDE):
-        parts = []
-        for s in log.stretches:
-            x, span = log.qdd[s], 4 * k
-            if len(x) > span:
-                parts.append(sum(w * x[i * k : len(x) - span + i * k] for i, w in enumerate(DEPARTURE)))
-        rest = np.concatenate(parts) if parts else np.empty((0, log.nq))
+        weights = np.zeros(4 * k + 1)
+        weights[::k] = DEPARTURE
+        parts = (correlate1d(log.qdd[s], weights, axis=0)[2 * k : -2 * k] for s in log.stretches)
+        rest = np.concatenate([np.empty((0, log.nq)), *parts])
         if len(rest) < NOISE_ROWS:
             return None
         levels.append(robust_std(rest) / np.linalg.norm(DEPARTURE))
@@ -315,14 +314,12 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
         filtered &= top < stated / NOISE_FACTOR
     if filtered.mean() > 0.5 and not log.header.filtered:
         share = f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them"
-        text = (
-            f"the acceleration is filtered: at the highest frequencies it holds {share}, so it is not white"
-        )
+        high = f"at the highest frequencies it holds {share}"
+        text = f"the acceleration is filtered: {high}, so it is not white"
         # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
         weight = "note" if stated is None else "warning"
-        return [
-            replace(log.finding("noise-filtered", text, log.named(filtered), **evidence), weight=weight)
-        ], log
+        finding = log.finding("noise-filtered", text, log.named(filtered), **evidence)
+        return [replace(finding, weight=weight)], log
     if stated is None:
         return [], log
     kinds = [("noise-understated", top > NOISE_FACTOR * stated, np.max)]

@@ -28,9 +28,7 @@ UNIT_ROWS = 400
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
     """Lower and upper limits by column."""
     r = system.robot
-    low, high, speed, effort = (
-        x.detach().cpu().numpy() for x in (r.lower, r.upper, r.velocity_limit, r.effort_limit)
-    )
+    low, high, speed, effort = (x.numpy() for x in (r.lower, r.upper, r.velocity_limit, r.effort_limit))
     return {"q": (low, high), "qd": (-speed, speed), "tau": (-effort, effort)}
 
 

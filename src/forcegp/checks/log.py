@@ -189,12 +189,8 @@ Outcome = tuple[list[Finding], Log]
 
 def log_of(data: Dataset) -> Log:
     """The log of a data set."""
-
-    def array(value: Any) -> Any:
-        return value.detach().cpu().numpy().astype(float)
-
     return Log(
-        **{name: array(getattr(data, name)) for name in ("t", *JOINT_VECTORS)},
+        **{n: getattr(data, n).detach().cpu().numpy().astype(float) for n in ("t", *JOINT_VECTORS)},
         segment=data.segment.cpu().numpy(),
         contact={name: value.cpu().numpy() for name, value in data.contact.items()},
         joint_names=data.joint_names,
@@ -216,8 +212,8 @@ def read_log(path: str | Path) -> Log:
     for name in absent:
         raw |= {f"{name}.{joint}": np.full_like(raw["t"], np.nan, dtype=float) for joint in joints}
     fields = parse(str(path), raw, header, None)
-    names = ("t", *JOINT_VECTORS, "segment", "contact", "joint_names", "header")
-    return derive(Log(**{name: fields[name] for name in names}), absent)
+    del fields["extras"], fields["contact_extras"]
+    return derive(Log(**fields), absent)
 
 
 def derive(log: Log, absent: list[str]) -> Log:
@@ -245,9 +241,8 @@ def of_robot(log: Log, robot: RobotModel) -> Log:
     if not set(robot.joint_names) <= set(log.joint_names):
         check_joints(log.joint_names, robot.joint_names, robot.name)
     order = [log.joint_names.index(joint) for joint in robot.joint_names]
-    return log.replace(
-        **{name: getattr(log, name)[:, order] for name in JOINT_VECTORS}, joint_names=robot.joint_names
-    )
+    columns = {name: getattr(log, name)[:, order] for name in JOINT_VECTORS}
+    return log.replace(**columns, joint_names=robot.joint_names)
 
 
 SMOOTHED_SECONDS, SMOOTHED_ORDER = 0.1, 3

@@ -49,9 +49,8 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         return passive, log
     smooth = smoothed(log)
     if not _enough(smooth):
-        raise NotJudgedError(
-            f"fewer than {LEAST_ROWS} rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
-        )
+        inner = f"rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
+        raise NotJudgedError(f"fewer than {LEAST_ROWS} {inner}")
     explanation = explain(system, smooth)
     disturbed, rows = [], np.zeros(len(log), bool)
     if log.header.ordered:

@@ -35,9 +35,8 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     rows, longest = intervals(np.append(False, gaps)), float(np.nanmax(log.steps))
     missing = int(np.round(log.steps[gaps] / log.dt - 1.0).sum())
-    text = (
-        f"about {missing} samples are missing before {describe(rows)}; the longest gap takes {longest:.4g} s"
-    )
+    gap = f"the longest gap takes {longest:.4g} s"
+    text = f"about {missing} samples are missing before {describe(rows)}; {gap}"
     evidence = {"missing_samples": missing, "longest_s": longest, "period_s": log.dt}
     return [Finding("time-gap", text, rows, evidence=evidence)], log
 
@@ -304,9 +303,8 @@ def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
     for s in log.stretches:  # what the rate does not account for
         mean = 0.5 * (rate[s][1:] + rate[s][:-1])
         surplus[s][1:] = np.diff(x[s], axis=0) - mean * np.diff(log.t[s])[:, None]
-    scale = (
-        robust_std(surplus[usable]) + resolution(x[usable]) + np.finfo(float).eps * np.abs(x[usable]).max()
-    )
+    rounding = np.finfo(float).eps * np.abs(x[usable]).max()
+    scale = robust_std(surplus[usable]) + resolution(x[usable]) + rounding
     change = np.zeros_like(x)
     change[1:] = np.abs(np.diff(x, axis=0))
     fastest = float(np.percentile(np.abs(rate[usable]), 99.9)) * log.dt

@@ -110,14 +110,12 @@ def trajectory_from(data: Dataset, start: int, purpose: str) -> Dataset:
 def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
     """A model fitted under a progress bar that notes the objective."""
 
-    with progress_bar(f"fitting {model.name}", 1) as progress:
-        return model.fit(
-            data,
-            progress=lambda done, most, value: progress(
-                done, most, "" if math.isnan(value) else f"objective {value:.4g}"
-            ),
-            **options,
-        )
+    with progress_bar(f"fitting {model.name}", 1) as advance:
+
+        def progress(done: int, most: int, value: float) -> None:
+            advance(done, most, "" if math.isnan(value) else f"objective {value:.4g}")
+
+        return model.fit(data, progress=progress, **options)
 
 
 def check_robot_named(scene: str | None, robot: str | None) -> None:

@@ -18,7 +18,15 @@ from forcegp.cli.common import (
     show,
     system_of,
 )
-from forcegp.cli.options import AsJson, Config, DataFiles, Differentiate, RobotName, SceneOrNone
+from forcegp.cli.options import (
+    AsJson,
+    Config,
+    DataFiles,
+    Differentiate,
+    RobotName,
+    SceneOrNone,
+    SimulatedTime,
+)
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset, StreamedDataset
@@ -130,9 +138,7 @@ def sweep(
     model: Annotated[list[str], typer.Option("--model", "-m", help="Model; may be given several times.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fits.")],
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0 on.")] = 1,
-    duration: Annotated[
-        float | None, typer.Option(help="Simulated time in seconds; default: the scene's.")
-    ] = None,
+    duration: SimulatedTime = None,
     processes: Annotated[int, typer.Option(min=1, help="Workers on this machine, of one thread each.")] = 2,
     address: Annotated[
         str | None, typer.Option(help="Scheduler of a running cluster, in place of workers here.")
@@ -156,9 +162,7 @@ def sweep(
     check_destination(out, folder=True)
     fits = fits_of(scene, model, range(seeds), duration)
     with progress_bar("sweeping", len(fits)) as progress:
-        scores = run(
-            fits, out, processes=processes, address=address, say=lambda done, _: progress(done, len(fits))
-        )
+        scores = run(fits, out, processes=processes, address=address, say=lambda done, _: progress(done))
     pairs = zip(fits, scores, strict=True)
     errors = {fit.name: score["clean_mae"] or score["noisy_mae"] for fit, score in pairs}
     show({**errors, "folder": str(out)}, as_json)

@@ -24,6 +24,9 @@ RobotName = Annotated[
 ]
 ModelFile = Annotated[Path, typer.Option("--model", "-m", help="File of a fitted model.")]
 DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
+SimulatedTime = Annotated[
+    float | None, typer.Option("--duration", help="Simulated time in seconds; default: the scene's.")
+]
 Config = Annotated[
     Path | None,
     typer.Option(help="TOML file with a table \\[model], in place of the scene's: priors, learning."),

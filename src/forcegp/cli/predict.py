@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -86,18 +87,15 @@ def predict(
     if sensor and quantity != "multiplier":
         raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
     with progress_bar(f"predicting {quantity}", len(test)) as progress:
-        mean, std = in_chunks(
-            lambda part: _predicted(regression, part, quantity, noise, sensor), test, progress
-        )
+        predicted = partial(_predicted, regression, quantity=quantity, noise=noise, sensor=sensor)
+        mean, std = in_chunks(predicted, test, progress)
     warn_beyond(regression, test)
     test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", mean)
     if std is not None:
         test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}_std", std)
     write_or_keep(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
-    show(
-        {"quantity": quantity, "samples": len(test), "uncertainty": std is not None, "file": str(out)},
-        as_json,
-    )
+    result = {"quantity": quantity, "samples": len(test), "uncertainty": std is not None}
+    show({**result, "file": str(out)}, as_json)
 
 
 def _predicted(model: Predictor, part: Dataset, quantity: str, noise: bool, sensor: bool) -> Moments:

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from forcegp.cli.common import check_data_destination, progress_bar, read_data, show, trajectory_from
-from forcegp.cli.options import AsJson, DataFile, ModelFile, SceneName
+from forcegp.cli.options import AsJson, DataFile, ModelFile, SceneName, SimulatedTime
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from forcegp.data import Dataset
-    from forcegp.models.base import FittedModel
-    from forcegp.rollout import Rollout, RolloutOptions
+    from forcegp.rollout import Rollout
 
 
 def rollout(
@@ -57,6 +56,7 @@ def rollout(
     from forcegp.report.rollout_data import rollout_data
     from forcegp.report.rollouts import write_rollouts
     from forcegp.rollout import RolloutOptions, beside_log
+    from forcegp.rollout.forward import replayed
     from forcegp.rollout.inputs import sampling_period
 
     check_destination(out, folder=True, own_files=["rollout*", "*.svg", "*.png"])
@@ -65,7 +65,8 @@ def rollout(
     _say_contact(log, unilateral)
     dt = sampling_period(log)
     options = RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
-    path = _roll(regression, log, options, samples, seed)
+    with progress_bar("rolling out", len(log) - 1) as progress:
+        path = replayed(regression, log, samples, seed=seed, options=options, progress=progress)
     rolled = _as_data(path, log, dt)
     compared = rollout_data(beside_log(regression.kind, path, log, dt))
     step = f"rolled out by the model in {model} from row {start}"
@@ -78,23 +79,6 @@ def rollout(
     write_or_keep(write, out)
     written = {"page": str(out / "rollout.html"), "file": str(out / "rollout.parquet")}
     show({**_figures(path, rolled, dt), **written}, as_json)
-
-
-def _roll(regression: FittedModel, log: Dataset, options: RolloutOptions, samples: int, seed: int) -> Rollout:
-    """From the first state of the log under its torques, to its end."""
-    steps = len(log) - 1
-    with progress_bar("rolling out", steps) as progress:
-        return regression.rollout(
-            log.q[0],
-            log.qd[0],
-            log,
-            duration=float(log.t[-1] - log.t[0]),
-            samples=samples,
-            seed=seed,
-            active=log.active(regression.system.contact_names)[0],
-            options=options,
-            progress=progress,
-        )
 
 
 def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:
@@ -176,9 +160,7 @@ def _as_data(path: Rollout, log: Dataset, dt: float) -> Dataset:
 def simulate(
     scene: SceneName,
     out: Annotated[Path, typer.Option("--out", "-o", help="Where the log goes (.parquet).")],
-    duration: Annotated[
-        float | None, typer.Option(help="Simulated time in seconds; default: the scene's.")
-    ] = None,
+    duration: SimulatedTime = None,
     seed: Annotated[int | None, typer.Option(help="Seed of motion and noise; default: the scene's.")] = None,
     engine: Annotated[str | None, typer.Option(help="pybullet, mujoco or auto; default: scene's.")] = None,
     contact: Annotated[

@@ -16,7 +16,7 @@ from torch import Tensor
 from forcegp import derivatives, dynamics
 from forcegp.compiled.program import QUANTITIES, trace
 from forcegp.compiled.source import Kernel, cpu_kernel, cpu_source, cuda_kernel, cuda_source
-from forcegp.errors import ModelError, ShapeError, UnknownNameError
+from forcegp.errors import ModelError, ShapeError, check_name
 from forcegp.kinematics import common_states
 from forcegp.robot.model import RobotModel
 
@@ -156,8 +156,7 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
         ModelError: a parameter of the robot is being learned, or its precision has no kernel.
         MissingDependencyError: there is no compiler.
     """
-    if quantity not in QUANTITIES:
-        raise UnknownNameError("quantity to compile", quantity, QUANTITIES)
+    check_name("quantity to compile", quantity, QUANTITIES)
     if robot.learned:
         raise ModelError(
             "a robot whose figures require a gradient cannot be compiled, as they become constants",

@@ -27,10 +27,9 @@ def unparse(data: Fields) -> tuple[Columns, DataHeader]:
     for name, value in named_columns(data).items():
         parts = component_names(name, value, data.joint_names)
         columns |= dict(zip(parts, value.reshape(len(data), len(parts)).unbind(-1), strict=True))
-    header = data.header.model_copy(
-        update={"joint_names": data.joint_names, "contact_names": tuple(data.contact)}
-    )
-    return {name: value.detach().cpu().numpy() for name, value in columns.items()}, header
+    names = {"joint_names": data.joint_names, "contact_names": tuple(data.contact)}
+    arrays = {name: value.detach().cpu().numpy() for name, value in columns.items()}
+    return arrays, data.header.model_copy(update=names)
 
 
 def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Arrays:
@@ -161,13 +160,11 @@ def _fill_in(
     def derive(name: str, degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return differentiate(fields["t"], fields[name], fields["segment"], method, degree)
 
-    try:
+    with DataError.within(source):
         if "qd" in absent:
             fields["qd"], _ = derive("q", 1)
         if "qdd" in absent:
             fields["qdd"], fields["extras"]["qdd_std"] = derive(of, order)
-    except DataError as error:
-        raise DataError.at(source, error) from None
     step = f"computed {' and '.join(sorted(absent))} from the log by {method}"
     if "qdd" not in absent:
         return header.with_step(step)

@@ -24,7 +24,7 @@ from forcegp.data.columns import as_tensors, parse, unparse
 from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields, mapped
 from forcegp.data.table import check_ending, read_table, write_parquet
-from forcegp.errors import DataError, UnknownNameError
+from forcegp.errors import DataError, check_name
 from forcegp.notebook import html_table
 from forcegp.robot.model import RobotModel
 
@@ -196,9 +196,7 @@ class Dataset:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Dataset:
         """The same data on another device or in another precision."""
-        return self._map(
-            lambda value: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-        )
+        return self._map(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
 
     def select(self, joints: Sequence[str]) -> Dataset:
         """The data set with its joints reordered, or only some of them, such as `robot.joint_names`.
@@ -207,8 +205,7 @@ class Dataset:
             UnknownNameError: a joint is not in the data set; the message has the nearest name.
         """
         for joint in joints:
-            if joint not in self.joint_names:
-                raise UnknownNameError("joint of the data set", joint, self.joint_names)
+            check_name("joint of the data set", joint, self.joint_names)
         order = [self.joint_names.index(joint) for joint in joints]
         fields = {name: getattr(self, name)[:, order] for name in JOINT_VECTORS}
         extras = {name: value[:, order] for name, value in self.extras.items()}
@@ -282,10 +279,8 @@ class Dataset:
         """
         raw, header = read_table(path)
         fields = parse(str(path), raw, header, differentiate)
-        try:
+        with DataError.within(str(path)):
             return cls(**as_tensors(fields, dtype, torch.device(device)))
-        except DataError as error:
-            raise DataError.at(str(path), error) from None
 
     def write(self, path: str | Path) -> None:
         """Write to a Parquet file, whole or not at all.

@@ -69,7 +69,7 @@ def cross_validated_window(signals: Sequence[NDArray[np.float64]], order: int = 
     for x in signals:
         windows = [w for w in WINDOWS if order < w < len(x)]
         weights = [savgol_coeffs(w, order)[w // 2] for w in windows]
-        fits = [savgol_filter(x, w, order, axis=0) for w in windows]
+        fits = [np.asarray(savgol_filter(x, w, order, axis=0)) for w in windows]
         errors = [np.square((x - fit) / (1.0 - h)).mean(0) for fit, h in zip(fits, weights, strict=True)]
         best += [windows[i] for i in np.argmin(errors, axis=0)]
     return max(best)

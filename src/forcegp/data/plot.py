@@ -54,10 +54,8 @@ def _overview(data: Fields, joints: list[int]) -> list[Panel]:
 
 def _by_joint(data: Fields, quantity: str, joints: list[int]) -> list[Panel]:
     values, label = getattr(data, quantity), _named(quantity)
-    return [
-        Panel(data.joint_names[j], label, [Curve(values[:, j], "logged", MEASURED, width=0.8)])
-        for j in joints
-    ]
+    curves = ((j, Curve(values[:, j], "logged", MEASURED, width=0.8)) for j in joints)
+    return [Panel(data.joint_names[j], label, [curve]) for j, curve in curves]
 
 
 def _by_contact(data: Fields, quantity: str) -> list[Panel]:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from forcegp.data.dataset import Dataset
-from forcegp.errors import DataError, UnknownNameError
+from forcegp.errors import DataError, check_name
 
 INPUTS = ("q", "qd", "tau")
 """What a regression model sees of a sample."""
@@ -112,8 +112,7 @@ def select_points(
     if method == "farthest":
         # Scaled by the whole log, so that the metric does not depend on what is held out.
         return rows[farthest_points(standardized_inputs(data)[rows], count, progress=progress)]
-    if method not in ("even", "random"):
-        raise UnknownNameError("method of selection", method, ["farthest", "even", "random"])
+    check_name("method of selection", method, ["farthest", "even", "random"])
     _check_count(count, len(rows))
     if method == "even":
         return rows[torch.linspace(0, len(rows) - 1, count, dtype=torch.float64).round().long()]
@@ -259,12 +258,7 @@ def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset
         raise DataError("the noise is not valid", expected="a finite standard deviation ≥ 0", got=std)
     clean = data.extras.get("qdd_clean", data.qdd)
     noise = torch.randn(clean.shape, dtype=clean.dtype, device=generator.device, generator=generator)
-    header = data.header.with_step(
-        f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}",
-        noise_std=std,
-        filtered=False,
-        filter_span=None,
-    )
-    return data.replace(
-        qdd=clean + std * noise.to(clean.device), extras={**data.extras, "qdd_clean": clean}, header=header
-    )
+    step = f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}"
+    header = data.header.with_step(step, noise_std=std, filtered=False, filter_span=None)
+    qdd, extras = clean + std * noise.to(clean.device), {**data.extras, "qdd_clean": clean}
+    return data.replace(qdd=qdd, extras=extras, header=header)

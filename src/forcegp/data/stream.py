@@ -99,15 +99,14 @@ def _columns(file: Path, table: pa.Table) -> Columns:
 
 def _with_context(before: Columns, columns: Columns, after: Columns) -> tuple[Columns, int]:
     """A piece with the rows around it of its first and last trajectory, and the number of those before it."""
-    parts = [columns]
-    if before:
-        same = before["segment"] == columns["segment"][0]
-        parts.insert(0, {name: values[same] for name, values in before.items()})
-    if after:
-        same = after["segment"] == columns["segment"][-1]
-        parts.append({name: values[same] for name, values in after.items()})
-    whole = {name: np.concatenate([part[name] for part in parts]) for name in columns}
-    return whole, len(parts[0]["segment"]) if before else 0
+    own = columns["segment"]
+    parts = [
+        {name: values[part["segment"] == number] for name, values in part.items()}
+        for part, number in ((before, own[0]), (after, own[-1]))
+    ]
+    parts.insert(1, columns)
+    whole = {name: np.concatenate([part[name] for part in parts if part]) for name in columns}
+    return whole, len(parts[0].get("segment", ()))
 
 
 class _Trajectories:
@@ -255,17 +254,13 @@ class StreamedDataset:
             fields = parse(source, piece.columns, piece.header, self.differentiate)
         names = {name: fields["header"].__dict__[name] for name in ("joint_names", "contact_names")}
         fields["header"] = self.header.model_copy(update=names)
-        try:
+        with DataError.within(source):
             data = Dataset(**as_tensors(fields, self.dtype, torch.device(self.device)))
-        except DataError as error:
-            raise DataError.at(source, error) from None
         data = data[piece.before : piece.before + piece.rows]
         if self.joints is not None and not set(self.joints) - set(data.joint_names):
             data = data.select(self.joints)
-        try:
+        with DataError.within(str(path)):
             check_alike([data[:1] if first is None else first, data[:1]])
-        except DataError as error:
-            raise DataError.at(str(path), error) from None
         return data
 
 

@@ -6,6 +6,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -73,9 +74,8 @@ def read_table(
     file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}
     if file.suffix.lower() not in readers:
-        raise DataError(
-            f"{file}: not a kind of data file that is read", expected=" or ".join(readers), got=file.suffix
-        )
+        kinds, text = " or ".join(readers), f"{file}: not a kind of data file that is read"
+        raise DataError(text, expected=kinds, got=file.suffix)
     table, header = readers[file.suffix.lower()](file)
     return {name: numeric(file, name, table[name], missing) for name in table.column_names}, header
 
@@ -119,28 +119,31 @@ def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], Data
             _check_flat(file, usable, [parquet.schema.column(i).path for i in range(shape.num_columns)])
             yield parquet, usable, header
     except (pa.ArrowException, OSError, MemoryError, OverflowError, UnicodeDecodeError) as cause:
-        raise DataError(
-            f"{file}: the file is damaged, truncated or not Parquet",
-            got=str(cause).splitlines()[0] if str(cause) else type(cause).__name__,
-            hint="write it again from its source; an interrupted copy is the usual cause",
-        ) from cause
+        raise damaged(str(file), "Parquet", cause) from cause
+
+
+def damaged(source: str, kind: str, cause: BaseException) -> DataError:
+    """The error for a file that a parser of some kind of files fails on."""
+    lines = str(cause).splitlines()
+    return DataError(
+        f"{source}: the file is damaged, truncated or not {kind}",
+        got=lines[0][:300] if lines else type(cause).__name__,
+        hint="write it again from its source; an interrupted copy is the usual cause",
+    )
 
 
 def _check_count(file: Path, columns: int) -> None:
-    most = f"at most {limits.COLUMNS}"
     if columns > limits.COLUMNS:
-        hint = "write only the columns of the robot"
+        most, hint = f"at most {limits.COLUMNS}", "write only the columns of the robot"
         raise DataError(f"{file}: too many columns", expected=most, got=columns, hint=hint)
 
 
 def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
     """Check that no list or struct lies inside a column of numbers: a name also selects what is inside it."""
     names = set(usable)
-    for path in paths:
-        parts = path.split(".") if path not in names else []
-        outer = next(
-            (".".join(parts[:n]) for n in range(1, len(parts)) if ".".join(parts[:n]) in names), None
-        )
+    for path in (path for path in paths if path not in names):
+        prefixes = accumulate(path.split("."), "{}.{}".format)
+        outer = next((prefix for prefix in prefixes if prefix in names), None)
         if outer is not None:
             raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
 

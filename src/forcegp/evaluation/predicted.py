@@ -164,14 +164,9 @@ def _scores(model: Predictor, data: Dataset, mean: Tensor, std: Tensor | None) -
         if name not in logged or int(rows.sum()) < 2:
             continue
         both = torch.stack([mean[rows, i], logged[name][rows]])
-        error = both[0] - both[1]
-        score = MultiplierScore(
-            contact=name,
-            samples=len(error),
-            bias=float(error.mean()),
-            spread=float(error.std()),
-            correlation=float(torch.corrcoef(both)[0, 1]) if bool((both.std(1) > 0.0).all()) else None,
-            coverage=None if std is None else share(error.abs() <= 2.0 * std[rows, i]),
-        )
-        scores.append(score)
+        error, varies = both[0] - both[1], bool((both.std(1) > 0.0).all())
+        correlation = float(torch.corrcoef(both)[0, 1]) if varies else None
+        coverage = None if std is None else share(error.abs() <= 2.0 * std[rows, i])
+        bias, spread = float(error.mean()), float(error.std())
+        scores.append(MultiplierScore(name, len(error), bias, spread, correlation, coverage))
     return tuple(scores)

@@ -137,9 +137,8 @@ def join_stream(
         report.find("uncovered", message, signals.row[~covered])
         signals.keep(covered, split=True)
     signals.vectors[name] = onto(t, values, signals.t)
-    report.steps.append(
-        f"interpolated {name} from {1.0 / usual_step(t):.4g} Hz onto the clock of the positions"
-    )
+    rate = f"{1.0 / usual_step(t):.4g} Hz"
+    report.steps.append(f"interpolated {name} from {rate} onto the clock of the positions")
 
 
 UNEVEN = 0.02

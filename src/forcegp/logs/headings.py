@@ -217,14 +217,14 @@ def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
             for part, names in enumerate(_AXES):
                 if axis and stem in names:
                     columns.setdefault((part, axis), column)
-        if all((0, axis) in columns for axis in "xyz"):
-            draft.further["wrench"] = {
-                "force": [columns[0, axis] for axis in "xyz"],
+        force, moment = ([columns.get((part, axis)) for axis in "xyz"] for part in range(2))
+        if all(force):
+            wrench = {
+                "force": force,
                 "stream": stream.name or None,
+                "torque": moment if all(moment) else None,
             }
-            if all((1, axis) in columns for axis in "xyz"):
-                draft.further["wrench"]["torque"] = [columns[1, axis] for axis in "xyz"]
-            draft.further["wrench"]["frame"] = robot.frame_names[-1]
+            draft.further["wrench"] = {**wrench, "frame": robot.frame_names[-1]}
             unknown = "the sensor's frame, its sign (acts_on) and the tool's weight are not in the log"
             draft.say("wrench", unknown, doubt=True)
             return

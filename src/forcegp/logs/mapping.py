@@ -278,11 +278,8 @@ def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
         for name, symbol in logged.items():
             draft.families[name] = Family(f"{symbol}.{{joint}}", {}, unit=units.SI[name])
         for contact in system.contact_names:
-            if f"contact.{contact}" in names:
-                draft.further[f"contact.{quoted(contact)}"] = {
-                    "source": "column",
-                    "column": f"contact.{contact}",
-                }
+            if (column := f"contact.{contact}") in names:
+                draft.further[f"contact.{quoted(contact)}"] = {"source": "column", "column": column}
         return parse_mapping(draft.toml().encode(), "columns named as in a data set")
     if "header" in names and names >= {f"{n}.{joint}" for n in ("position", "effort") for joint in joints}:
         return load_mapping("ros_joint_states")

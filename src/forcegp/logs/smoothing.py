@@ -179,9 +179,8 @@ def add_derivatives(signals: Signals, settings: DerivativesSection, report: Impo
     how = "a Kalman (RTS) smoother with white snap"
     if golay:
         how = f"a Savitzky-Golay filter of window {settings.window} and order {settings.order}"
-    report.steps.append(
-        f"computed {' and '.join(name for name in ('qd', 'qdd') if name not in logged)} by {how}"
-    )
+    computed = " and ".join(name for name in ("qd", "qdd") if name not in logged)
+    report.steps.append(f"computed {computed} by {how}")
     if "qdd" not in logged and settings.filter_torque:
         report.steps.append("passed the torque through the same filter")
     return std

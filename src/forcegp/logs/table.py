@@ -3,7 +3,7 @@ a small compressed file can claim to hold more than memory does. The bounds are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
+from forcegp.data.table import damaged
 from forcegp.errors import DataError, ForceGPError, did_you_mean
 from forcegp.resources import announce_memory
 
@@ -134,24 +135,19 @@ def foreign(source: str, kind: str) -> Iterator[None]:
         what = "no such file" if isinstance(cause, FileNotFoundError) else "the file may not be read"
         raise DataError(f"{source}: {what}", got=str(cause)) from cause
     except (Exception, RecursionError, MemoryError) as cause:
-        lines = str(cause).splitlines()
-        raise DataError(
-            f"{source}: the file is damaged, truncated or not {kind}",
-            got=lines[0][:300] if lines else type(cause).__name__,
-            hint="write it again from its source; an interrupted copy is the usual cause",
-        ) from cause
+        raise damaged(source, kind, cause) from cause
 
 
-def arrays_to_streams(
-    source: str, arrays: Mapping[str, NDArray[np.generic]], remarks: list[str]
-) -> tuple[Stream, ...]:
-    """Streams of the arrays of a file, one for each number of rows.
+def table_of_arrays(
+    source: str, kind: str, arrays: Mapping[str, NDArray[np.generic]], remarks: Sequence[str] = ()
+) -> LogTable:
+    """The log of the arrays of a file, a stream for each number of rows.
 
     A matrix `(n, d)` becomes the columns `name[0]` to `name[d-1]`. Rows run along the axis whose length
-    most arrays share; `(d, n)` is transposed. Arrays of another length are streams of their own. `remarks`
-    gets a sentence for each array that was transposed or left out.
+    most arrays share; `(d, n)` is transposed. Arrays of another length are streams of their own. After the
+    `remarks` of the reader comes one for each array that was transposed or left out.
     """
-    usable = {}
+    usable, remarks = {}, list(remarks)
     for name, array in arrays.items():
         squeezed = array.reshape(-1) if array.ndim == 2 and 1 in array.shape else array
         if squeezed.dtype.kind not in "fiub" or squeezed.ndim not in (1, 2) or squeezed.size < 2:
@@ -173,4 +169,4 @@ def arrays_to_streams(
     check_count(source, "arrays of different length", len(groups), limits.LOG_STREAMS)
     for rows, columns in groups.items():
         check_values(source, rows, len(columns))
-    return streams_by_length(groups, common)
+    return LogTable(source, kind, streams_by_length(groups, common), tuple(remarks))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -70,7 +70,7 @@ class ExternalWrench(Prediction):
             raise ParameterError(
                 "invalid detection", expected="threshold > 0 [σ] and hold ≥ 1", got=(threshold, hold)
             )
-        quantile = scipy.stats.chi2.isf(false_alarm_rate(threshold), self.mean.shape[-1])
+        quantile = float(scipy.stats.chi2.isf(false_alarm_rate(threshold), self.mean.shape[-1]))
         far = self.distance_squared > quantile
         held = far.clone()
         for lag in range(1, hold):
@@ -153,7 +153,7 @@ class JointForces(NamedTuple):
 
 def joint_forces(
     fit: LearnedForces,
-    states: Sequence[Tensor],
+    states: tuple[Tensor, Tensor, Tensor],
     active: Tensor,
     qdd: Tensor,
     memory: FrictionMemory | None = None,

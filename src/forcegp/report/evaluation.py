@@ -108,9 +108,7 @@ def draw_calibration(evaluation: Evaluation) -> Picture:
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         axes.plot([0.4, 1.0], [0.4, 1.0], color=INK, linewidth=0.8, linestyle=":", label="nominal")
-        axes.plot(
-            list(levels), list(levels.values()), color=colour(evaluation.kind), marker="o", label="model"
-        )
+        axes.plot(list(levels), list(levels.values()), "o-", color=colour(evaluation.kind), label="model")
         axes.set_xlabel("probability of the interval")
         axes.set_ylabel("share of samples inside")
         axes.set_ylim(0.0, 1.02)
@@ -134,9 +132,8 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
         rows, bad = [], set()
         for i, joint in enumerate(evaluation.joint_names):
             shown = [e.in_motion[i] for e in errors.values()]
-            rows.append(
-                (joint, *(cell(x, 3) for x in (*shown, model_errors.rest[i], model_errors.normalised[i])))
-            )
+            values = (*shown, model_errors.rest[i], model_errors.normalised[i])
+            rows.append((joint, *(cell(x, 3) for x in values)))
             if any((shown[0] or 0.0) > (e.in_motion[i] or 0.0) for e in others):
                 bad.add((i, 1))
         caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: worse than another"
@@ -150,9 +147,8 @@ def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
     if evaluation.uncertainty is not None:
         shares = zip(evaluation.joint_names, evaluation.uncertainty.coverage_by_joint, strict=True)
         rows = tuple((joint, f"{share:.3f}") for joint, share in shares)
-        tables.append(
-            Table("±2σ coverage of measured accelerations (nominal 0.954)", ("joint", "share"), rows)
-        )
+        caption = "±2σ coverage of measured accelerations (nominal 0.954)"
+        tables.append(Table(caption, ("joint", "share"), rows))
     if any(p.nlpd is not None for p in evaluation.predictors):
         rows = tuple((p.name, "–" if p.nlpd is None else f"{-p.nlpd:.3f}") for p in evaluation.predictors)
         caption = "Mean log density of a measured joint acceleration [nats], higher is better"

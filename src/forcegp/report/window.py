@@ -104,9 +104,8 @@ def draw_errors(window: WindowData, limit: float | None = None) -> Picture:
 def _draw(window: WindowData, centre: Tensor, alt: str, limit: float | None = None) -> Picture:
     name, joints = label(window.model), len(window.joint_names)
     alt = f"{name}: " + alt.format(f"{joints} joints over {window.seconds:.3g} s")
-    return draw(
-        lambda figure: _rows(figure, window, centre, limit), (WIDTH, MARGIN + ROW * joints), alt, name
-    )
+    size = (WIDTH, MARGIN + ROW * joints)
+    return draw(lambda figure: _rows(figure, window, centre, limit), size, alt, name)
 
 
 def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | None = None) -> None:
@@ -119,10 +118,8 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
         axes.plot(window.t, measured[i], color=ink, linewidth=0.7, label="measured")
         if window.std is not None:
             spread = 2.0 * as_tensor(window.std[i])
-            low, high = mean[i] - spread, mean[i] + spread
-            axes.fill_between(
-                window.t, low, high, color=model_colour, alpha=0.3, linewidth=0, label="±2σ", zorder=3
-            )
+            band, style = (mean[i] - spread, mean[i] + spread), {"color": model_colour, "alpha": 0.3}
+            axes.fill_between(window.t, *band, linewidth=0, label="±2σ", zorder=3, **style)
         axes.plot(window.t, mean[i], color=model_colour, linewidth=1.1, label="predicted", zorder=4)
         if relative and window.clean is not None:
             clean = as_tensor(window.clean[i]) - centre[i]

@@ -178,12 +178,10 @@ def _free_name(tree: Tree, site: Site, taken: set[str], remarks: list[str]) -> s
     """A unique frame name: in MJCF, a site and a body may share a name."""
     if site.name not in taken:
         return site.name
-    name = f"site/{site.name}"
+    name, doubt = f"site/{site.name}", f"{tree.label}: site {site.name!r} shares its name with a body"
     if name in taken:
-        raise UnsupportedRobotError(
-            f"{tree.label}: site {site.name!r} shares its name with a body", expected="different names"
-        )
-    remarks.append(f"{tree.label}: site {site.name!r} shares its name with a body; its frame is {name!r}")
+        raise UnsupportedRobotError(doubt, expected="different names")
+    remarks.append(f"{doubt}; its frame is {name!r}")
     return name
 
 
@@ -252,11 +250,8 @@ def _read(source: str | Path) -> Tree:
         from forcegp.robot.mjcf import read_mjcf  # loads MuJoCo, which is optional
 
         return read_mjcf(root, path)
-    raise RobotFileError(
-        f"{path}: neither URDF nor MJCF",
-        expected="a <robot> or a <mujoco> document",
-        got=f"<{root.tag[:60]}>",
-    )
+    expected = "a <robot> or a <mujoco> document"
+    raise RobotFileError(f"{path}: neither URDF nor MJCF", expected=expected, got=f"<{root.tag[:60]}>")
 
 
 def _vector(value: Sequence[float | int], name: str) -> np.ndarray:

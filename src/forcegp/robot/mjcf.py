@@ -52,18 +52,13 @@ def read_mjcf(root: Element, path: Path) -> Tree:
         chain = _chain(model, b, names, joint_names, coupled, str(path))
         links += [Link(joint.child, frame=False) for joint in chain[:-1]]
         joints += chain
-    return Tree(
-        name=root.get("model", path.stem),
-        label=str(path),
-        links=tuple(links),
-        joints=tuple(joints),
-        sites=tuple(
-            Site(name, names[model.site_bodyid[i]], _pose(model.site_pos[i], model.site_quat[i]))
-            for i in range(model.nsite)
-            if (name := model.site(i).name)
-        ),
-        remarks=tuple(remarks),
+    sites = tuple(
+        Site(name, names[model.site_bodyid[i]], _pose(model.site_pos[i], model.site_quat[i]))
+        for i in range(model.nsite)
+        if (name := model.site(i).name)
     )
+    name = root.get("model", path.stem)
+    return Tree(name, str(path), tuple(links), tuple(joints), sites, tuple(remarks))
 
 
 _HANDLER = threading.RLock()

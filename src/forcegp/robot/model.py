@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from forcegp.errors import ShapeError, UnknownNameError
+from forcegp.errors import ShapeError, check_name
 from forcegp.notebook import html_table
 
 JointType = Literal["revolute", "prismatic"]
@@ -86,7 +86,7 @@ class RobotModel:
 
     def __repr__(self) -> str:
         """One line that says which robot it is, without the numbers."""
-        moving = sum(1 for kind in self.joint_types if kind == "prismatic")
+        moving = self.joint_types.count("prismatic")
         kinds = f", {moving} of them prismatic" if moving else ""
         mass = float(self.mass.detach().sum())
         kind = str(self.dtype).removeprefix("torch.")
@@ -96,12 +96,9 @@ class RobotModel:
         """A table of the joints for notebooks."""
         head = ("joint", "type", "parent", "lower", "upper", "mass [kg]", "damping", "friction")
         numbers = torch.stack([self.lower, self.upper, self.mass, self.damping, self.friction], dim=1)
-        rows = [
-            (name, kind, self.joint_names[parent] if parent != BASE else "base", *values)
-            for name, kind, parent, values in zip(
-                self.joint_names, self.joint_types, self.parents, numbers.detach().tolist(), strict=True
-            )
-        ]
+        parents = ["base" if parent == BASE else self.joint_names[parent] for parent in self.parents]
+        columns = self.joint_names, self.joint_types, parents, *numbers.detach().T.tolist()
+        rows = list(zip(*columns, strict=True))
         return html_table(repr(self).strip("<>"), head, rows, self.remarks)
 
     @cached_property
@@ -125,9 +122,8 @@ class RobotModel:
         depth: list[int] = []
         for parent in self.parents:
             depth.append(0 if parent == BASE else depth[parent] + 1)
-        return tuple(
-            tuple(i for i, d in enumerate(depth) if d == level) for level in range(max(depth, default=-1) + 1)
-        )
+        levels = range(max(depth, default=-1) + 1)
+        return tuple(tuple(i for i, d in enumerate(depth) if d == level) for level in levels)
 
     @cached_property
     def ancestors(self) -> Tensor:
@@ -148,18 +144,21 @@ class RobotModel:
     def fingerprint(self) -> str:
         """SHA-256 of joint names, kinematics and inertial parameters: equal for equal robots."""
         digest = hashlib.sha256(repr((self.joint_names, self.joint_types, self.parents)).encode())
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, Tensor):
-                digest.update(field.name.encode())
-                digest.update(value.detach().to("cpu", torch.float64).contiguous().numpy().tobytes())
+        for name, value in self._tensors.items():
+            digest.update(name.encode())
+            digest.update(value.detach().to("cpu", torch.float64).contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]
 
     @property
     def learned(self) -> tuple[str, ...]:
         """Names of the constants that require a gradient."""
+        return tuple(name for name, x in self._tensors.items() if x.requires_grad)
+
+    @property
+    def _tensors(self) -> dict[str, Tensor]:
+        """Every constant that is a tensor, by name."""
         values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
-        return tuple(name for name, x in values if isinstance(x, Tensor) and x.requires_grad)
+        return {name: value for name, value in values if isinstance(value, Tensor)}
 
     def frame_index(self, frame: str) -> int:
         """Index of a named frame.
@@ -167,8 +166,7 @@ class RobotModel:
         Raises:
             UnknownNameError: no such frame; the message lists the frames and the nearest one.
         """
-        if frame not in self.frame_names:
-            raise UnknownNameError(f"frame of robot {self.name!r}", frame, self.frame_names)
+        check_name(f"frame of robot {self.name!r}", frame, self.frame_names)
         return self.frame_names.index(frame)
 
     def joint_index(self, joint: str) -> int:
@@ -177,19 +175,12 @@ class RobotModel:
         Raises:
             UnknownNameError: no such joint; the message lists the joints and the nearest one.
         """
-        if joint not in self.joint_names:
-            raise UnknownNameError(f"joint of robot {self.name!r}", joint, self.joint_names)
+        check_name(f"joint of robot {self.name!r}", joint, self.joint_names)
         return self.joint_names.index(joint)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RobotModel:
         """The same robot with its constants on another device or in another precision."""
-        return self.replace(
-            **{
-                field.name: value.to(device=device, dtype=dtype)
-                for field in dataclasses.fields(self)
-                if isinstance(value := getattr(self, field.name), Tensor)
-            }
-        )
+        return self.replace(**{name: x.to(device=device, dtype=dtype) for name, x in self._tensors.items()})
 
     def replace(self, **fields: object) -> RobotModel:
         """A robot with some fields changed, such as `robot.replace(mass=mass)`.
@@ -200,15 +191,11 @@ class RobotModel:
         """
         names = [field.name for field in dataclasses.fields(self)]
         for name, value in fields.items():
-            if name not in names:
-                raise UnknownNameError("robot field", name, names)
+            check_name("robot field", name, names)
             old = getattr(self, name)
             if isinstance(old, Tensor) and isinstance(value, Tensor) and value.shape != old.shape:
-                raise ShapeError(
-                    f"robot field {name!r} has the wrong shape",
-                    expected=tuple(old.shape),
-                    got=tuple(value.shape),
-                )
+                text = f"robot field {name!r} has the wrong shape"
+                raise ShapeError(text, expected=tuple(old.shape), got=tuple(value.shape))
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
 
     def check_state(self, **states: Tensor) -> None:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from forcegp.batchlast import skew
-from forcegp.errors import InertiaError, ModelError, UnknownNameError
+from forcegp.errors import InertiaError, ModelError, check_name
 from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, log_cholesky, pseudo_inertia
 from forcegp.robot.model import RobotModel
 
@@ -104,9 +104,8 @@ class AnalyticalParameters(nn.Module):
     def _initial(self, quantity: str) -> nn.Parameter:
         robot, rows = self.start, self._rows[quantity]
         if quantity == "inertia":
-            bodies = zip(
-                self.joints[quantity], robot.mass[rows], robot.com[rows], robot.inertia[rows], strict=True
-            )
+            parts = (x[rows] for x in (robot.mass, robot.com, robot.inertia))
+            bodies = zip(self.joints[quantity], *parts, strict=True)
             return nn.Parameter(torch.stack([_log_cholesky(*body) for body in bodies]))
         if quantity == "com":
             return nn.Parameter(robot.com[rows].clone())
@@ -120,9 +119,8 @@ class AnalyticalParameters(nn.Module):
 
     def _fields(self, quantity: str, x: Tensor) -> dict[str, Tensor]:
         if quantity == "inertia":
-            return dict(
-                zip(("mass", "com", "inertia"), from_pseudo_inertia(from_log_cholesky(x)), strict=True)
-            )
+            parts = from_pseudo_inertia(from_log_cholesky(x))
+            return dict(zip(("mass", "com", "inertia"), parts, strict=True))
         if quantity == "offset":
             rows = self._rows[quantity]
             turn = torch.linalg.matrix_exp(skew(x[:, :3].T).permute(2, 0, 1))
@@ -134,8 +132,7 @@ class AnalyticalParameters(nn.Module):
 
 
 def _joints(robot: RobotModel, quantity: str, names: Sequence[str] | Literal["all"]) -> tuple[str, ...]:
-    if quantity not in QUANTITIES:
-        raise UnknownNameError("quantity to learn", quantity, QUANTITIES)
+    check_name("quantity to learn", quantity, QUANTITIES)
     chosen = robot.joint_names if names == "all" else tuple(names)
     for name in chosen:
         robot.joint_index(name)

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from forcegp.errors import InertiaError, RobotFileError, UnknownNameError, UnsupportedRobotError, did_you_mean
+from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError, check_name, did_you_mean
 
 JointKind = Literal["revolute", "prismatic", "fixed"]
 
@@ -104,8 +104,7 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
     """
     names = [joint.name for joint in tree.joints if joint.kind != "fixed"]
     for name, q in locked.items():
-        if name not in names:
-            raise UnknownNameError(f"joint of {tree.label} to lock", name, names)
+        check_name(f"joint of {tree.label} to lock", name, names)
         if not np.isfinite(q):
             raise RobotFileError(f"{tree.label}: joint {name!r} cannot be locked", expected="a number", got=q)
 

@@ -151,9 +151,7 @@ def _tip_contact(system: ConstrainedSystem) -> SurfaceContact | None:
 def tip_of(system: ConstrainedSystem) -> tuple[str, Sequence[float]]:
     """Frame and point of the first contact with a surface, or the origin of the last frame."""
     contact = _tip_contact(system)
-    return (
-        (system.robot.frame_names[-1], (0.0, 0.0, 0.0)) if contact is None else (contact.frame, contact.point)
-    )
+    return (contact.frame, contact.point) if contact else (system.robot.frame_names[-1], (0.0, 0.0, 0.0))
 
 
 def compare(
@@ -189,19 +187,12 @@ def compare(
     rows = first[:, None] + torch.arange(steps + 1)
     options = options or RolloutOptions(on_divergence="keep")
     options = dataclasses.replace(options, dt=options.dt or dt)
-    predicted = {}
+    start, predicted = (data.q[first], data.qd[first], data.tau[rows]), {}
+    active = data.active(system.contact_names)[first]
     for i, (name, model) in enumerate(models.items()):
-        drawn = samples if model.has_function_samples else 0
+        drawn, report = samples if model.has_function_samples else 0, share_of(progress, i, len(models))
         predicted[name] = rollout_model(
-            model,
-            data.q[first],
-            data.qd[first],
-            data.tau[rows],
-            duration,
-            drawn,
-            active=data.active(system.contact_names)[first],
-            options=options,
-            progress=share_of(progress, i, len(models)),
+            model, *start, duration, drawn, active=active, options=options, progress=report
         )
     return _beside(system, data, rows, dt, predicted)
 

@@ -54,10 +54,9 @@ def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
     active = state.active ^ crossed
     landing = (crossed & active).any(-1)
     if not bool(landing.any()):
-        return State(state.t, state.q, state.qd, active)
+        return state._replace(active=active)
     after = project_velocity(problem.system.equations(state.q, state.qd, active), state.qd)
-    qd = torch.where(landing[:, None], after, state.qd)
-    return State(state.t, state.q, qd, active)
+    return state._replace(qd=torch.where(landing[:, None], after, state.qd), active=active)
 
 
 def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, Instant, list[ContactEvent]]:

@@ -12,7 +12,8 @@ from torch import Tensor
 from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.constraints.unilateral import any_row, can_open
-from forcegp.errors import ForceGPError, ModelError, UnknownNameError
+from forcegp.data import Dataset
+from forcegp.errors import ForceGPError, ModelError, check_name
 from forcegp.resources import one_thread
 from forcegp.rollout.inputs import Disturbed, ForwardModel, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
@@ -83,12 +84,10 @@ class RolloutOptions:
                 raise ForceGPError(
                     f"the rollout's {name} is out of range", expected="a positive finite number", got=value
                 )
-        if self.method not in METHODS:
-            raise UnknownNameError("method of integration", self.method, METHODS)
-        if self.on_divergence not in ON_DIVERGENCE:
-            raise UnknownNameError("on_divergence", self.on_divergence, ON_DIVERGENCE)
-        if not isinstance(self.stabilization, Baumgarte) and self.stabilization not in STABILIZATIONS:
-            raise UnknownNameError("stabilization", self.stabilization, STABILIZATIONS)
+        check_name("method of integration", self.method, METHODS)
+        check_name("on_divergence", self.on_divergence, ON_DIVERGENCE)
+        if not isinstance(self.stabilization, Baumgarte):
+            check_name("stabilization", self.stabilization, STABILIZATIONS)
 
     def stabilized(self, system: ConstrainedSystem) -> ConstrainedSystem:
         """The system with the stabilization terms of the rollout in its right-hand side."""
@@ -186,11 +185,29 @@ def rollout_model(
         whole, report = torch.Size((samples, *batch)), share_of(progress, 1, shares)
         density = model.torque_disturbance if options.torque_noise else None
         noise = None if density is None else (density, generator)
-        sampled = _run(
-            force, system, start, tau, duration, whole, active, options, report, batch=batch, noise=noise
-        )
+        given = force, system, start, tau, duration, whole, active, options, report
+        sampled = _run(*given, batch=batch, noise=noise)
         rollout = dataclasses.replace(rollout, samples=sampled)
     return _checked(rollout, options)
+
+
+def replayed(
+    model: ForwardModel,
+    log: Dataset,
+    samples: int = 0,
+    seconds: float = float("inf"),
+    *,
+    seed: int = 0,
+    options: RolloutOptions,
+    progress: Progress | None = None,
+) -> Rollout:
+    """A model rolled out from the first state of a logged trajectory under its torques, at most to its end.
+
+    Batch, samples and options are those of `rollout_model`.
+    """
+    duration = min(seconds, float(log.t[-1] - log.t[0]))
+    active, how = log.active(model.system.contact_names)[0], {"options": options, "progress": progress}
+    return rollout_model(model, log.q[0], log.qd[0], log, duration, samples, seed=seed, active=active, **how)
 
 
 def _run(

@@ -104,9 +104,8 @@ class _Record:
         if not bool(alive.all()):
             rows = alive[:, None]
             now = Instant(*(torch.where(rows, x, torch.nan) for x in now[:-1]))  # pyright: ignore[reportArgumentType]
-            state = state._replace(
-                q=torch.where(rows, state.q, torch.nan), qd=torch.where(rows, state.qd, torch.nan)
-            )
+            q, qd = (torch.where(rows, x, torch.nan) for x in (state.q, state.qd))
+            state = state._replace(q=q, qd=qd)
         self.states.append(state)
         self.motions.append(now)
 
@@ -201,9 +200,8 @@ def _survivors(
     sound = torch.isfinite(after.q).all(-1) & (after.qd.abs().amax(-1) < speed_limit)
     if bool(sound.all()):
         return after, alive
-    _give_up(
-        record, before, alive & ~sound, f"a joint speed of {speed_limit:g} or more, or a state not finite"
-    )
+    reason = f"a joint speed of {speed_limit:g} or more, or a state not finite"
+    _give_up(record, before, alive & ~sound, reason)
     return after.where(sound, before), alive & sound
 
 
@@ -225,11 +223,5 @@ def _result(problem: RolloutProblem, record: _Record, dt: float) -> Rollout:
 
     t = torch.arange(len(states), dtype=states[0].t.dtype, device=states[0].t.device) * dt
     columns = over_time(states, "q qd active") | over_time(motions, "qdd tau multiplier c cd")
-    return Rollout(
-        problem.system,
-        t,
-        **columns,
-        samples=None,
-        events=tuple(record.events),
-        diverged=tuple(record.diverged),
-    )
+    events, diverged = tuple(record.events), tuple(record.diverged)
+    return Rollout(problem.system, t, **columns, samples=None, events=events, diverged=diverged)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ModelError, NumericalError, ParameterError, UnknownNameError
+from forcegp.errors import ModelError, NumericalError, ParameterError, check_name
 from forcegp.rollout.events import ContactEvent
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class Rollout:
     active: Tensor
     events: Sequence[ContactEvent] = ()
     diverged: Sequence[Divergence] = ()
-    samples: Rollout | None = field(default=None)
+    samples: Rollout | None = None
 
     def __repr__(self) -> str:
         """One line: length, batch, samples and what happened, without the numbers."""
@@ -140,8 +140,7 @@ class Rollout:
         """
         from forcegp.plots import MEASURED, PREDICTED, Curve, Panel, Timeline, axis_label, chosen, draw_panels
 
-        if quantity not in QUANTITIES:
-            raise UnknownNameError("quantity of a rollout", quantity, QUANTITIES)
+        check_name("quantity of a rollout", quantity, QUANTITIES)
         if self.rows != 1:
             raise ParameterError(
                 "several trajectories cannot be drawn on one axis",

@@ -81,10 +81,8 @@ class Document:
 
     def at(self, key: Key, make: Callable[..., T], *args: object, **options: object) -> T:
         """The result of `make(*args, **options)`, whose errors are reported at a key of this file."""
-        try:
+        with self.error.within(self.place(key)):
             return make(*args, **options)
-        except ForceGPError as error:
-            raise self.error.at(self.place(key), error) from error
 
     def place(self, key: Key) -> str:
         """`file:line: key` of a key, or of the nearest enclosing key that is in the file."""

@@ -16,16 +16,8 @@ from forcegp.scene.document import Document
 from forcegp.scene.sections import ModelFile, ModelSection, SceneSections
 from forcegp.simulate.config import SimulationConfig
 
-BUNDLED = (
-    "kuka_plane",
-    "kuka_sphere",
-    "kuka_two_points",
-    "panda_sphere",
-    "panda_tilted",
-    "pendulum_wire",
-    "ur5_free",
-    "ur5_wiping",
-)
+FOLDER = Path(str(files("forcegp.scene") / "bundled"))
+BUNDLED = tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
 """Scenes that come with the library; `kuka_plane` is the paper's task."""
 
 
@@ -104,7 +96,7 @@ def load_scene(source: str | Path) -> Scene:
         SceneError: the scene does not exist or is not valid; the message names file, line and key.
     """
     bundled = str(source) in BUNDLED
-    path = Path(str(files("forcegp.scene") / "bundled" / f"{source}.toml")) if bundled else Path(source)
+    path = FOLDER / f"{source}.toml" if bundled else Path(source)
     if not _is_file(path):
         beside = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
         raise SceneError(

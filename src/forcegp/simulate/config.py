@@ -46,9 +46,8 @@ class ContactSolver:
                 check_setting(name, 0.0 < value < float("inf"), "a positive finite number", value)
         for name in ("joint_friction", "joint_damping"):
             values = getattr(self, name)
-            check_setting(
-                name, all(0.0 <= x < float("inf") for x in values), "finite numbers, 0 or above", values
-            )
+            valid = all(0.0 <= x < float("inf") for x in values)
+            check_setting(name, valid, "finite numbers, 0 or above", values)
         check_setting("friction", 0.0 <= self.friction < float("inf"), NOT_NEGATIVE, self.friction)
 
     def substeps(self, dt: float) -> int:

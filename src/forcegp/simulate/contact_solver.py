@@ -89,15 +89,8 @@ class ContactSolverEngine(MuJoCoWorld):
         Q, F = (np.stack(part) for part in zip(*contacts, strict=True)) if contacts else none
         Q_I, Q_z = Q.sum(0)
         whole = data.qfrc_applied + data.qfrc_passive + data.qfrc_constraint - data.qfrc_bias
-        return SolvedForces(
-            qdd=qdd[dof],
-            Q=(whole - hD * qdd)[dof] - Q_I - Q_z,
-            Q_I=Q_I,
-            Q_z=Q_z,
-            multiplier=np.linalg.norm(F[:, 0], axis=-1),
-            F_I=F[:, 0],
-            F_z=F[:, 1],
-        )
+        others, (F_I, F_z) = (whole - hD * qdd)[dof] - Q_I - Q_z, F.swapaxes(0, 1)
+        return SolvedForces(qdd[dof], others, Q_I, Q_z, np.linalg.norm(F_I, axis=-1), F_I, F_z)
 
     def step(self) -> None:
         """Advance by the sampling period under the torque last given to `forces`."""

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.errors import MissingDependencyError, UnknownNameError, UnsupportedRobotError, optional_module
+from forcegp.errors import MissingDependencyError, UnsupportedRobotError, check_name, optional_module
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.engine import Engine
 from forcegp.simulate.urdf import write_urdf
@@ -55,9 +55,8 @@ class PyBulletEngine(Engine):
         self._bullet.setTimeStep(dt)
         self._bullet.setGravity(*robot.gravity.tolist())
         self._body = self._load()
-        info = (
-            self._bullet.getJointInfo(self._body, i) for i in range(self._bullet.getNumJoints(self._body))
-        )
+        count = self._bullet.getNumJoints(self._body)
+        info = (self._bullet.getJointInfo(self._body, i) for i in range(count))
         index = {entry[1].decode(): entry[0] for entry in info}
         self._joints = [index[name] for name in robot.joint_names]
         # PyBullet's vectors list joints by their index.
@@ -82,11 +81,9 @@ class PyBulletEngine(Engine):
         return torch.tensor(q, dtype=self._robot.dtype), torch.tensor(qd, dtype=self._robot.dtype)
 
     def step(self, force: JointVector) -> None:
-        bullet = self._bullet
-        bullet.setJointMotorControlArray(
-            self._body, self._joints, bullet.TORQUE_CONTROL, forces=force.tolist()
-        )
-        bullet.stepSimulation()
+        mode, forces = self._bullet.TORQUE_CONTROL, force.tolist()
+        self._bullet.setJointMotorControlArray(self._body, self._joints, mode, forces=forces)
+        self._bullet.stepSimulation()
 
     def mass_matrix(self, q: JointVector) -> JointMatrix:
         M = self._bullet.calculateMassMatrix(self._body, self._ordered(q))
@@ -218,8 +215,7 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
         UnknownNameError: no such engine.
         MissingDependencyError: the engine's package is not installed.
     """
-    if name != "auto" and name not in MAKERS:
-        raise UnknownNameError("engine", name, ["auto", *MAKERS])
+    check_name("engine", name, ["auto", *MAKERS])
     if name != "auto":
         return MAKERS[name](robot, dt)
     try:

@@ -113,10 +113,8 @@ class Mechanics:
         M, Q_C, Q_G, *points = self._blocks(q, qd)
         frames = [points[i : i + POINT] for i in range(0, len(points), POINT)]
         moving = [PointMotion.of([torch.from_numpy(x) for x in frame], velocity) for frame in frames]
-        terms = [
-            contact.terms_of([moving[k] for k in places])
-            for contact, places in zip(self.contacts, self._places, strict=True)
-        ]
+        pairs = zip(self.contacts, self._places, strict=True)
+        terms = [contact.terms_of([moving[k] for k in places]) for contact, places in pairs]
         nq = len(q)
         c = np.concatenate([np.zeros(0), *(x.c.numpy() for x in terms)])
         A = np.concatenate([np.zeros((0, nq)), *(x.A.numpy() for x in terms)])
@@ -129,22 +127,14 @@ class Mechanics:
         rows = rows * np.concatenate([np.zeros(0), *holds])
         Q_D = dynamics.damping_force(self._system.robot, velocity).numpy()
         rotation, position, jacobian, bias = frames[0]
-        return StateEquations(
-            M=M,
-            A=A * rows[:, None],
-            b=b * rows,
-            c=c,
-            cd=cd,
-            Q_C=Q_C,
-            Q_D=Q_D,
-            Q_K=Q_C + Q_G + Q_D,
-            contact_points={
-                contact.name: TouchingPoint(*(getattr(x.point, f).numpy() for f in TouchingPoint._fields))
-                for contact, x in zip(self.contacts, terms, strict=True)
-                if x.point is not None
-            },
-            tool=PointMotion(rotation, position, jacobian @ qd, jacobian, bias),
-        )
+        tool = PointMotion(rotation, position, jacobian @ qd, jacobian, bias)
+        touching = {
+            contact.name: TouchingPoint(*(getattr(x.point, f).numpy() for f in TouchingPoint._fields))
+            for contact, x in zip(self.contacts, terms, strict=True)
+            if x.point is not None
+        }
+        Q_K = Q_C + Q_G + Q_D
+        return StateEquations(M, A * rows[:, None], b * rows, c, cd, Q_C, Q_D, Q_K, touching, tool)
 
 
 def _blocks(system: ConstrainedSystem, anchors: Sequence[Anchor]) -> tuple[Blocks, bool]:

@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from forcegp.errors import ForceGPError, ModelError, UnknownNameError, near_names
+from forcegp.errors import ModelError, check_name, near_names
 
 Classes = Mapping[str, type]
 """The classes that may be written and read, by the name in the file."""
@@ -56,30 +56,24 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bo
     """
     if depth > MAX_DEPTH:
         raise ModelError(f"{place}: nested too deeply", expected=f"at most {MAX_DEPTH} levels")
+
+    def within(key: object, part: Any) -> Any:
+        return decode(part, classes, f"{place}.{key}", depth + 1, whole=whole)
+
     if isinstance(json, list):
-        return tuple(
-            decode(part, classes, f"{place}.{i}", depth + 1, whole=whole) for i, part in enumerate(json)
-        )
+        return tuple(within(i, part) for i, part in enumerate(json))
     if not isinstance(json, dict):
         return json
     name = str(json.get("type"))
-    if name not in classes:
-        raise UnknownNameError(f"type in {place}", name, classes)
+    check_name(f"type in {place}", name, classes)
     kind = classes[name]
     assert is_dataclass(kind)
     members = {key: value for key, value in json.items() if key != "type"}
     _check_fields(kind, name, members, place, whole)
     hints = get_type_hints(kind)
-    values = {
-        key: _checked(
-            decode(value, classes, f"{place}.{key}", depth + 1, whole=whole), hints[key], f"{place}.{key}"
-        )
-        for key, value in members.items()
-    }
-    try:
+    values = {k: _checked(within(k, part), hints[k], f"{place}.{k}") for k, part in members.items()}
+    with ModelError.within(place):
         return kind(**values)
-    except ForceGPError as cause:
-        raise ModelError.at(place, cause) from cause
 
 
 def _written(kind: Any) -> list[Field[Any]]:

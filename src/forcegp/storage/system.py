@@ -23,7 +23,7 @@ from forcegp.constraints import (
     SurfaceContact,
     SurfaceSchema,
 )
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.errors import ModelError
 from forcegp.files import Record, validated
 from forcegp.robot.model import RobotModel
 
@@ -174,11 +174,9 @@ def unpack_system(
     """
     record = validated(SystemRecord, dict(json), source, ModelError, ("system",))
     robot = _robot(record.robot, tensors, source)
-    try:
+    with ModelError.within(f"{source}: field 'system'"):
         contacts = tuple(_constraint(contact, fallback) for contact in record.contacts)
         return ConstrainedSystem(robot, contacts, record.baumgarte)
-    except ForceGPError as cause:
-        raise ModelError.at(f"{source}: field 'system'", cause) from cause
 
 
 def _constraint(record: ConstraintRecord, fallback: ConstrainedSystem | None) -> Constraint:

@@ -19,6 +19,7 @@ from forcegp.plots import as_array
 from forcegp.report.animation import FRAMES_PER_SECOND
 from forcegp.rollout import Rollout, RolloutOptions
 from forcegp.rollout.comparison import tip_of
+from forcegp.rollout.forward import replayed
 from forcegp.rollout.inputs import sampling_period
 
 Array = NDArray[np.float64]
@@ -91,16 +92,9 @@ def with_rollout(motion: Motion, path: Rollout) -> Motion:
 
 def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float, seed: int = 0) -> Rollout:
     """A model rolled out under the logged torques from the first state of a trajectory."""
-    return model.rollout(
-        data.q[0],
-        data.qd[0],
-        data,
-        duration=min(seconds, float(data.t[-1] - data.t[0])),
-        samples=samples if model.has_function_samples else 0,
-        seed=seed,
-        active=data.active(model.system.contact_names)[0],
-        options=RolloutOptions(sampling_period(data), on_divergence="keep"),
-    )
+    options = RolloutOptions(sampling_period(data), on_divergence="keep")
+    drawn = samples if model.has_function_samples else 0
+    return replayed(model, data, drawn, seconds, seed=seed, options=options)
 
 
 def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:

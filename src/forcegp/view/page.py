@@ -65,9 +65,8 @@ def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
 
 
 def _solid(points: Array, colour: str, link: int | None) -> dict[str, Any]:
-    return {
-        "points": rounded(torch.from_numpy(points)), "colour": colour, "opacity": OPACITY, "link": link,
-    }  # fmt: skip
+    style = {"colour": colour, "opacity": OPACITY, "link": link}
+    return {"points": rounded(torch.from_numpy(points)), **style}
 
 
 def _around(motion: Motion, contact: str, tip: Array) -> Array:

@@ -19,18 +19,16 @@ from forcegp import limits
 from forcegp.errors import DataError, optional_module
 from forcegp.logs import table
 from forcegp.logs.readers.matlab5 import Variable, variables
-from forcegp.logs.table import LogTable, Progress, Wanted
+from forcegp.logs.table import LogTable
 
 Arrays = dict[str, NDArray[np.generic]]
 MAX_ARRAYS = 4096
 """Arrays of one archive."""
 
 
-def read_numpy(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+def read_numpy(path: Path, **_: object) -> LogTable:
     """Read the numeric arrays of an `.npz` archive, or the array of an `.npy` file."""
-    del wanted, rows, progress
     arrays: Arrays = {}
-    remarks: list[str] = []
     with table.foreign(str(path), "a NumPy file"):
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
@@ -46,8 +44,7 @@ def read_numpy(path: Path, *, wanted: Wanted, rows: int | None, progress: Progre
         else:
             with path.open("rb") as file:
                 arrays = _array(str(path), "", file, path.stat().st_size)
-    streams = table.arrays_to_streams(str(path), arrays, remarks)
-    return LogTable(str(path), "numpy", streams, tuple(remarks))
+    return table.table_of_arrays(str(path), "numpy", arrays)
 
 
 def _array(source: str, name: str, file: Any, size: int) -> Arrays:
@@ -75,12 +72,10 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
     return {name: array}
 
 
-def read_hdf5(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+def read_hdf5(path: Path, **_: object) -> LogTable:
     """Read the numeric data sets of an HDF5 file; one in a group is `group/name`."""
-    del wanted, rows, progress
     remarks: list[str] = []
-    streams = table.arrays_to_streams(str(path), _hdf5_arrays(path, "/", remarks), remarks)
-    return LogTable(str(path), "hdf5", streams, tuple(remarks))
+    return table.table_of_arrays(str(path), "hdf5", _hdf5_arrays(path, "/", remarks), remarks)
 
 
 def _hdf5_arrays(path: Path, separator: str, remarks: list[str]) -> Arrays:
@@ -133,12 +128,11 @@ HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 """Version 7.3 puts it after a header of 512 bytes."""
 
 
-def read_matlab(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+def read_matlab(path: Path, **_: object) -> LogTable:
     """Read the numeric arrays of a MATLAB file; fields of a struct are `struct.field`.
 
     Cells, objects, sparse matrices and function handles are left out with a remark.
     """
-    del wanted, rows, progress
     with path.open("rb") as file:
         head = file.read(520)
     remarks: list[str] = []
@@ -150,7 +144,7 @@ def read_matlab(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
             for variable in _version4(path) if 0 in head[:4] else variables(path.read_bytes(), str(path)):
                 _collect(variable, arrays, remarks)
     table.check_count(str(path), "arrays", len(arrays), limits.COLUMNS)
-    return LogTable(str(path), "matlab", table.arrays_to_streams(str(path), arrays, remarks), tuple(remarks))
+    return table.table_of_arrays(str(path), "matlab", arrays, remarks)
 
 
 def _version4(path: Path) -> Iterator[Variable]:
