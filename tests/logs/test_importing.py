@@ -96,6 +96,21 @@ def test_units_signs_gears_and_currents(tmp_path: Path, robot: forcegp.RobotMode
         np.testing.assert_allclose(getattr(data, name).numpy(), getattr(m, name), rtol=0.0, atol=1e-13)
 
 
+def test_a_joint_without_a_torque_sensor_is_named(tmp_path: Path, robot: forcegp.RobotModel) -> None:
+    """Its torque is 0 in the data set, whose header says so also after it was written."""
+    m = motion()
+    path, toml = write_csv(tmp_path, m)
+    lacking = toml.replace('unit = "Nm"', 'unit = "Nm"\nunmeasured = ["shoulder"]')
+    path.write_text(path.read_text().replace("tau_shoulder", "other"))
+    data = read_log(path, robot, parse_mapping(lacking.encode(), "mapping.toml"))
+    assert not bool(data.tau[:, 0].any())
+    data.write(tmp_path / "log.parquet")
+    assert forcegp.Dataset.read(tmp_path / "log.parquet").header.unmeasured_torques == ("shoulder",)
+    unknown = lacking.replace('["shoulder"]', '["knee"]')
+    with pytest.raises(MappingError, match="'knee' is not a joint of the robot"):
+        read_log(path, robot, parse_mapping(unknown.encode(), "mapping.toml"))
+
+
 def test_joints_are_matched_by_name_and_not_by_order(tmp_path: Path, robot: forcegp.RobotModel) -> None:
     m = motion()
     path, toml = write_csv(tmp_path, m)

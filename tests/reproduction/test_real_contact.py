@@ -19,7 +19,13 @@ from forcegp.forces.measurements import measurement_of
 from forcegp.gp.optimise import LearningOptions
 from forcegp.logs import import_log
 from forcegp.models.registry import create
-from forcegp.models.sensed import force_from_sensor, sensed_force, sensor_noise_std, with_sensor
+from forcegp.models.sensed import (
+    force_from_sensor,
+    sensed_force,
+    sensor_noise_std,
+    with_sensed_forces,
+    with_sensor,
+)
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
@@ -86,6 +92,26 @@ def test_the_sensor_measures_the_force_on_the_tip(logs: dict[str, Dataset]) -> N
         measured.values[:, 0] - truth.contact_extras["multiplier"]["ball"][rows_of(log, truth)][closed]
     )
     assert float(difference.std()) == pytest.approx(FORCE_NOISE, rel=0.2)
+
+
+def test_sensor_and_accelerations_show_the_joint_forces(logs: dict[str, Dataset]) -> None:
+    """Q̄ = M q̈ − J_EᵀF of MuJoCo's own forces, within what the noise of both leaves."""
+    log = logs["wrench"]
+    (observation,) = with_sensed_forces(log, SYSTEM, FORCE_NOISE)
+    measured, noise = measurement_of(observation, SYSTEM)
+    exact = ConstrainedSystem(SYSTEM.robot).equations(log.q, log.qd).Q_K + log.tau
+    left = measured.values - exact
+    friction = -torch.tensor(SCENE.simulation.solver.joint_friction, dtype=torch.float64) * log.qd.sign()
+    assert float((left - friction).std()) < float(left.std()), "what is left is friction of the joints"
+    open_ = ~log.contact["ball"]
+    assert bool((noise[open_].mean(0) < noise[~open_].mean(0)).all()), "no force, no noise of it"
+    slider = SYSTEM.robot.joint_names[0]
+    lacking = log.replace(header=log.header.model_copy(update={"unmeasured_torques": (slider,)}))
+    (hidden,) = with_sensed_forces(lacking, SYSTEM, FORCE_NOISE)
+    unknown = measurement_of(hidden, SYSTEM)[1]
+    assert bool((unknown[:, 0] > noise[:, 0]).all()) and torch.equal(unknown[:, 1:], noise[:, 1:])
+    with pytest.raises(ModelError, match="no sensor's force"):
+        with_sensed_forces(logs["truth"], SYSTEM, FORCE_NOISE)
 
 
 def test_the_noise_of_the_sensor_is_read_off_the_log(logs: dict[str, Dataset]) -> None:

@@ -168,6 +168,7 @@ def _dataset(
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,
         provenance=tuple(report.steps),
+        unmeasured_torques=mapping.sections.torque.unmeasured,
         joint_names=robot.joint_names,
         contact_names=tuple(signals.contact),
     )

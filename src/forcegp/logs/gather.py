@@ -87,14 +87,17 @@ class _Gathering:
         return self.table.stream_of(column, stream.name).columns[column]
 
     def _vector(self, name: str) -> tuple[Stream, Array]:
-        """A joint vector in SI units on the joint side."""
+        """A joint vector in SI units on the joint side, 0 for joints that the log does not have."""
+        joints = self.mapping.measured(name, self.joints)
 
         def numbers(key: str) -> Array:
-            return self.mapping.per_joint(name, key, self.joints)
+            return self.mapping.per_joint(name, key, joints)
 
         section = self.mapping.quantity(name)
         assert section is not None
         columns = self.mapping.columns_of(name, self.joints)
+        if not columns:
+            raise self.mapping.error((name, "unmeasured"), "no joint is left", expected="some joints")
         stream = self.table.stream_of(columns[0], section.stream)
         # s k, to SI on the joint side, and o in the unit of the column.
         scale, offset = numbers("sign") * units.QUANTITY[name][section.unit], numbers("offset")
@@ -102,10 +105,11 @@ class _Gathering:
             scale *= numbers("gear_ratio") ** (1.0 if name == "torque" else -1.0)
         if name == "torque" and self.mapping.sections.torque.torque_constant is not None:
             scale *= numbers("torque_constant")
-        result = np.empty((len(stream), len(self.joints)))
-        for i, column in enumerate(columns):
-            np.subtract(self._take(stream, column), offset[i], out=result[:, i])
-            result[:, i] *= scale[i]
+        result = np.zeros((len(stream), len(self.joints)))
+        for i, (joint, column) in enumerate(zip(joints, columns, strict=True)):
+            own = result[:, self.joints.index(joint)]
+            np.subtract(self._take(stream, column), offset[i], out=own)
+            own *= scale[i]
             if isinstance(stream.columns, dict) and len(stream.columns) > 1:
                 del stream.columns[column]  # memory holds it once
         return stream, result

@@ -58,9 +58,11 @@ class QuantitySection(Section):
 
 
 class TorqueSection(QuantitySection):
-    """`[torque]`: a torque, or a current with the torque constant of the motor [N m/A]."""
+    """`[torque]`: a torque, or a current with the torque constant of the motor [N m/A]; joints without either
+    are `unmeasured`."""
 
     torque_constant: PerJoint | None = None
+    unmeasured: tuple[str, ...] = ()
 
 
 class WrenchSection(Section):
@@ -130,8 +132,14 @@ class Mapping:
         """The table of a joint vector: `position`, `velocity`, `acceleration` or `torque`."""
         return getattr(self.sections, name)
 
+    def measured(self, name: str, joints: Sequence[str]) -> list[str]:
+        """The joints of which the log has a quantity: all but those whose torque is `unmeasured`."""
+        unmeasured = self.sections.torque.unmeasured if name == "torque" else ()
+        self._check_joints((name, "unmeasured"), unmeasured, joints)
+        return [joint for joint in joints if joint not in unmeasured]
+
     def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
-        """The log's column of a quantity for each joint of the robot."""
+        """The log's column of a quantity for each joint of the robot that has it."""
         section = self.quantity(name)
         assert section is not None
         self._check_joints(("joints",), self.sections.joints, joints)
@@ -140,11 +148,12 @@ class Mapping:
         pattern = section.column
         named = {} if pattern is None else {j: pattern.replace("{joint}", n) for j, n in called.items()}
         named |= section.columns
-        lacking = [joint for joint in joints if joint not in named]
+        measured = self.measured(name, joints)
+        lacking = [joint for joint in measured if joint not in named]
         if lacking:
             text, expected = f"joint {lacking[0]!r} has no column", f"{lacking[0]} = under columns"
             raise self.error((name,), text, expected=expected, hint=lock_hint(lacking))
-        columns = [named[joint] for joint in joints]
+        columns = [named[joint] for joint in measured]
         if len(set(columns)) < len(columns):
             twice = next(c for c in columns if columns.count(c) > 1)
             raise self.error((name,), f"column {twice!r} is given for two joints", expected="'{joint}' in it")
