@@ -1,7 +1,7 @@
 """A real contact with a measured force: a hopping leg on a slider, and the same leg pushed by hand.
 
     python benchmarks/real_contact.py --json result.json      # a few minutes
-    python benchmarks/real_contact.py --logs path/to/real
+    python benchmarks/real_contact.py --logs path/to/real --figure docs/figures/real_contact.svg
 
 In `hopper/hopping` the leg stands and squats (first half), jumps, lands, squats deeper and stands (second);
 each half is learned from and the other tested. In `hopper/pushed` somebody moves the base by hand while the
@@ -247,6 +247,34 @@ def contact_labels(logs: Path) -> dict[str, float]:
     }
 
 
+def draw(logs: Path, file: Path) -> None:
+    """The force in the second half of `hopping`, learned without the sensor in the first."""
+    import matplotlib.pyplot as plt
+
+    window = window_of(logs, FIRST)
+    system, data = hopping(logs, window)
+    fit, test = learned(system, between(data, FIRST)), between(data, SECOND)
+    open_ = test.replace(contact={"ground": torch.zeros_like(test.contact["ground"])})
+    found = fit.external_wrench(open_, "contact", axes=AXES)
+    assert found.std is not None
+    plain = classical(system.robot, test)["equations of motion"]
+    true = test.contact_extras[SENSOR]["ground"][:, [0, 2]]
+    figure, axes = plt.subplots(2, 1, figsize=(8.0, 5.0), sharex=True, layout="constrained")
+    for k, (ax, name) in enumerate(zip(axes, ("fore-aft", "vertical"), strict=True)):
+        mean, std = found.mean[:, k], found.std[:, k]
+        ax.fill_between(test.t, mean - 2.0 * std, mean + 2.0 * std, color="C0", alpha=0.25, lw=0.0)
+        ax.plot(test.t, plain[:, k], color="0.6", lw=0.9, label="equations of motion")
+        ax.plot(test.t, mean, color="C0", lw=1.2, label="forcegp ± 2σ, no sensor")
+        ax.plot(test.t, true[:, k], color="k", lw=0.9, label="force sensor")
+        ax.set_ylabel(f"{name} force [N]")
+    axes[0].set_ylim(-5.0, 4.0)
+    axes[1].set_ylim(-8.0, 30.0)
+    axes[0].legend(fontsize=8, ncols=3, loc="upper right")
+    axes[1].set_xlabel("t [s]")
+    figure.savefig(file, metadata={"Date": None})
+    plt.close(figure)
+
+
 def lines(name: str, result: dict[str, object]) -> list[list[str]]:
     """Rows of the table."""
 
@@ -268,6 +296,7 @@ def main() -> None:
     parser.add_argument(
         "--logs", type=Path, default=LOGS, help="folder of the logs (default: ../shared/real)"
     )
+    parser.add_argument("--figure", type=Path, help="draw the second half of `hopping` to this file")
     parser.add_argument("--json", type=Path, help="write all results to this file")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -292,6 +321,8 @@ def main() -> None:
     print(table(head, [row for name, part in result.items() for row in lines(name, part)]))
     print({name: part["window"] for name, part in result.items() if "window" in part})
     print(result["contact labels"])
+    if options.figure:
+        draw(options.logs, options.figure)
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 
