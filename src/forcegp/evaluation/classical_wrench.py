@@ -3,8 +3,9 @@
 - Quasi-static: w = −J⁺ᵀ (τ + Q_G), which leaves out friction and motion.
 - The generalized-momentum observer (De Luca and Mattone, *Sensorless robot collision detection and hybrid
   force/motion control*, ICRA 2005): the residual ρ̇ = K (ṗ − u − ρ) with p = M q̇ is a low-pass filter of the
-  external joint force, ρ → Jᵀ w, and w = J⁺ᵀ ρ. Here u = Q − Q_C + ½ ∂(q̇ᵀM q̇)/∂q of the robot file, or of a
-  robot and its friction that least squares has identified (`evaluation/least_squares.py`).
+  external joint force, ρ → Jᵀ w, from which `wrench_of` gives w. Here u = Q − Q_C + ½ ∂(q̇ᵀM q̇)/∂q of the
+  robot file, or of a robot and its friction that least squares has identified
+  (`evaluation/least_squares.py`).
 """
 
 from __future__ import annotations
@@ -64,14 +65,3 @@ def momentum_residual(
         # The exact solution of ρ̇ = K (ṗ − u − ρ) over a step
         rho[i] = keep * rho[i - 1] + (1.0 - keep) * ((p[i] - p[i - 1]) / h - 0.5 * (u[i] + u[i - 1]))
     return rho
-
-
-def momentum_observer(
-    robot: RobotModel,
-    data: Dataset,
-    frame: WrenchFrame,
-    gain: float,
-    losses: Callable[[Tensor], Tensor] | None = None,
-) -> Tensor:
-    """w = J⁺ᵀ ρ with the residual of the momentum observer, `(n, k)` [N, N m]; arguments as there."""
-    return wrench_of(frame.jacobian(robot, data.q), momentum_residual(robot, data, gain, losses))

@@ -20,7 +20,6 @@ The wrench is that of the environment on the robot. Multipliers of closed contac
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -212,8 +211,3 @@ def observe(log: MomentumLog) -> tuple[Array, Array]:
         P = 0.5 * (P + P.T)
         means[i], covariances[i] = x[w], P[w, w]
     return means, covariances
-
-
-def component_names(frame: str, axes: Sequence[str]) -> list[str]:
-    """Names of the components of a wrench, for plots."""
-    return [f"{frame} {axis}" for axis in axes]

@@ -19,9 +19,10 @@ import scipy.optimize
 import torch
 from torch import Tensor
 
+from forcegp.data import Dataset
 from forcegp.forces.calibration import CHUNK_STATES, autocorrelation_time, stretches
-from forcegp.forces.inverse_dynamics import Timed, bristles
-from forcegp.forces.measurements import Training
+from forcegp.forces.inverse_dynamics import bristles
+from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import TORQUE_NOISE, stick_variance
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.priors.inertial import InertialPrior
@@ -44,7 +45,7 @@ LEAST_SHARE = 0.01
 """Smallest share of the variance that is believed to remain."""
 
 
-def _features(robot: RobotModel, log: Timed) -> Tensor:
+def _features(robot: RobotModel, log: Measurement | Dataset) -> Tensor:
     """Bristles of all distances, friction without memory, an offset, and weight, `(n, nq, f)`."""
     v = log.qd[..., None]
     friction = [bristles(log), *(torch.tanh(v / speed) for speed in SPEEDS), v, torch.ones_like(v)]
@@ -81,7 +82,7 @@ class FrictionMemory:
             return None
         return cls(*(hyperparameters[name] for name in (WEIGHTS, SHARE, CORRELATION)))
 
-    def force(self, robot: RobotModel, log: Timed) -> Tensor:
+    def force(self, robot: RobotModel, log: Measurement | Dataset) -> Tensor:
         """Joint force of the correction in a log in order of time, `(n, nq)` [N m, N]."""
         return (_features(robot, log) * self.weights).sum(-1)
 
@@ -128,7 +129,12 @@ def memory_of(
 
 
 def learn_memory(
-    robot: RobotModel, motion: Timed, residual: Tensor, white: Tensor, forces: Tensor, noise: Tensor
+    robot: RobotModel,
+    motion: Measurement | Dataset,
+    residual: Tensor,
+    white: Tensor,
+    forces: Tensor,
+    noise: Tensor,
 ) -> FrictionMemory | None:
     """Learn the correction from training samples in free motion.
 

@@ -15,12 +15,12 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
 from forcegp.forces.calibration import stretches
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.priors.base import ForceMean
@@ -171,27 +171,13 @@ def free_rows(
     return _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
 
 
-@runtime_checkable
-class Timed(Protocol):
-    """Positions and velocities `(n, nq)` with time `(n,)` [s] and trajectory `(n,)` of each sample."""
-
-    @property
-    def q(self) -> Tensor: ...
-    @property
-    def t(self) -> Tensor: ...
-    @property
-    def qd(self) -> Tensor: ...
-    @property
-    def segment(self) -> Tensor: ...
-
-
-def _in_time(m: Timed) -> Tensor:
+def _in_time(m: Measurement | Dataset) -> Tensor:
     """Indices of samples in the order of segment and time."""
     order = torch.argsort(m.t, stable=True)
     return order[torch.argsort(m.segment[order], stable=True)]
 
 
-def bristles(m: Timed) -> Tensor:
+def bristles(m: Measurement | Dataset) -> Tensor:
     """Friction with memory: z of Dahl's model dz/dt = q̇/δ − |q̇| z/δ for some distances δ, `(n, nq, k)`.
 
     Within δ of a reversal this friction is a spring, and its torque is about proportional to −q̈: without

@@ -144,38 +144,14 @@ def external_wrench(
 
 
 class JointForces(NamedTuple):
-    """At n states: mean of Q̄ `(n, nq)`, its covariance `(n, nq, nq)`, and the equations of motion."""
+    """At n states: mean of Q̄ `(n, nq)`, its covariance with noise of the torques `(n, nq, nq)`, the equations
+    of motion, J `(n, k, nq)` of the wrench and of multipliers, and their priors `(k,)`."""
 
     mean: Tensor
     covariance: Tensor
     eom: Equations
-
-
-def joint_forces(
-    fit: LearnedForces,
-    states: tuple[Tensor, Tensor, Tensor],
-    active: Tensor,
-    qdd: Tensor,
-    memory: FrictionMemory | None = None,
-) -> JointForces:
-    """Q̄ with the noise of the torques, at states (q, q̇, τ) of shape `(n, nq)`.
-
-    Args:
-        fit: the learned forces.
-        states: q, q̇ and τ.
-        active: `(n, n_contacts)` which contacts are closed.
-        qdd: `(n, nq)` accelerations at which errors of the inertia act.
-        memory: whose shares of the noise remain; its force is not added.
-    """
-    at, _ = states_at(fit.system, *states, active)
-    at = dataclasses.replace(at, qdd=qdd)
-    mean, S = fit.posterior.read(fit.system, at, affine_map(fit.system, at, "total_force"))
-    stick = stick_variance(fit.hyperparameters, at)
-    beyond = fit.problem.unknown_variance(fit.hyperparameters, at) - stick
-    torque = torch.zeros_like(stick) if fit.torque_std is None else fit.torque_std.square().expand_as(stick)
-    noise = torch.stack([torque, stick], dim=-1)
-    noise = noise if memory is None else noise * memory.share
-    return JointForces(mean, S + torch.diag_embed(noise.sum(-1) + beyond), at.eom)
+    J: Tensor
+    prior: Tensor
 
 
 @dataclass(frozen=True)
@@ -205,18 +181,25 @@ class Reading:
         force = torch.zeros_like(data.q) if memory is None else memory.force(fit.system.robot, data)
         return cls(fit, data, frame, memory, force, external_std(external, fit.system.robot))
 
-    def forces(self, rows: Tensor, qdd: Tensor) -> tuple[JointForces, Tensor, Tensor]:
-        """Forces at some rows, J `(n, k, nq)` of the wrench and of multipliers, and their priors `(k,)`."""
-        data, system = self.data[rows], self.fit.system
+    def forces(self, rows: Tensor, qdd: Tensor) -> JointForces:
+        """Forces at some rows, with errors of the inertia at given accelerations `(n, nq)`."""
+        data, fit, system = self.data[rows], self.fit, self.fit.system
         active = data.active(system.contact_names)
-        forces = joint_forces(self.fit, (data.q, data.qd, data.tau), active, qdd, self.memory)
-        if self.external is not None:
-            forces = forces._replace(covariance=forces.covariance + torch.diag(self.external**2))
+        at, _ = states_at(system, data.q, data.qd, data.tau, active)
+        at = dataclasses.replace(at, qdd=qdd)
+        mean, S = fit.posterior.read(system, at, affine_map(system, at, "total_force"))
+        stick = stick_variance(fit.hyperparameters, at)
+        beyond = fit.problem.unknown_variance(fit.hyperparameters, at) - stick
+        beyond = beyond if self.external is None else beyond + self.external**2
+        torque = torch.zeros_like(stick) if fit.torque_std is None else fit.torque_std.square() + 0.0 * stick
+        noise = torch.stack([torque, stick], dim=-1)
+        noise = noise if self.memory is None else noise * self.memory.share
         # Multipliers of closed contacts are further unknowns.
-        A = forces.eom.A * system.active_rows(active, data.q.shape[:-1])[..., None]
+        A = at.eom.A * system.active_rows(active, data.q.shape[:-1])[..., None]
         prior = torch.cat([self.frame.prior, data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])
         J = torch.cat([self.frame.jacobian(system.robot, data.q), A], dim=-2)
-        return forces._replace(mean=forces.mean + self.remembered[rows]), J, prior
+        S = S + torch.diag_embed(noise.sum(-1) + beyond)
+        return JointForces(mean + self.remembered[rows], S, at.eom, J, prior)
 
     def from_accelerations(self) -> tuple[Tensor, Tensor]:
         """Mean and covariance by generalized least squares."""
@@ -224,10 +207,11 @@ class Reading:
         learned = self.fit.noise.get("qdd", self.data.q.new_zeros(self.data.nq))
         for rows in torch.arange(len(self.data)).split(CHUNK):
             qdd = self.data.qdd[rows]
-            forces, J, prior = self.forces(rows, qdd)
+            forces = self.forces(rows, qdd)
             M, std = forces.eom.M, learned.expand_as(qdd) if stated is None else stated[rows]
             S = forces.covariance + M @ torch.diag_embed(std**2) @ M.mT
-            parts.append(least_squares(J, (M @ qdd[..., None])[..., 0] - forces.mean, S, prior))
+            r = (M @ qdd[..., None])[..., 0] - forces.mean
+            parts.append(least_squares(forces.J, r, S, forces.prior))
         mean, covariance = zip(*parts, strict=True)
         return torch.cat(mean), torch.cat(covariance)
 
@@ -255,12 +239,13 @@ class Reading:
         for rows in trajectory.split(CHUNK):
             q, qd = self.data.q[rows], self.data.qd[rows]
             # Without accelerations, errors of the inertia count by their weight.
-            forces, J, prior = self.forces(rows, torch.zeros_like(q))
+            forces = self.forces(rows, torch.zeros_like(q))
+            prior = forces.prior
             M, added = momentum_force(robot, q, qd)
             p = (M @ qd[..., None])[..., 0]
             p_noise = M @ torch.diag(noise**2) @ M.mT
             factor = torch.linalg.cholesky(forces.covariance)
-            columns.append((p, p_noise, forces.mean - forces.eom.Q_C + added, J, factor))
+            columns.append((p, p_noise, forces.mean - forces.eom.Q_C + added, forces.J, factor))
         p, p_noise, u, J, factor = (torch.cat(parts).numpy() for parts in zip(*columns, strict=True))
         t, open_ = self.data.t[trajectory].numpy(), prior[len(self.frame.axes) :]
         change = torch.cat([self.frame.changes, open_])
