@@ -35,8 +35,6 @@ from forcegp.robot.model import RobotModel
 MEMORY = f"{NOISE}.memory."
 WEIGHTS, SHARE, CORRELATION = (MEMORY + name for name in ("weights", "share", "correlation"))
 """Names of the correction among the hyperparameters."""
-FEWEST = 200
-"""Training samples in free motion that are needed."""
 RIDGE = 1e-3
 """Of features of size 1, relative to the number of samples."""
 LONGEST_STEP = 0.05
@@ -91,21 +89,19 @@ class FrictionMemory:
 def memory_of(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> dict[str, Tensor]:
-    """The correction as hyperparameters, from samples in free motion; empty where these are too few or too
-    far apart in time.
+    """The correction as hyperparameters, from samples in free motion; empty where these are not in order of
+    time, or too far apart.
 
     Args:
         problem: what was learned.
         hyperparameters: learned tensors.
         training: samples whose residuals are looked at.
     """
-    if not training.period or "qdd" not in training.quantities:
+    if not training.period:
         return {}
     i = training.quantities.index("qdd")
     m = training.measurements[i]
     free = (~m.active.any(-1)).nonzero()[:, 0]
-    if len(free) < FEWEST:
-        return {}
     std = dataclasses.replace(problem, training=training).noise_at(hyperparameters, i).expand_as(m.values)
     posterior, parts = force_posterior(problem, hyperparameters), []
     torque = hyperparameters[TORQUE_NOISE].exp().square()

@@ -448,7 +448,7 @@ def solve(
         values |= calibrated_noise(part, values)
     if correlated:
         part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
-    if calibrated:
+    if calibrated and (neighbours or problem.training).free_motions >= LEAST:
         values |= memory_of(part, values, neighbours or problem.training)
     training = dataclasses.replace(problem.training, slopes=part.training.slopes)
     whole = dataclasses.replace(part, training=training, inducing=None)
