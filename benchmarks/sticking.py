@@ -1,0 +1,148 @@
+"""Contact forces where the tip sticks and where it slides, beside equations of motion; MuJoCo is the truth.
+
+    python benchmarks/sticking.py --json result.json      # some minutes
+    python benchmarks/sticking.py --scene ur5_wiping --seeds 1
+
+Two logs of one robot, whose file lacks the friction of its joints: in one the tip slides with the scene's
+friction, in the other friction is so high that the tip sticks while the controller pulls at it; in both it
+lifts off now and then. The first halves of both are learned from together, the second halves are tested, all
+three components of the force on the tip.
+
+- `equations of motion`: least squares of M q̈ − Q_K − τ = J_EᵀF with the file.
+- `with friction`: the same, with viscous and dry friction of each joint from the free motion of training.
+- `forcegp`: force predicted from q, q̇, τ, with a tip that may stick.
+- `forcegp wrench`: the external wrench at the tip, no contact declared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import warnings
+from pathlib import Path
+
+import torch
+from results_page import table
+from torch import Tensor
+
+import forcegp
+from forcegp.scene import load_scene
+from forcegp.simulate import simulate
+
+SCENES = ("ur5_wiping", "panda_sphere")
+DURATION, AREA = 40.0, (0.03, 0.03)
+"""Of each log [s], and where the tip that sticks is pulled to [m]."""
+HIGH_FRICTION = 3.0
+STICK_SPEED = 0.003
+"""Below which the tip sticks [m/s]: it creeps by some mm/s in MuJoCo's soft friction."""
+SLIDING = 0.01
+"""Speed above which rows count as sliding [m/s]."""
+EVERY, TESTED = 4, 3
+"""Every so many rows are learned from, and tested."""
+DRY_SPEED = 0.05
+"""Speed over which dry friction of the plain regression changes sign [rad/s]."""
+
+
+def truth(data: forcegp.Dataset, contact: str) -> Tensor:
+    """The force on the tip `(n, 3)` [N]."""
+    return data.contact_extras["F_I"][contact] + data.contact_extras["F_z"][contact]
+
+
+def residual(system: forcegp.ConstrainedSystem, data: forcegp.Dataset) -> tuple[Tensor, Tensor, Tensor]:
+    """M q̈ − Q_K − τ `(n, nq)`, J_E `(n, 3, nq)` and the speed of the tip along the surface `(n,)`."""
+    eom = system.equations(data.q, data.qd)
+    point = eom.contact_points[system.contacts[0].name]
+    left = (eom.M @ data.qdd[..., None])[..., 0] - eom.Q_K - data.tau
+    return left, point.jacobian, point.sliding[1].norm(dim=-1)
+
+
+def friction(data: forcegp.Dataset) -> Tensor:
+    """Columns of viscous and dry friction and an offset of each joint, `(n, nq, 3)`."""
+    return torch.stack([data.qd, torch.tanh(data.qd / DRY_SPEED), torch.ones_like(data.qd)], dim=-1)
+
+
+def plain(
+    system: forcegp.ConstrainedSystem, train: forcegp.Dataset, test: forcegp.Dataset
+) -> dict[str, Tensor]:
+    """The force by equations of motion, without friction and with that of free motion, `(n, 3)`."""
+    name = system.contacts[0].name
+    free = train[~train.contact[name]]
+    left, _, _ = residual(system, free)
+    weights = torch.linalg.lstsq(friction(free).transpose(0, 1), left.T[..., None]).solution[..., 0]
+    rest, J, _ = residual(system, test)
+    learned = rest - (friction(test) * weights).sum(-1)
+    forces = {"equations of motion": rest, "with friction": learned}
+    return {k: torch.linalg.lstsq(J.mT, r[..., None]).solution[..., 0] for k, r in forces.items()}
+
+
+def score(error: Tensor, std: Tensor | None = None) -> dict[str, float]:
+    result = {"rmse_N": float(error.square().sum(-1).mean().sqrt())}
+    if std is not None:
+        result["median_std_N"] = float(std.square().sum(-1).sqrt().median())
+        result["coverage"] = float((error.abs() <= 2.0 * std).double().mean())
+    return result
+
+
+def scores(scene: str, seed: int) -> dict[str, dict[str, dict[str, float]]]:
+    """Scores of each method, where the tip sticks and where it slides."""
+    loaded = load_scene(scene)
+    system = loaded.system()
+    (contact,) = system.contacts
+    slides = dataclasses.replace(loaded.simulation, seed=seed, duration=DURATION)
+    solver = dataclasses.replace(slides.solver, friction=HIGH_FRICTION)
+    sticks = dataclasses.replace(slides, seed=seed + 100, size=AREA, solver=solver)
+    logs = {"slides": simulate(system, slides).data, "sticks": simulate(system, sticks).data}
+    half = {name: len(log) // 2 for name, log in logs.items()}
+    train = forcegp.Dataset.concatenate([log[: half[name]] for name, log in logs.items()])
+    both = dataclasses.replace(system, contacts=[dataclasses.replace(contact, stick_speed=STICK_SPEED)])
+    fit = forcegp.StructuredGP(both, "analytical").fit(train[::EVERY])
+    result = {}
+    for name, log in logs.items():
+        test = log[half[name] :: TESTED]
+        _, _, speed = residual(system, test)
+        moves = speed < STICK_SPEED if name == "sticks" else speed > SLIDING
+        rows, true = test.contact[contact.name] & moves, truth(test, contact.name)
+        own = {k: score((force - true)[rows]) for k, force in plain(system, train, test).items()}
+        force = fit.predict(
+            test.q, test.qd, test.tau, "contact_force", active=test.active((contact.name,)), noise=True
+        )
+        open_ = test.replace(contact={contact.name: torch.zeros_like(rows)})
+        wrench = fit.external_wrench(
+            open_, contact.frame, axes=("fx", "fy", "fz"), point=tuple(contact.point)
+        )
+        if name == "sticks":
+            own["forcegp"] = score((force.mean - true)[rows], force.std[rows])
+        own["forcegp wrench"] = score((wrench.mean - true)[rows], wrench.std[rows])
+        result[name] = own
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scene", choices=SCENES, action="append")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    result = {
+        scene: [scores(scene, seed) for seed in range(options.seeds)] for scene in options.scene or SCENES
+    }
+    lines = []
+    for scene, seeds in result.items():
+        for state in seeds[0]:
+            for method in seeds[0][state]:
+                own = [seed[state][method] for seed in seeds]
+                keys = ("rmse_N", "median_std_N", "coverage")
+                means = [sum(x[k] for x in own) / len(own) if k in own[0] else None for k in keys]
+                lines.append([scene, state, method, *("–" if x is None else f"{x:.2f}" for x in means)])
+    print(table(["scene", "tip", "method", "RMSE [N]", "median σ [N]", "coverage of ±2σ"], lines))
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
