@@ -38,7 +38,7 @@ FORCES, MOMENTS = ("fx", "fy", "fz"), ("mx", "my", "mz")
 AXES = (*FORCES, *MOMENTS)
 FORCE_STD, MOMENT_STD = 30.0, 5.0
 """Standard deviation of each force [N] and moment [N m] before the data: wide beside pushes by hand."""
-FORCE_CHANGE, MOMENT_CHANGE = 5.0, 0.5
+FORCE_CHANGE, MOMENT_CHANGE = 10.0, 1.0
 """By how much they change within a second, in the momentum filter."""
 MULTIPLIER_STD = 1e4
 """Of the multipliers of declared contacts [N], which are left open."""
