@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 FORCES, MOMENTS = ("fx", "fy", "fz"), ("mx", "my", "mz")
 """Components of a wrench; moments are about the point."""
 AXES = (*FORCES, *MOMENTS)
-FORCE_STD, MOMENT_STD = 50.0, 10.0
+FORCE_STD, MOMENT_STD = 30.0, 5.0
 """Standard deviation of each force [N] and moment [N m] before the data: wide beside pushes by hand."""
 FORCE_CHANGE, MOMENT_CHANGE = 10.0, 1.0
 """By how much they change within a second, in the momentum filter."""
@@ -61,7 +61,7 @@ class WrenchFrame:
 
     Example:
         >>> WrenchFrame("tool", axes=("fx", "fz")).prior.tolist()
-        [50.0, 50.0]
+        [30.0, 30.0]
 
     Raises:
         UnknownNameError: no such reference or component.
