@@ -125,9 +125,9 @@ def pushed(robot: forcegp.RobotModel, logs: Path, window: int) -> tuple[forcegp.
     q = np.concatenate([np.zeros((len(raw[FORCE]), 1)), raw["joint_positions"]], axis=1)
     q[:, 0] -= kinematics.frame_pose(robot, torch.from_numpy(q), "contact")[1][:, 2].numpy()
     saturated = binary_dilation(np.abs(raw["joint_torques"][:, 1]) > SATURATED, iterations=window // 2)
-    inside = np.arange(len(q))
-    inside = (inside >= window // 2) & (inside < len(q) - window // 2)
-    return dataset(robot, q, raw, window), torch.from_numpy(~saturated & inside)
+    rows = torch.from_numpy(np.asarray(saturated)).logical_not()
+    rows[: window // 2], rows[-(window // 2) :] = False, False
+    return dataset(robot, q, raw, window), rows
 
 
 def between(data: forcegp.Dataset, half: tuple[float, float]) -> forcegp.Dataset:

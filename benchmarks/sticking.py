@@ -89,6 +89,7 @@ def scores(scene: str, seed: int) -> dict[str, dict[str, dict[str, float]]]:
     loaded = load_scene(scene)
     system = loaded.system()
     (contact,) = system.contacts
+    assert isinstance(contact, forcegp.SurfaceContact)
     slides = dataclasses.replace(loaded.simulation, seed=seed, duration=DURATION)
     solver = dataclasses.replace(slides.solver, friction=HIGH_FRICTION)
     sticks = dataclasses.replace(slides, seed=seed + 100, size=AREA, solver=solver)
