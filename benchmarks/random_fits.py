@@ -110,7 +110,7 @@ def _not_positive(fit: Any, data: forcegp.Dataset) -> int:
     if isinstance(fit, StructuredFit) and bool(bad.any()):
         at, _ = states_at(fit.system, data.q[bad], data.qd[bad], data.tau[bad], closed[bad])
         rows = fit.posterior.rows(fit.system, at, affine_map(fit.system, at, "qdd"))
-        return int(sum(W.flatten(1).any(-1) for W in rows.operators).bool().sum())
+        return int(torch.stack([W.flatten(1).any(-1) for W in rows.operators]).any(0).sum())
     return int(bad.sum())
 
 

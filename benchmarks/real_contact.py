@@ -302,6 +302,7 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     try:
+        existing(options.logs / "hopper" / "teststand.urdf")
         result = {
             "hopping, second half": hopping_scores(options.logs, FIRST, SECOND),
             "hopping, first half": hopping_scores(options.logs, SECOND, FIRST),
