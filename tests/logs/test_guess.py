@@ -124,3 +124,32 @@ def test_names_that_are_only_alike_are_matched_and_doubted() -> None:
     assert list(joints.values()) == ["Base", "Shoulder", "Elbow", "Wrist 1", "Wrist 2", "Wrist 3"]
     assert any("likeness" in doubt for doubt in proposal.doubts)
     assert mapping_of(proposal).sections.torque.sign == -1.0
+
+
+def test_the_window_follows_the_noise(tmp_path: Path) -> None:
+    """At 1 kHz with noisy encoders, a window of 11 samples leaves accelerations of noise alone."""
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    t = np.arange(4000) * 1e-3
+    x = t[:, None] * np.array([3.0, 4.0]) + np.array([0.0, 1.0])
+    q, qd, qdd = np.sin(x), np.array([3.0, 4.0]) * np.cos(x), -np.array([9.0, 16.0]) * np.sin(x)
+    tau = forcegp.dynamics.inverse_dynamics(
+        system.robot, *(torch.from_numpy(v) for v in (q, qd, qdd))
+    ).numpy()
+    noisy = q + 1e-4 * np.random.default_rng(0).standard_normal(q.shape)
+    columns = {"time": t} | {
+        f"{name}_{joint}": values[:, i]
+        for name, values in (("position", noisy), ("torque", tau))
+        for i, joint in enumerate(system.robot.joint_names)
+    }
+    path = written(tmp_path, columns, ",", ".")
+    proposal = guess.guess_mapping(path, system)
+    assert proposal.window > 41 and "cross-validation asks for" in proposal.toml()
+    errors = {}
+    for window in (11, proposal.window):
+        proposal.window = window
+        data = read_log(path, system.robot, mapping_of(proposal))
+        true = -np.array([9.0, 16.0]) * np.sin(
+            data.t.numpy()[:, None] * np.array([3.0, 4.0]) + np.array([0.0, 1.0])
+        )
+        errors[window] = float(np.sqrt(((data.qdd.numpy() - true)[200:-200] ** 2).mean()))
+    assert errors[proposal.window] < 0.1 * errors[11]

@@ -45,7 +45,9 @@ class SavitzkyGolay:
             )
 
 
-def cross_validated_window(signals: Sequence[NDArray[np.float64]], order: int = 3) -> int:
+def cross_validated_window(
+    signals: Sequence[NDArray[np.float64]], order: int = 3, most: int | None = None
+) -> int:
     """The window that predicts the noisiest of some signals best, each sample from the others in its window.
 
     With h the weight of a sample in its own fit, the sample is off the fit to the others by (x − x̂)/(1 − h).
@@ -55,6 +57,10 @@ def cross_validated_window(signals: Sequence[NDArray[np.float64]], order: int = 
     Args:
         signals: logged values, `(n, d)` each, evenly spaced in time.
         order: degree of the polynomial.
+        most: widest window that is tried; by default as many samples as there are.
+
+    Raises:
+        DataError: a signal has fewer samples than the narrowest window.
 
     Example:
         >>> import numpy as np
@@ -66,8 +72,14 @@ def cross_validated_window(signals: Sequence[NDArray[np.float64]], order: int = 
     from scipy.signal import savgol_coeffs, savgol_filter
 
     best = []
+    if any(len(x) <= WINDOWS[0] for x in signals):
+        raise DataError(
+            "the signal is too short for a filter",
+            expected=f"more than {WINDOWS[0]} samples",
+            got=min(map(len, signals)),
+        )
     for x in signals:
-        windows = [w for w in WINDOWS if order < w < len(x)]
+        windows = [w for w in WINDOWS if order < w < len(x) and w <= max(most or w, WINDOWS[0])]
         weights = [savgol_coeffs(w, order)[w // 2] for w in windows]
         fits = [np.asarray(savgol_filter(x, w, order, axis=0)) for w in windows]
         errors = [np.square((x - fit) / (1.0 - h)).mean(0) for fit, h in zip(fits, weights, strict=True)]

@@ -37,7 +37,7 @@ class Family:
 @dataclass
 class Draft:
     """A proposed mapping: tables, in which a key that is `None` is left out, families of columns by quantity,
-    comments above each table, and what the user must check."""
+    comments above each table, what the user must check, and the window of the derivatives."""
 
     source: str
     time: dict[str, Any] = field(default_factory=dict)
@@ -46,6 +46,7 @@ class Draft:
     further: dict[str, dict[str, Any]] = field(default_factory=dict)
     comments: dict[str, list[str]] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
+    window: int = 11
 
     def say(self, table: str, sentence: str, doubt: bool = False) -> None:
         """Comment on a table; a doubt is also listed at the top."""
@@ -64,10 +65,11 @@ class Draft:
             above = [f"# {_plain(sentence)}" for sentence in self.comments.get(name, [])]
             lines += [*above, f"[{name}]", *body, ""] if body else []
         lines += [
+            *(f"# {_plain(sentence)}" for sentence in self.comments.get("derivatives", [])),
             "[derivatives]",
             'method = "savitzky_golay"   # or "smoother", with error bars from a model',
         ]
-        return "\n".join([*lines, "window = 11", "order = 3", "filter_torque = true", ""])
+        return "\n".join([*lines, f"window = {self.window}", "order = 3", "filter_torque = true", ""])
 
 
 def _plain(text: str) -> str:

@@ -16,6 +16,7 @@ import torch
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.data.derivative import cross_validated_window
 from forcegp.errors import DataError
 from forcegp.logs import units
 from forcegp.logs.clock import even_clock
@@ -28,6 +29,7 @@ from forcegp.logs.readers import read
 from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.logs.smoothing import add_derivatives
 from forcegp.logs.table import LogTable, Progress, Stream
+from forcegp.rows import runs
 
 ROWS = 100_000
 """Rows that are looked at."""
@@ -39,6 +41,8 @@ CLEARER = 1.5
 """A unit is certain if the torque fits so much better than in the other one."""
 NEAR = 1.3
 """A ratio is that of a unit if it is within this factor."""
+TRAJECTORY = 10
+"""Windows have at most one in so many samples of a trajectory."""
 LEAST_FORCE = 1.0
 """A contact that is always closed presses with more than this [N]."""
 
@@ -83,7 +87,24 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
         draft.say("position", f"mean squared correlation of the torque with the model: {listing}", doubt)
     if "velocity" in draft.families:
         _velocity_unit(draft, _signals(path, draft, system))
-    _torque(draft, _signals(path, draft, system), system)
+    trial = _signals(path, draft, system)
+    _window(draft, trial)
+    _torque(draft, trial, system)
+
+
+def _window(draft: Draft, trial: Signals) -> None:
+    """A window as wide as the noise of positions and velocities in the longest trajectory asks for."""
+    rows = max(runs(trial.segment), key=lambda rows: rows.stop - rows.start)
+    names = ["q", *(["qd"] if "velocity" in draft.families else [])]
+    asked = cross_validated_window(
+        [trial.vectors[name][rows] for name in names], most=(rows.stop - rows.start) // TRAJECTORY
+    )
+    draft.window = max(asked, draft.window)
+    period = float(np.median(np.diff(trial.t[rows])))
+    draft.say(
+        "derivatives",
+        f"window of {1e3 * period * draft.window:.3g} ms: cross-validation asks for {asked} samples",
+    )
 
 
 def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
