@@ -185,6 +185,10 @@ def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
             values, std = values["table"], std["table"]
         assert values.shape == ((220, width) if width else (220,))
         assert bool((std > 0.0).all())
+        run("predict", "-m", model, "-d", test, "-q", quantity, "-o", predicted, "--no-noise")
+        quiet = getattr(Dataset.read(predicted), f"predicted_{quantity}_std")
+        # Noise of accelerations is known; that of a force sensor is not, and the torque has none here.
+        assert torch.equal(std, quiet["table"]) if width is None else bool((std > quiet).all())
     figures = json.loads(run("evaluate", "-m", model, "-d", test, "-o", tmp_path / "figures", "--json"))
     # Mean error over noise of 0.1; the analytical mean alone knows the motion up to the contact's friction.
     assert 0.05 < figures["noisy_mae"] < 0.3

@@ -47,8 +47,13 @@ def predict(
         typer.Option("--momentum", help="external_wrench by a causal filter that reads no accelerations."),
     ] = False,
     noise: Annotated[
-        bool, typer.Option("--noise", help="Count the noise of the motor torque and of the sensor too.")
-    ] = False,
+        bool,
+        typer.Option(
+            "--noise/--no-noise",
+            help="Whether the standard deviation is that of a measurement, with the noise of the motor "
+            "torque and of the sensor (of models that know it).",
+        ),
+    ] = True,
     sensor: Annotated[
         bool,
         typer.Option(
@@ -60,8 +65,8 @@ def predict(
     """Predict a quantity at the states of a data set.
 
     The output is the data set with the columns predicted_<quantity> and, for models that know their
-    uncertainty, predicted_<quantity>_std (without measurement noise, unless --noise is given). A
-    measured normal force differs from the prediction by the noise of the motor torque too: use --noise.
+    uncertainty, predicted_<quantity>_std: that of a measurement, with the noise of the motor torque and of
+    the sensor; --no-noise leaves these out, as predict in Python does.
 
     [bold]Examples[/bold]
 
@@ -104,8 +109,8 @@ def _predicted(model: Predictor, part: Dataset, quantity: str, noise: bool, sens
     from forcegp.models.sensed import force_from_sensor
     from forcegp.models.structured_fit import StructuredFit
 
-    if (noise or sensor) and not isinstance(model, StructuredFit):
-        raise ModelError("--noise and --sensor need a structured Gaussian process", got=model.kind)
+    if sensor and not isinstance(model, StructuredFit):
+        raise ModelError("--sensor needs a structured Gaussian process", got=model.kind)
     if sensor:
         mean, std = force_from_sensor(model, part)  # pyright: ignore[reportArgumentType]
         return mean[:, None], std[:, None]
