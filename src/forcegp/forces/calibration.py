@@ -21,6 +21,7 @@ from forcegp.forces.noise import (
     RELATIVE,
     TORQUE_NOISE,
     distance_beyond,
+    hidden_variance,
     trained_region,
 )
 from forcegp.forces.posterior import ForcePosterior
@@ -306,7 +307,7 @@ def _held_out(
     if training.weights is not None:
         residual = training.weights[i][own].sqrt()[:, None] * residual
     spread = (M @ covariance @ M.mT).diagonal(dim1=-2, dim2=-1)
-    stick = (P**2 @ problem.hidden_variance(hyperparameters, at)[..., None])[..., 0]
+    stick = (P**2 @ hidden_variance(hyperparameters, at, problem.external_std)[..., None])[..., 0]
     return residual, spread + (M**2 @ typical(std) ** 2) + stick, P
 
 

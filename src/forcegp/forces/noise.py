@@ -200,11 +200,20 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-def beyond_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of forces beyond the trained region, g² D² `(n, nq)`; zero where it is not learned."""
+def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
+    """Variance of forces that neither the state nor a torque sensor tells, `(n, nq)`: of joints that stick,
+    and unknown ones of stated size `(nq,)`."""
+    variance = stick_variance(tensors, at)
+    return variance if external is None else variance + external**2
+
+
+def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
+    """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and g² D² beyond the
+    trained region."""
+    variance = hidden_variance(tensors, at, external)
     if GROWTH not in tensors:
-        return torch.zeros_like(at.q)
-    return (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
+        return variance
+    return variance + (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
 
 
 ForceNoise = Callable[[States], Tensor]

@@ -22,15 +22,13 @@ from forcegp.forces.noise import (
     TORQUE_NOISE,
     ForceNoise,
     SampleNoise,
-    beyond_variance,
+    hidden_variance,
     state_jacobian,
-    stick_variance,
 )
 from forcegp.forces.posterior import ForcePosterior, ForceProcess
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
-from forcegp.forces.quantities import States
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.exact import ExactPosterior, require_exact_fits
 from forcegp.gp.features import Features, Standardization
@@ -153,18 +151,7 @@ class Problem:
         if std is None and self.external_std is None:
             return None
         white = 0.0 if std is None else std**2
-        return lambda at: white + self.hidden_variance(tensors, at)
-
-    def hidden_variance(self, tensors: Mapping[str, Tensor], at: States) -> Tensor:
-        """Variance of forces that neither the state nor a torque sensor tells, `(n, nq)`: of joints that
-        stick, and unknown ones of stated size."""
-        variance = stick_variance(tensors, at)
-        return variance if self.external_std is None else variance + self.external_std**2
-
-    def unknown_variance(self, tensors: Mapping[str, Tensor], at: States) -> Tensor:
-        """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and those beyond
-        the trained region."""
-        return self.hidden_variance(tensors, at) + beyond_variance(tensors, at)
+        return lambda at: white + hidden_variance(tensors, at, self.external_std)
 
     def state_factor(self, system: ConstrainedSystem, measurement: int) -> Tensor | None:
         """G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` where no noise of the state reaches it."""

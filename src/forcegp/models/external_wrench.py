@@ -25,7 +25,7 @@ from forcegp.forces.external_wrench import (
     observe,
 )
 from forcegp.forces.friction_memory import FrictionMemory
-from forcegp.forces.noise import distance_beyond, external_std, stick_variance
+from forcegp.forces.noise import distance_beyond, external_std, stick_variance, unknown_variance
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.problem import Problem
 from forcegp.forces.quantities import affine_map, states_at
@@ -189,7 +189,7 @@ class Reading:
         at = dataclasses.replace(at, qdd=qdd)
         mean, S = fit.posterior.read(system, at, affine_map(system, at, "total_force"))
         stick = stick_variance(fit.hyperparameters, at)
-        beyond = fit.problem.unknown_variance(fit.hyperparameters, at) - stick
+        beyond = unknown_variance(fit.hyperparameters, at, fit.problem.external_std) - stick
         beyond = beyond if self.external is None else beyond + self.external**2
         torque = torch.zeros_like(stick) if fit.torque_std is None else fit.torque_std.square() + 0.0 * stick
         noise = torch.stack([torque, stick], dim=-1)

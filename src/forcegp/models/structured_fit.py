@@ -22,6 +22,7 @@ from forcegp.forces.noise import (
     TORQUE_NOISE,
     distance_beyond,
     learned_slopes,
+    unknown_variance,
 )
 from forcegp.forces.posterior import ForcePosterior, doubts_of, draw_samples
 from forcegp.forces.priors.base import ForcePrior
@@ -136,7 +137,8 @@ class StructuredFit(FittedModel):
         else:
             mean, spread = self.posterior.read(system, at, z)
             z = self.posterior.process.coupled(system, at, z)
-            spread = spread + _carried(z, self.problem.unknown_variance(self.hyperparameters, at))
+            unknown = unknown_variance(self.hyperparameters, at, self.problem.external_std)
+            spread = spread + _carried(z, unknown)
             if noise:
                 spread = spread + self._noise_covariance(z, parts)
         beyond = self.beyond(at.qd, at.tau)

@@ -14,7 +14,7 @@ from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.control.plan import Plan
 from forcegp.control.task_space import Gains, Target, control_torque
 from forcegp.data import Dataset
-from forcegp.errors import DataError, ModelError, ShapeError, check_name
+from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
 from forcegp.forces.quantities import ForceField
 from forcegp.kinematics import point_motion
 
@@ -218,7 +218,8 @@ def inputs_of(
         ModelError: the sampling period of an array is missing.
         DataError: the log is not one trajectory with a constant sampling period.
     """
-    check_name("interpolation", interpolation, INTERPOLATIONS)
+    if interpolation not in INTERPOLATIONS:
+        raise UnknownNameError("interpolation", interpolation, INTERPOLATIONS)
     if isinstance(tau, Inputs):
         return tau
     if isinstance(tau, Dataset):
