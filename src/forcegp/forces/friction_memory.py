@@ -167,8 +167,8 @@ def learn_memory(
         # r² − white − forces ≈ share · noise, with weights by the variance of r²
         rows = noise[:, j] / total[:, j, None]
         target = (remaining[:, j].square() - white[:, j] - forces[:, j]) / total[:, j]
-        found = torch.from_numpy(scipy.optimize.nnls(rows.numpy(), target.numpy())[0])
-        share[j] = found.clamp(min=LEAST_SHARE, max=1.0)
+        found = torch.from_numpy(scipy.optimize.nnls(rows.cpu().numpy(), target.cpu().numpy())[0])
+        share[j] = found.to(share).clamp(min=LEAST_SHARE, max=1.0)
         # A new motion is one more stretch, so its variance scatters as that of the stretches does.
         square = remaining[:, j].square() / (white[:, j] + forces[:, j] + noise[:, j] @ share[j])
         by_stretch = torch.stack([square[group == g].mean() for g in group.unique()])

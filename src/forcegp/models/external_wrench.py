@@ -196,7 +196,7 @@ class Reading:
         noise = noise if self.memory is None else noise * self.memory.share
         # Multipliers of closed contacts are further unknowns.
         A = at.eom.A * system.active_rows(active, data.q.shape[:-1])[..., None]
-        prior = torch.cat([self.frame.prior, data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])
+        prior = torch.cat([self.frame.prior.to(data.q), data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])
         J = torch.cat([self.frame.jacobian(system.robot, data.q), A], dim=-2)
         S = S + torch.diag_embed(noise.sum(-1) + beyond)
         return JointForces(mean + self.remembered[rows], S, at.eom, J, prior)
@@ -231,7 +231,8 @@ class Reading:
             for own in segment.unique_consecutive()
         ]
         mean, covariance = zip(*(observe(log) for log in logs), strict=True)
-        return torch.from_numpy(np.concatenate(mean)), torch.from_numpy(np.concatenate(covariance))
+        mean, covariance = (torch.from_numpy(np.concatenate(x)).to(self.data.q) for x in (mean, covariance))
+        return mean, covariance
 
     def momenta(self, trajectory: Tensor, noise: Tensor, correlation: Tensor) -> MomentumLog:
         """What the momentum filter reads of one trajectory, given by its rows."""
@@ -246,10 +247,11 @@ class Reading:
             p_noise = M @ torch.diag(noise**2) @ M.mT
             factor = torch.linalg.cholesky(forces.covariance)
             columns.append((p, p_noise, forces.mean - forces.eom.Q_C + added, forces.J, factor))
-        p, p_noise, u, J, factor = (torch.cat(parts).numpy() for parts in zip(*columns, strict=True))
-        t, open_ = self.data.t[trajectory].numpy(), prior[len(self.frame.axes) :]
-        change = torch.cat([self.frame.changes, open_])
-        return MomentumLog(t, p, p_noise, u, J, prior.numpy(), change.numpy(), factor, correlation.numpy())
+        p, p_noise, u, J, factor = (torch.cat(parts).cpu().numpy() for parts in zip(*columns, strict=True))
+        t, open_ = self.data.t[trajectory].cpu().numpy(), prior[len(self.frame.axes) :]
+        change = torch.cat([self.frame.changes.to(open_), open_])
+        known = [x.cpu().numpy() for x in (prior, change, correlation)]
+        return MomentumLog(t, p, p_noise, u, J, known[0], known[1], factor, known[2])
 
 
 def velocity_noise(data: Dataset) -> Tensor:
