@@ -9,7 +9,7 @@ from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
 from forcegp.checks.log import Array, Log, Outcome
 from forcegp.constraints import ConstrainedSystem
-from forcegp.rows import intervals
+from forcegp.rows import Intervals, intervals
 
 DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi
@@ -18,7 +18,13 @@ SLACK = 1e-3
 CLIPPED_RUN = 3
 """Rows in a row at the same extreme value that make a plateau."""
 OFTENER = 5.0
-"""Factor by which a clipped value occurs more often than its neighbours."""
+"""Factor by which a clipped value occurs more often than its neighbours; at the peaks of a sine, 2.4."""
+BAND = 0.03
+"""Part of the range of a torque that noise of a clipped one stays within."""
+PLATEAUS = 3
+"""Plateaus at least that a noisy clipped torque reaches while its joint moves."""
+MOVES = 0.02
+"""Part of its largest speed from which a joint moves; the torque of one that rests is constant."""
 OFTEN = 0.05
 """Share of rows beyond the limits from which a wrong unit is considered."""
 UNIT_ROWS = 400
@@ -103,15 +109,29 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
         usable = tau[log.usable]
         if not len(usable) or np.ptp(usable) == 0.0:
             continue
-        # An extreme value that the column reaches far more often than its neighbourhood is a limit.
         for extreme in (usable.max(), usable.min()):
-            at = (tau == extreme) & log.usable
-            near = np.abs(usable - extreme) <= 0.01 * np.ptp(usable)
-            runs = [(a, b) for a, b in intervals(at) if b - a >= CLIPPED_RUN]
-            others = (near.sum() - at.sum()) / max(len(np.unique(usable[near])) - 1, 1)
-            if runs and at.sum() > OFTENER * max(others, 1.0) and extreme != 0.0:
-                for a, b in runs:
-                    clipped[a:b, j] = True
+            for first, last in _plateaus(log, j, extreme):
+                clipped[first:last, j] = True
     joints = log.named(clipped.any(axis=0))
     text = f"the torque of {', '.join(joints)} stays at its largest value in"
     return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log
+
+
+def _plateaus(log: Log, j: int, extreme: float) -> Intervals:
+    """Runs of rows in which the torque of a joint is clipped at an extreme value, exactly or up to noise."""
+    tau, moves = log.tau[:, j], np.abs(log.qd[:, j]) > MOVES * np.abs(log.qd[log.usable, j]).max()
+    usable, width = tau[log.usable], BAND * np.ptp(tau[log.usable])
+    if extreme == 0.0:
+        return ()
+    # A value that the column reaches far more often than its neighbourhood is a limit.
+    at = (tau == extreme) & log.usable
+    near = np.abs(usable - extreme) <= width
+    runs = tuple((a, b) for a, b in intervals(at) if b - a >= CLIPPED_RUN)
+    others = (near.sum() - at.sum()) / max(len(np.unique(usable[near])) - 1, 1)
+    if runs and at.sum() > OFTENER * max(others, 1.0):
+        return runs
+    # With noise, a band of values, beside the next one of the same width.
+    band = (np.abs(tau - extreme) <= width) & log.usable & moves
+    beside = (np.abs(tau - extreme) > width) & (np.abs(tau - extreme) <= 2.0 * width) & log.usable & moves
+    runs = tuple((a, b) for a, b in intervals(band) if b - a >= CLIPPED_RUN)
+    return runs if len(runs) >= PLATEAUS and band.sum() > OFTENER * max(beside.sum(), 1) else ()
