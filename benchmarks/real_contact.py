@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from real_cases import existing
 from results_page import table
 from scipy.ndimage import binary_dilation
-from scipy.signal import savgol_filter
+from scipy.signal import savgol_coeffs, savgol_filter
 from torch import Tensor
 
 import forcegp
@@ -40,6 +40,7 @@ from forcegp.data.derivative import cross_validated_window
 from forcegp.errors import DataError
 from forcegp.models.sensed import SENSOR, with_sensed_forces
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.robust import MAD_TO_STD
 
 LOGS = Path(__file__).resolve().parents[2] / "shared" / "real"
 DT, ORDER = 1e-3, 3
@@ -55,8 +56,6 @@ SATURATED = 2.69
 """Torque of the knee from which its drive is saturated [N m]."""
 HAND = 30.0
 """Size of the unknown force on the base while somebody pushes it [N]."""
-SENSOR_STD = 0.1
-"""Resolution of the force sensor [N]."""
 UNKNOWN = 1e4
 """Standard deviation of axes of the sensor that are not used [N]."""
 FLIGHT = 0.5
@@ -143,6 +142,17 @@ def window_of(logs: Path, half: tuple[float, float]) -> int:
     return cross_validated_window(signals, ORDER)
 
 
+def sensor_std(logs: Path, log: str, half: tuple[float, float], window: int) -> float:
+    """Standard deviation of the noise that the filter leaves of the noisiest axis of the sensor [N].
+
+    White noise is told by the departure of each training sample from the cubic through its neighbours.
+    """
+    x = columns(logs / "hopper" / log, (FORCE,))[FORCE][round(half[0] / DT) : round(half[1] / DT)]
+    departure = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
+    white = MAD_TO_STD * np.median(np.abs(departure), axis=0) / (35.0 / 18.0) ** 0.5
+    return float(white.max() * np.linalg.norm(savgol_coeffs(window, ORDER)))
+
+
 def classical(robot: forcegp.RobotModel, data: forcegp.Dataset) -> dict[str, Tensor]:
     """Fore-aft and vertical force of each method without learning, `(n, 2)`."""
     eom = forcegp.ConstrainedSystem(robot).equations(data.q, data.qd)
@@ -184,17 +194,19 @@ def wrench_scores(
     return scores(found.mean, data, rows, found.std)
 
 
-def learned(system: forcegp.ConstrainedSystem, data: forcegp.Dataset, sensor: str = "") -> StructuredFit:
-    """A fit with the defaults, without the force sensor, with it, or with its vertical axis."""
+def learned(
+    system: forcegp.ConstrainedSystem, data: forcegp.Dataset, sensor: str = "", std: float = 0.0
+) -> StructuredFit:
+    """A fit with the defaults, without the force sensor, with it and its noise, or with its vertical axis."""
     if sensor == "sensor":
         free = forcegp.ConstrainedSystem(system.robot)
-        return forcegp.StructuredGP(free, "analytical").fit(with_sensed_forces(data, system, SENSOR_STD))
+        return forcegp.StructuredGP(free, "analytical").fit(with_sensed_forces(data, system, std))
     model = forcegp.StructuredGP(system, "analytical")
     if sensor == "vertical axis":
         closed = data[data.contact["ground"]]
         force = {"F_I": {"ground": closed.contact_extras[SENSOR]["ground"]}}
-        std = torch.tensor([UNKNOWN, UNKNOWN, SENSOR_STD], dtype=torch.float64)
-        sensed = forcegp.Observation(closed.replace(contact_extras=force), "contact_force", noise_std=std)
+        noise = torch.tensor([UNKNOWN, UNKNOWN, std], dtype=torch.float64)
+        sensed = forcegp.Observation(closed.replace(contact_extras=force), "contact_force", noise_std=noise)
         return model.fit([forcegp.Observation(data), sensed])
     return model.fit(data)
 
@@ -208,8 +220,9 @@ def hopping_scores(logs: Path, train: tuple[float, float], test: tuple[float, fl
     result: dict[str, object] = {"window": window}
     for name, force in classical(system.robot, second).items():
         result[name] = scores(force, second, rows)
+    std = sensor_std(logs, "hopping", train, window)
     for name in ("", "sensor", "vertical axis"):
-        result[f"forcegp {name}".strip()] = wrench_scores(learned(system, first, name), second, rows)
+        result[f"forcegp {name}".strip()] = wrench_scores(learned(system, first, name, std), second, rows)
     return result
 
 
@@ -226,7 +239,8 @@ def pushed_scores(logs: Path) -> dict[str, object]:
             result[name] = scores(force, log, rows)
     fit = learned(system, between(data, (FIRST[0], SECOND[1])))
     result["forcegp, learned on hopping"] = wrench_scores(fit, log, rows, hand)
-    fit = learned(system, log[rows & ~later], "sensor")
+    std = sensor_std(logs, "pushed", (0.0, float(log.t[-1]) / 2.0), window)
+    fit = learned(system, log[rows & ~later], "sensor", std)
     result["forcegp sensor, second half"] = wrench_scores(fit, log, later, hand)
     return result
 

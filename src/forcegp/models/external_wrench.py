@@ -194,8 +194,8 @@ class Reading:
         torque = torch.zeros_like(stick) if fit.torque_std is None else fit.torque_std.square() + 0.0 * stick
         noise = torch.stack([torque, stick], dim=-1)
         noise = noise if self.memory is None else noise * self.memory.share
-        # Multipliers of closed contacts are further unknowns.
-        A = at.eom.A * system.active_rows(active, data.q.shape[:-1])[..., None]
+        # Multipliers of closed contacts are further unknowns; rows of open ones are zero.
+        A = at.eom.A
         prior = torch.cat([self.frame.prior.to(data.q), data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])
         J = torch.cat([self.frame.jacobian(system.robot, data.q), A], dim=-2)
         S = S + torch.diag_embed(noise.sum(-1) + beyond)

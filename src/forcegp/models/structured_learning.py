@@ -377,9 +377,20 @@ def learned(
         search = dataclasses.replace(search, recorded=saved.recorded)
     report = reported(progress, search.options.max_evaluations)
     lesson = solve(spec, problem, search, report, begin, neighbours)
+    if TORQUE_NOISE in search.start:
+        lesson = _with_memory(lesson, neighbours)
     if saved is not None:
         saved.write()
     return lesson
+
+
+def _with_memory(lesson: Lesson, neighbours: Training | None) -> Lesson:
+    """The lesson with friction with memory, where the log has free motion."""
+    training = neighbours or lesson.problem.training
+    if training.free_motions < LEAST:
+        return lesson
+    memory = memory_of(lesson.problem, lesson.hyperparameters, training)
+    return dataclasses.replace(lesson, hyperparameters={**lesson.hyperparameters, **memory})
 
 
 def identity(problem: Problem) -> tuple[object, ...]:
@@ -396,7 +407,8 @@ def _key(
     """Identifies the learning of some tensors of a problem, with these options."""
     named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
     sides = [side for scale in problem.training.scales for side in (scale.mean, scale.std)]
-    noise = [x for x in (problem.state_std, problem.torque_std) if x is not None]
+    stated = problem.state_std, problem.torque_std, problem.external_std
+    noise = ["none" if x is None else x for x in stated]
     return (
         *identity(problem), *problem.pinned, *problem.pinned.values(), problem.training.quantities,
         spec.options, spec.noise.degrees_of_freedom, search.options,
@@ -448,8 +460,6 @@ def solve(
         values |= calibrated_noise(part, values)
     if correlated:
         part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
-    if calibrated and (neighbours or problem.training).free_motions >= LEAST:
-        values |= memory_of(part, values, neighbours or problem.training)
     training = dataclasses.replace(problem.training, slopes=part.training.slopes)
     whole = dataclasses.replace(part, training=training, inducing=None)
     whole = prepared(spec, whole, values)
