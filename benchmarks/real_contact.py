@@ -60,6 +60,9 @@ UNKNOWN = 1e4
 """Standard deviation of axes of the sensor that are not used [N]."""
 FLIGHT = 0.5
 """Vertical force below which the sensor shows flight [N], to judge the contact labels."""
+BEFORE, AFTER = 0.15, 0.3
+"""The hop in open loop starts this long before lift-off, and ends this long after landing [s]."""
+BAND, SAMPLES = (0.05, 0.95), 50
 AXES = ("fx", "fz")
 SIGNALS = ("joint_positions", "joint_torques", "ati_force")
 HEIGHT = "height_sensors"
@@ -261,6 +264,40 @@ def contact_labels(logs: Path) -> dict[str, float]:
     }
 
 
+def hop(logs: Path) -> dict[str, object]:
+    """The jump in open loop under the logged torques, learned from the first half, also with the sensor."""
+    window = window_of(logs, FIRST)
+    system, data = hopping(logs, window)
+    air = data.contact_extras[SENSOR]["ground"][:, 2] < FLIGHT
+    air &= (data.t > SECOND[0]) & (data.t < SECOND[1])
+    left, landed = (float(data.t[air][k]) for k in (0, -1))
+    log = between(data, (left - BEFORE, landed + AFTER))
+    lifted = round(BEFORE / DT)
+    result: dict[str, object] = {"measured": jump(log.q[:, 0], lifted, landed - left)}
+    for name in ("", "sensor"):
+        fit = learned(system, between(data, FIRST), name, sensor_std(logs, "hopping", FIRST, window))
+        options = forcegp.RolloutOptions(unilateral=True, on_divergence="keep")
+        path = fit.rollout(
+            log.q[0], log.qd[0], log, DT * (len(log) - 1), SAMPLES, system=system, options=options
+        )
+        assert path.samples is not None
+        flights = [event.t for event in path.events if event.row == 0 and event.t > 0.0]
+        flight = flights[1] - flights[0] if len(flights) > 1 else float("nan")
+        found = jump(path.q[:, 0], round(flights[0] / DT) if flights else lifted, flight)
+        low, high = path.samples.q[..., 0].nanquantile(path.q.new_tensor(BAND), dim=0)
+        height = log.q[: len(path.t), 0]
+        result[f"forcegp {name}".strip()] = found | {
+            "in_band": float(((low <= height) & (height <= high)).double().mean()),
+            "band_at_lift_off_m": float(high[lifted] - low[lifted]),
+        }
+    return result
+
+
+def jump(height: Tensor, lifted: int, flight: float) -> dict[str, float]:
+    """Time in the air, and rise of the base from lift-off to its highest point."""
+    return {"flight_s": flight, "rise_m": float(height.nan_to_num(-1.0).max() - height[lifted])}
+
+
 def draw(logs: Path, file: Path) -> None:
     """The force in the second half of `hopping`, learned without the sensor in the first."""
     import matplotlib.pyplot as plt
@@ -322,6 +359,7 @@ def main() -> None:
             "hopping, first half": hopping_scores(options.logs, SECOND, FIRST),
             "pushed": pushed_scores(options.logs),
             "contact labels": contact_labels(options.logs),
+            "hop": hop(options.logs),
         }
     except DataError as error:
         sys.exit(str(error))
@@ -336,6 +374,7 @@ def main() -> None:
     print(table(head, [row for name, part in result.items() for row in lines(name, part)]))
     print({name: part["window"] for name, part in result.items() if "window" in part})
     print(result["contact labels"])
+    print(result["hop"])
     if options.figure:
         draw(options.logs, options.figure)
     if options.json:

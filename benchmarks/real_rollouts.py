@@ -29,7 +29,7 @@ class Rigid:
     found: LeastSquares
     kind: str = "least squares"
     has_function_samples: bool = False
-    torque_disturbance: Tensor | None = None
+    disturbance: None = None
 
     @property
     def system(self) -> ConstrainedSystem:

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import forcegp
+from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint import AnalyticalMean
+from forcegp.gp.kernels import Linear
 from forcegp.rollout import DivergedError, ForceLaw, RolloutOptions, rollout
 from forcegp.rollout.law import dry_friction_force
 
@@ -219,3 +221,60 @@ def test_a_learned_friction_sticks_as_the_true_one_does(pendulum) -> None:
     assert float((path.q - truth).abs().max()) < 1e-3
     breaks = (path.samples.qd[..., 0] != 0.0).double().argmax(-1).double()
     assert float((breaks - 200.0).abs().max()) < 20.0
+
+
+MASS, MU, GRAVITY = 2.0, 0.4, 9.81
+BLOCK = f"""
+<mujoco><worldbody><body><inertial pos="0 0 0" mass="{MASS}" diaginertia="0.01 0.01 0.01"/>
+  <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+</body></worldbody></mujoco>
+"""
+
+
+@pytest.fixture
+def block(tmp_path: Path) -> forcegp.ConstrainedSystem:
+    """A block that slides along x and z, on a table at z = 0, where it may stick."""
+    path = tmp_path / "block.xml"
+    path.write_text(BLOCK)
+    robot = forcegp.load_robot(path)
+    foot = forcegp.SurfaceContact(
+        "foot", robot.frame_names[-1], (0.0, 0.0, 0.0), forcegp.Plane(offset=0.0), stick_speed=1e-3
+    )
+    return forcegp.ConstrainedSystem(robot, [foot])
+
+
+def test_a_block_slides_where_the_push_leaves_its_friction_cone(block) -> None:
+    """Pushed by 0.95 μ m g it rests, by 1.25 μ m g it slides by ¼ μ g t²/2, and released it stops."""
+    n = 400
+    generator = torch.Generator().manual_seed(0)
+    weight = MASS * GRAVITY
+    qd, push = torch.zeros(2, n, 2, dtype=torch.float64)
+    qd[:, 0] = 0.5 * torch.randn(n, generator=generator, dtype=torch.float64)
+    push[:, 0] = weight * torch.randn(n, generator=generator, dtype=torch.float64)
+    qdd = torch.zeros_like(qd)
+    qdd[:, 0] = push[:, 0] / MASS - MU * GRAVITY * torch.tanh(qd[:, 0] / 1e-9)
+    slides = qd[:, 0].abs() > 0.05
+    log = forcegp.Dataset(
+        t=torch.arange(int(slides.sum()), dtype=torch.float64),
+        q=0.0 * qd[slides],
+        qd=qd[slides],
+        qdd=qdd[slides] + 1e-3 * torch.randn(int(slides.sum()), 2, generator=generator, dtype=torch.float64),
+        tau=push[slides],
+        joint_names=block.robot.joint_names,
+        contact={"foot": torch.ones(int(slides.sum()), dtype=torch.bool)},
+    )
+    prior = SlidingFrictionPrior("foot", Linear(), coupled=True)
+    fit = forcegp.StructuredGP(block, "analytical", force_priors=[prior], noise=1e-3).fit(log)
+    dt, each = 5e-3, 80
+    steps = torch.tensor([[0.95], [1.25], [0.0]], dtype=torch.float64).repeat_interleave(each, dim=0)
+    pushes = torch.cat([steps * MU * weight, torch.zeros_like(steps)], dim=-1)
+    options = RolloutOptions(dt=dt)
+    path = fit.rollout(pair(0, 0), pair(0, 0), pushes, dt * (3 * each - 1), options=options)
+    speeds, speed = path.qd[:, 0], 0.25 * MU * GRAVITY * dt * each
+    assert float(speeds[:each].abs().max()) < 1e-6
+    assert float(path.multiplier[:each, 1].abs().max()) == pytest.approx(0.95 * MU * weight, rel=1e-6)
+    assert float(speeds[2 * each]) == pytest.approx(speed, rel=0.03)
+    # v/(μ g) after the push ends
+    stopped = 2 * each + int((speeds[2 * each :] < 1e-3).double().argmax())
+    assert stopped == pytest.approx(2 * each + speed / (MU * GRAVITY) / dt, abs=2)
+    assert float(speeds[stopped:].abs().max()) < 1e-3

@@ -19,7 +19,7 @@ from forcegp.forces.measurements import COLUMNS
 from forcegp.forces.noise import warnings_beyond
 from forcegp.forces.quantities import ForceField, ForceLinearization, linearize_field
 from forcegp.rollout.forward import rollout_model
-from forcegp.rollout.inputs import Torque
+from forcegp.rollout.inputs import Disturbance, Torque
 from forcegp.rollout.trajectory import Rollout
 
 if TYPE_CHECKING:
@@ -225,9 +225,8 @@ class Predictor(ABC):
         return self.system
 
     @property
-    def torque_disturbance(self) -> Tensor | None:
-        """Root of the spectral density of torque noise `(nq,)` [N m √s], where one was learned with its
-        correlation in time."""
+    def disturbance(self) -> Disturbance | None:
+        """Forces beside the learned ones that disturb rollouts of function samples, `None` for none."""
         return None
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:

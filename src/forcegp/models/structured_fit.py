@@ -45,6 +45,7 @@ from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
+from forcegp.rollout.inputs import Disturbance
 from forcegp.storage.model_file import ModelHeader
 
 KIND = "structured_gp"
@@ -342,14 +343,19 @@ class StructuredFit(FittedModel):
         return self.specification.system
 
     @property
-    def torque_disturbance(self) -> Tensor | None:
-        """s √T of torque noise with standard deviation s that is correlated for a time T, `(nq,)` [N m √s].
+    def disturbance(self) -> Disturbance | None:
+        """s √T of torque noise with standard deviation s that is correlated for a time T, and unknown forces
+        of stated size.
 
-        Over times longer than T it acts like white noise with this root of a spectral density.
+        Over times longer than T the noise acts like white noise with this root of a spectral density.
         """
-        if self.torque_std is None or self.problem.correlation is None:
+        none, density = torch.zeros_like(self.system.robot.mass[:1]).expand(self.system.robot.nq), None
+        if self.torque_std is not None and self.problem.correlation is not None:
+            density = self.torque_std * self.problem.correlation.sqrt()
+        external = self.problem.external_std
+        if density is None and external is None:
             return None
-        return self.torque_std * self.problem.correlation.sqrt()
+        return Disturbance(none if density is None else density, none if external is None else external)
 
     def _noise_covariance(self, z: AffineMap, parts: Mapping[str, slice]) -> Tensor:
         """B Σ_τ Bᵀ + Σ_q̈ of a measurement of the quantities, `(n, d, d)`."""

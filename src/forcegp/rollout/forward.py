@@ -15,7 +15,7 @@ from forcegp.constraints.unilateral import any_row, can_open
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError, check_name
 from forcegp.resources import one_thread
-from forcegp.rollout.inputs import Disturbed, ForwardModel, Torque, inputs_of
+from forcegp.rollout.inputs import Disturbance, Disturbed, ForwardModel, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
 from forcegp.rollout.law import ForceLaw, Law, RolloutProblem, State, law_of
 from forcegp.rollout.trajectory import FIELDS, DivergedError, Rollout
@@ -52,7 +52,8 @@ class RolloutOptions:
         interpolation: of a torque array between its samples, `hold` or `linear`.
         speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
         torque_noise: whether function samples are driven by torques with noise drawn anew for each of them,
-            where the model has learned the noise of logged torques and its correlation in time.
+            where the model has learned the noise of logged torques and its correlation in time, or where
+            the size of an unknown force on a joint is stated (constant over a trajectory).
         sticking: whether dry friction of joints (of the robot file, or of a prior such as
             `JointFrictionPrior`) holds a joint at rest while the net force is within its limit; otherwise it
             is the smooth function of the velocity that models learn, which lets joints creep.
@@ -183,8 +184,8 @@ def rollout_model(
         generator = torch.Generator().manual_seed(seed)
         force = ForceLaw(model.force_samples(samples, generator))
         whole, report = torch.Size((samples, *batch)), share_of(progress, 1, shares)
-        density = model.torque_disturbance if options.torque_noise else None
-        noise = None if density is None else (density, generator)
+        disturbance = model.disturbance if options.torque_noise else None
+        noise = None if disturbance is None else (disturbance, generator)
         given = force, system, start, tau, duration, whole, active, options, report
         sampled = _run(*given, batch=batch, noise=noise)
         rollout = dataclasses.replace(rollout, samples=sampled)
@@ -222,7 +223,7 @@ def _run(
     progress: Progress | None,
     *,
     batch: torch.Size | None = None,
-    noise: tuple[Tensor, torch.Generator] | None = None,
+    noise: tuple[Disturbance, torch.Generator] | None = None,
 ) -> Rollout:
     """Flatten the batch, integrate, and give the result the shape of the whole batch."""
     n, system = whole.numel(), options.stabilized(system)

@@ -53,8 +53,8 @@ class ForwardModel(Protocol):
         ...
 
     @property
-    def torque_disturbance(self) -> Tensor | None:
-        """Root of the spectral density of the logged torques' noise `(nq,)` [N m √s], `None` for none."""
+    def disturbance(self) -> Disturbance | None:
+        """What disturbs the torques of function samples, `None` for nothing."""
         ...
 
     def predict(
@@ -69,6 +69,19 @@ class ForwardModel(Protocol):
     ) -> Any:
         """`mean` and `std` `(*batch, d)` of a quantity at states `(*batch, nq)`; `std` may be `None`."""
         ...
+
+
+class Disturbance(NamedTuple):
+    """Forces beside the learned ones, as function samples meet them.
+
+    Attributes:
+        density: root of the spectral density of the logged torques' noise `(nq,)` [N m √s, N √s].
+        constant: standard deviation of an unknown force on each joint `(nq,)` [N m, N], kept for the whole
+            trajectory, since nothing says how it varies.
+    """
+
+    density: Tensor
+    constant: Tensor
 
 
 class Reached(NamedTuple):
@@ -151,7 +164,7 @@ class Feedback(Inputs):
 
 @dataclass(frozen=True)
 class Disturbed(Inputs):
-    """Inputs with noise `(n, steps, nq)` [N m], each value held for dt [s], as logged torques are noisy."""
+    """Inputs with noise `(n, steps, nq)` [N m], each value held for dt [s]."""
 
     inputs: Inputs
     noise: Tensor
@@ -166,11 +179,14 @@ class Disturbed(Inputs):
 
     @classmethod
     def drawn(
-        cls, inputs: Inputs, density: Tensor, rows: int, steps: int, dt: float, generator: torch.Generator
+        cls, inputs: Inputs, by: Disturbance, rows: int, steps: int, dt: float, generator: torch.Generator
     ) -> Disturbed:
-        """White noise with a root of a spectral density `(nq,)` [N m √s] for each of n trajectories."""
-        unit = torch.randn(rows, steps, len(density), generator=generator, dtype=density.dtype)
-        return cls(inputs, unit.to(density.device) * density / dt**0.5, dt)
+        """White noise and a constant force, drawn for each of n trajectories."""
+        density, constant = by
+        white = torch.randn(rows, steps, len(density), generator=generator, dtype=density.dtype)
+        kept = torch.randn(rows, 1, len(density), generator=generator, dtype=density.dtype)
+        noise = white.to(density.device) * density / dt**0.5 + kept.to(density.device) * constant
+        return cls(inputs, noise, dt)
 
 
 @dataclass(frozen=True)
