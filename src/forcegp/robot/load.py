@@ -45,7 +45,7 @@ class _Placed:
     links: dict[str, tuple[int, np.ndarray]]
 
 
-def _build(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
+def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
     """The robot that a tree describes, in double precision, with pose of the base and gravity as given.
 
     Raises:
@@ -234,16 +234,35 @@ def load_robot(
         "base_position": _vector(base_position, "base_position"),
         "gravity": _vector(gravity, "gravity"),
     }
-    return _build(checked(lock_joints(_read(source), locked_joints or {})), world).to(device, dtype)
+    return robot_of(checked(lock_joints(_read(source), locked_joints or {})), world).to(device, dtype)
+
+
+def robot_path(source: str | Path) -> Path:
+    """The file of a bundled name or a path.
+
+    Raises:
+        UnknownNameError: neither a bundled robot nor a path.
+    """
+    path = Path(source).expanduser()
+    if str(source) in BUNDLED:
+        return Path(__file__).parent / "bundled" / f"{source}.urdf"
+    if not path.suffix and path.name == str(source):
+        raise UnknownNameError("robot", source, (*BUNDLED, "path of a .urdf or .xml file"))
+    return path
 
 
 def _read(source: str | Path) -> Tree:
-    path = Path(source).expanduser()
-    if str(source) in BUNDLED:
-        path = Path(__file__).parent / "bundled" / f"{source}.urdf"
-    elif not path.suffix and path.name == str(source):
-        raise UnknownNameError("robot", source, (*BUNDLED, "path of a .urdf or .xml file"))
-    root = parse_xml(read_bytes(path), str(path))
+    path = robot_path(source)
+    return read_tree(read_bytes(path), path)
+
+
+def read_tree(data: bytes, path: Path) -> Tree:
+    """Links and joints of a URDF or MJCF document; `path` names it, and files that it includes are beside it.
+
+    Raises:
+        RobotFileError: the document is neither, or not valid.
+    """
+    root = parse_xml(data, str(path))
     if root.tag == "robot":
         return read_urdf(root, str(path))
     if root.tag == "mujoco":

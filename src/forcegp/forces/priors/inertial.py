@@ -220,7 +220,7 @@ class PayloadPrior(ForcePrior):
         # Not the measured one: where the arm hardly accelerates, its noise would be taken for a payload.
         eom = at.eom
         if self.known:
-            eom = system.with_robot(self._loaded(system.robot)).equations(at.q, at.qd, at.active)
+            eom = system.with_robot(self.loaded(system.robot)).equations(at.q, at.qd, at.active)
         qdd = eom.acceleration(eom.Q_K + at.tau)
         first = PER_PAYLOAD * self._link(system.robot)
         Y = regressor(system.robot, at.q, at.qd, qdd)[..., first : first + MASS_AND_MOMENT]
@@ -241,8 +241,10 @@ class PayloadPrior(ForcePrior):
         """Mass and first moment for each unit of the latent constants, `(4,)`."""
         return like.new_tensor([self.mass, *3 * [self.mass * self.length]])
 
-    def _loaded(self, robot: RobotModel) -> RobotModel:
-        """The robot with the known payload, a point mass."""
+    def loaded(self, robot: RobotModel) -> RobotModel:
+        """The robot with the known payload, a point mass; as it is if none is known."""
+        if not self.known:
+            return robot
         J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
         point = J.new_tensor([*self.known[1:], self.known[0]])
         J = J.index_add(

@@ -1,0 +1,422 @@
+"""The robot that a fit found, as figures that robot files hold, with samples of it.
+
+Links have the identified inertia. Robot files know joint friction as d q̇ + f sign q̇ only; d and f are those
+nearest to the learned friction Q_D(q̇) over the trained speeds, by least squares with an offset,
+
+    min Σ_v (Q_D(v) + d v + f sign v − c)²,   d, f ≥ 0,
+
+averaged over poses where friction depends on the load. What is left, and the offset c, are losses. URDF has
+no armature a either: a ring of inertia a about the joint's axis takes its place in the link, if that brings
+the mass matrix closer. Samples are the same for functions drawn from the posterior, with inertial parameters
+π + S δ (`forces/priors/inertial.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+from torch import Tensor
+
+from forcegp import dynamics
+from forcegp.errors import ModelError, ParameterError
+from forcegp.files import write_json
+from forcegp.forces.noise import HIGH, LOW
+from forcegp.forces.posterior import ForceSamples
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
+from forcegp.forces.quantities import States, states_at
+from forcegp.models.structured_fit import StructuredFit
+from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia
+from forcegp.robot.model import RobotModel
+from forcegp.robot.write_back import is_mjcf, write_robot
+
+SPEEDS, POSES = 20, 20
+"""Speeds in each direction, and poses, at which friction is read."""
+SLOWEST = 0.05
+"""Least of these speeds, over the largest trained one: below it, dry friction is smooth in the fit."""
+UNTRAINED = 1.0
+"""Largest speed where the fit does not say which it has seen [rad/s, m/s]."""
+DRAWS = 100
+"""Function samples from which standard deviations are taken."""
+DETERMINED = 0.5
+"""A parameter is determined from this fraction of its prior standard deviation, or of its own size, on."""
+SMALLEST = 1e-2
+"""ε, the smallest eigenvalue of a sampled link's pseudo-inertia in units of the estimate."""
+MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+"""The inertial parameters of a link, about its origin [kg, kg m, kg m²]."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One figure of the robot.
+
+    Attributes:
+        element: joint whose figure it is; inertia is that of the link that it moves.
+        name: of the figure.
+        file, estimate, std: SI units.
+        determined: whether the data say more about it than the prior.
+    """
+
+    element: str
+    name: str
+    file: float
+    estimate: float
+    std: float
+    determined: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The robot that a fit found.
+
+    Attributes:
+        robot: with identified inertia, and friction in the form that robot files have.
+        parameters: what changed, beside the file, with standard deviations.
+        speeds, friction, friction_std: `(k, nq)` the learned friction of each joint over its trained speeds
+            [rad/s, m/s], [N m, N].
+        left: `(nq,)` root mean square of the friction that d q̇ + f sign q̇ leaves [N m, N].
+        offset: `(nq,)` constant force beside it [N m, N].
+    """
+
+    robot: RobotModel
+    parameters: tuple[Parameter, ...]
+    speeds: Tensor
+    friction: Tensor
+    friction_std: Tensor
+    left: Tensor
+    offset: Tensor
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """What the robot does not contain of the learned forces, one sentence for each joint."""
+        joints = zip(self.robot.joint_names, self.left.tolist(), self.offset.tolist(), strict=True)
+        return tuple(
+            f"joint {joint!r}: friction beyond d q̇ + f sign q̇ of {left:.3g} (root mean square), and a "
+            f"constant force of {offset:.3g} (N m or N)"
+            for joint, left, offset in joints
+            if max(left, abs(offset)) > 0.0
+        )
+
+
+@torch.no_grad()
+def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Calibration:
+    """The robot with identified inertia, payload, and the part of the friction that robot files can hold.
+
+    Args:
+        fit: around the analytical forces.
+        draws: function samples that standard deviations are taken from.
+        seed: of these samples, and of the poses that friction is averaged over.
+
+    Returns:
+        Robot, parameters with standard deviations, and what is lost.
+
+    Raises:
+        ModelError: the fit has no analytical mean, so its forces are not those beyond the robot file's.
+
+    Example:
+        `write_robot(calibrated(fit).robot, "my.urdf", "calibrated.urdf")`
+    """
+    reader = _Reader.of(fit, seed)
+    mean, *samples = reader.robots(draws)
+    file = fit.specified.robot
+    robot, (curve, left, offset) = mean
+    curves = torch.stack([found for _, (found, _, _) in samples])
+    parameters = _parameters(file, robot, [each for each, _ in samples], reader.scale)
+    return Calibration(robot, parameters, reader.speeds, curve, curves.std(0), left, offset)
+
+
+@torch.no_grad()
+def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[RobotModel]:
+    """Robots drawn from the joint posterior of inertia, drives' links, payload and friction; each is
+    physically consistent.
+
+    A link of a sample that no body could be is replaced by the nearest one (eigenvalues of its pseudo-inertia
+    over the estimate are at least ε = 0.01).
+
+    Args:
+        fit: around the analytical forces.
+        samples: how many.
+        seed: of the draws.
+
+    Raises:
+        ModelError: see `calibrated`.
+        ParameterError: fewer than one sample.
+    """
+    if samples < 1:
+        raise ParameterError("no such number of samples", expected="1 or more", got=samples)
+    return [robot for robot, _ in _Reader.of(fit, seed).robots(samples)[1:]]
+
+
+def write_calibrated(
+    fit: StructuredFit,
+    source: str | Path,
+    out: str | Path,
+    *,
+    samples: int = 0,
+    seed: int = 0,
+    locked_joints: Mapping[str, float] | None = None,
+) -> Calibration:
+    """Write a copy of the robot file with what a fit found, a report beside it, and sampled robots.
+
+    `calibrated.urdf` gets `calibrated.report.json`, with parameters, losses and friction in full, and
+    `calibrated.sample_000.urdf` and so on.
+
+    Args:
+        fit: around the analytical forces.
+        source: the file that the robot was loaded from, or a bundled name.
+        out: the edited copy.
+        samples: number of robots drawn from the posterior.
+        seed: of the draws.
+        locked_joints: as they were given to `load_robot`.
+
+    Raises:
+        RobotFileError: the file does not fit the robot, or cannot take a change.
+        ModelError: see `calibrated`.
+    """
+    found, out = calibrated(fit, seed=seed), Path(out)
+    robots = [found.robot, *(sampled_robots(fit, samples, seed=seed) if samples else [])]
+    has_armature = is_mjcf(source)
+    rings = not has_armature and _rings_help(found.robot)
+    losses: tuple[str, ...] = ()
+    for k, robot in enumerate(robots):
+        path = out.with_name(f"{out.stem}.sample_{k - 1:03d}{out.suffix}") if k else out
+        holding = with_rings(robot) if rings else robot
+        losses = losses or write_robot(holding, source, path, locked_joints=locked_joints).losses
+    if rings:
+        values = ", ".join(f"{x:.4g}" for x in found.robot.armature.tolist())
+        losses = (f"URDF has no armature ({values}): rings in the links have its inertia", *losses)
+    report = {
+        "parameters": [vars(parameter) for parameter in found.parameters],
+        "losses": [*losses, *found.losses],
+        "friction": {
+            joint: {
+                "speed": found.speeds[:, j].tolist(),
+                "force": found.friction[:, j].tolist(),
+                "std": found.friction_std[:, j].tolist(),
+            }
+            for j, joint in enumerate(found.robot.joint_names)
+        },
+    }
+    write_json(out.with_name(f"{out.stem}.report.json"), report)
+    return found
+
+
+Curve = tuple[Tensor, Tensor, Tensor]
+"""Friction over speeds `(k, nq)`, what d q̇ + f sign q̇ leaves of it, and the offset `(nq,)`."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Reader:
+    """Reads robots off the posterior of a fit.
+
+    Attributes:
+        fit: what is read.
+        speeds: `(k, nq)`.
+        at: the states of all poses at these speeds.
+        seed: of the draws.
+    """
+
+    fit: StructuredFit
+    speeds: Tensor
+    at: States
+    seed: int
+
+    @classmethod
+    def of(cls, fit: StructuredFit, seed: int) -> _Reader:
+        mean = fit.problem.mean
+        if not isinstance(mean, AnalyticalMean) or "actuation" not in mean.terms:
+            raise ModelError(
+                "the forces of this fit are not those that the robot file lacks",
+                expected='a model with mean="analytical"',
+                hint='fit StructuredGP(system, "analytical")',
+            )
+        robot, values = fit.system.robot, fit.hyperparameters
+        fastest = torch.full_like(robot.mass, UNTRAINED)
+        if LOW in values:
+            fastest = torch.maximum(-values[LOW][0], values[HIGH][0]).clamp(min=1e-6)
+        up = torch.linspace(SLOWEST, 1.0, SPEEDS, dtype=robot.dtype, device=robot.device)
+        speeds = torch.cat([-up.flip(0), up])[:, None] * fastest
+        low, high = (x.clamp(-np.pi, np.pi) for x in (robot.lower, robot.upper))
+        share = torch.rand(
+            POSES, 1, robot.nq, generator=torch.Generator().manual_seed(seed), dtype=robot.dtype
+        )
+        q = (low + share.to(robot.device) * (high - low)).expand(-1, len(speeds), -1).flatten(0, 1)
+        qd = speeds.expand(POSES, -1, -1).flatten(0, 1)
+        open_ = torch.zeros(len(q), len(fit.system.contacts), dtype=torch.bool, device=robot.device)
+        at, _ = states_at(fit.system, q, qd, torch.zeros_like(q), open_)
+        return cls(fit, speeds, at, seed)
+
+    @property
+    def scale(self) -> Tensor | None:
+        """Prior standard deviation of the inertial parameters `(nq, 10)`; `None` where they were kept."""
+        for prior in self.fit.force_priors:
+            if isinstance(prior, InertialPrior):
+                return prior.scale(self.fit.system.robot).reshape(-1, len(MOMENTS))
+        return None
+
+    def robots(self, draws: int) -> list[tuple[RobotModel, Curve]]:
+        """The robot of the posterior mean, and of function samples, each with its friction."""
+        drawn = self.fit.force_samples(draws, torch.Generator().manual_seed(self.seed))
+        assert isinstance(drawn, ForceSamples)
+        mean, *curves = self._curves(drawn)
+        inertias, loads = self._constants(drawn, InertialPrior), self._constants(drawn, PayloadPrior)
+        found = [self._robot(mean, None, self._payload())]
+        for k, curve in enumerate(curves):
+            found.append(
+                self._robot(
+                    curve, None if inertias is None else inertias[k], None if loads is None else loads[k]
+                )
+            )
+        return found
+
+    def _curves(self, drawn: ForceSamples) -> Iterator[Tensor]:
+        """The friction Q_D over speeds `(k, nq)` of the posterior mean and of samples, mean over poses."""
+        fit, at = self.fit, self.at
+        priors = [p for p, prior in enumerate(fit.force_priors) if isinstance(prior, JointFrictionPrior)]
+        known = dynamics.damping_force(fit.system.robot, at.qd)
+        yield self._over_poses(known + fit.posterior.unknown_force(fit.system, at, priors))
+        for k in range(drawn.count):
+            force = torch.zeros_like(at.q)
+            which = torch.full((len(at.q),), k, device=at.q.device)
+            for p in priors:
+                features = fit.posterior.process.features(p, fit.system, at)
+                latent = drawn.functions.latent(p, features, which) + fit.posterior.shift(p, features)
+                force = force + (fit.force_priors[p].operator(fit.system, at) @ latent[..., None])[..., 0]
+            yield self._over_poses(known + force)
+
+    def _over_poses(self, force: Tensor) -> Tensor:
+        return force.unflatten(0, (POSES, len(self.speeds))).mean(0)
+
+    def _constants(self, drawn: ForceSamples, kind: type) -> Tensor | None:
+        """Samples of the constants of the first prior of a kind `(samples, components)`."""
+        for p, prior in enumerate(self.fit.force_priors):
+            if isinstance(prior, kind):
+                one = {name: x[:1] for name, x in self._features(p).items()}
+                values = drawn.functions.latent(p, one, None)[:, 0]
+                return values + self.fit.posterior.shift(p, one)
+        return None
+
+    def _features(self, p: int) -> dict[str, Tensor]:
+        return self.fit.posterior.process.features(p, self.fit.system, self.at)
+
+    def _payload(self) -> Tensor | None:
+        """Posterior mean of the constants of a payload."""
+        for p, prior in enumerate(self.fit.force_priors):
+            if isinstance(prior, PayloadPrior):
+                return self.fit.posterior.means.latent_mean(
+                    p, {k: x[:1] for k, x in self._features(p).items()}
+                )[0]
+        return None
+
+    def _robot(self, curve: Tensor, delta: Tensor | None, load: Tensor | None) -> tuple[RobotModel, Curve]:
+        """The robot with a friction curve, a deviation δ of its inertial parameters and a payload."""
+        robot = self.fit.system.robot
+        damping, friction, left, offset = _projected(self.speeds, curve)
+        robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction)
+        if delta is not None and self.scale is not None:
+            robot = _moved(robot, delta.reshape(self.scale.shape) * self.scale)
+        prior = next((p for p in self.fit.force_priors if isinstance(p, PayloadPrior)), None)
+        if load is not None and prior is not None:
+            robot = prior.around(load).loaded(robot)
+        return robot, (curve, left, offset)
+
+
+def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Damping d, dry friction f, what they leave, and the offset c of each joint, `(nq,)`."""
+    found: list[NDArray[np.float64]] = []
+    for v, force in zip(speeds.T.cpu().numpy(), curve.T.cpu().numpy(), strict=True):
+        # −Q_D = d v + f sign v − c
+        X = np.stack([v, np.sign(v), -np.ones_like(v)], axis=1)
+        fitted = lsq_linear(X, -force, bounds=([0.0, 0.0, -np.inf], np.inf))
+        found.append(np.array([*fitted.x[:2], np.sqrt(np.mean(fitted.fun**2)), fitted.x[2]]))
+    damping, friction, left, offset = torch.from_numpy(np.stack(found, axis=1)).to(curve)
+    return damping, friction, left, offset
+
+
+def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
+    """The robot with inertial parameters π + change `(nq, 10)`, or the nearest that some body has.
+
+    J = J₀^½ V max(w, ε) Vᵀ J₀^½ with the eigenvalues w of J₀^-½ (J₀ + ΔJ) J₀^-½; a link that no body could be
+    stays as it is.
+    """
+    pi = inertial_parameters(robot.mass, robot.com, robot.inertia)
+    J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
+    values, vectors = torch.linalg.eigh(J)
+    sound = values[:, 0] > 0.0
+    values = torch.where(sound[:, None], values, 1.0)
+    root = vectors @ torch.diag_embed(values.sqrt()) @ vectors.mT
+    inverse = vectors @ torch.diag_embed(values.rsqrt()) @ vectors.mT
+    w, V = torch.linalg.eigh(inverse @ (J + _pseudo(pi + change) - _pseudo(pi)) @ inverse)
+    moved = root @ V @ torch.diag_embed(w.clamp(min=SMALLEST)) @ V.mT @ root
+    mass, com, inertia = from_pseudo_inertia(torch.where(sound[:, None, None], moved, J))
+    kept = sound[:, None]
+    return robot.replace(
+        mass=torch.where(sound, mass, robot.mass),
+        com=torch.where(kept, com, robot.com),
+        inertia=torch.where(kept[..., None], inertia, robot.inertia),
+    )
+
+
+def _pseudo(pi: Tensor) -> Tensor:
+    """J of inertial parameters `(nq, 10)`, linear in them: Σ = ½ tr(I_o) 1 − I_o."""
+    I = pi[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].unflatten(-1, (3, 3))
+    Sigma = 0.5 * I.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * torch.eye(3).to(I) - I
+    top = torch.cat([Sigma, pi[:, 1:4, None]], dim=-1)
+    return torch.cat([top, torch.cat([pi[:, None, 1:4], pi[:, None, :1]], dim=-1)], dim=-2)
+
+
+def with_rings(robot: RobotModel) -> RobotModel:
+    """The robot with a ring about each revolute axis in the link, in place of the armature of its joint.
+
+    Its inertia is a about the axis and a/2 across it, the least that a body without mass can have.
+    """
+    along = robot.axis[:, :, None] * robot.axis[:, None, :]
+    eye = torch.eye(3, dtype=robot.dtype, device=robot.device)
+    ring = robot.armature[:, None, None] * robot.revolute[:, None, None] * 0.5 * (eye + along)
+    armature = robot.armature * (1.0 - robot.revolute)
+    return robot.replace(inertia=robot.inertia + ring, armature=armature)
+
+
+def _rings_help(robot: RobotModel) -> bool:
+    """Whether the diagonal of the mass matrix is closer to that with armature than without anything."""
+    share = torch.rand(POSES, robot.nq, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q = (2.0 * torch.pi * share.to(robot.mass)).contiguous()
+    exact, rings, nothing = (
+        dynamics.mass_matrix(each, q).diagonal(dim1=-2, dim2=-1).log()
+        for each in (robot, with_rings(robot), robot.replace(armature=0.0 * robot.armature))
+    )
+    return bool((rings - exact).square().mean() < (nothing - exact).square().mean())
+
+
+def _parameters(
+    file: RobotModel, robot: RobotModel, samples: list[RobotModel], scale: Tensor | None
+) -> tuple[Parameter, ...]:
+    """All figures that the fit may change, with standard deviations over samples."""
+
+    def links(each: RobotModel) -> Tensor:
+        return inertial_parameters(each.mass, each.com, each.inertia)
+
+    of: dict[str, Callable[[RobotModel], Tensor]] = {
+        "damping": lambda each: each.damping,
+        "friction": lambda each: each.friction,
+        "armature": lambda each: each.armature,
+    }
+    of |= {name: lambda each, k=k: links(each)[:, k] for k, name in enumerate(MOMENTS)}
+    found = []
+    for name, value in of.items():
+        before, after = value(file), value(robot)
+        std = torch.stack([value(each) for each in samples]).std(0)
+        prior = after.abs()
+        if name in MOMENTS and scale is not None:
+            prior = scale[:, MOMENTS.index(name)]
+        determined = (std > 0.0) & (std <= DETERMINED * prior)
+        columns = (x.tolist() for x in (before, after, std, determined))
+        rows = zip(robot.joint_names, *columns, strict=True)
+        found += [Parameter(joint, name, *row) for joint, *row in rows]
+    return tuple(found)

@@ -1,0 +1,146 @@
+"""XML documents edited in place: attributes and elements change, and every other byte stays.
+
+Writers of XML drop comments, the order of attributes or the indentation. Here the positions of start tags and
+of attribute values in the text are found, and only these spans are replaced.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+from forcegp.errors import RobotFileError
+from forcegp.robot.safety import parse_xml
+
+_ATTRIBUTE = re.compile(rb"""\s+([^\s=/>"']+)\s*=\s*("[^"]*"|'[^']*')""")
+_TAG_NAME = re.compile(rb"<[^\s/>]+")
+
+
+@dataclass(eq=False)
+class Span:
+    """An element of the text.
+
+    Attributes:
+        tag: its name.
+        attributes: values by name.
+        values: start and end of each value with its quotes, and of the whole attribute with the space
+            before it.
+        head: end of the name in the start tag; `close`: end of the start tag.
+        empty: whether it is `<tag/>`.
+        indent: white space at the start of the line.
+        children: in order.
+    """
+
+    tag: str
+    attributes: dict[str, str]
+    values: dict[str, tuple[int, int, int]]
+    head: int
+    close: int
+    empty: bool
+    indent: bytes
+    children: list[Span] = field(default_factory=list)
+
+    def find(self, tag: str) -> Span | None:
+        """The first child with a tag."""
+        return next((child for child in self.children if child.tag == tag), None)
+
+    def iter(self) -> Iterator[Span]:
+        """The element and all below, in the order of the document."""
+        yield self
+        for child in self.children:
+            yield from child.iter()
+
+
+class EditableXml:
+    """An XML document whose attributes can be changed in place.
+
+    Args:
+        data: the document.
+        label: names the file in messages.
+
+    Raises:
+        RobotFileError: the document is not well-formed UTF-8, or is hostile (`safety.parse_xml`).
+
+    Example:
+        >>> document = EditableXml(b"<robot> <!-- mine --> <mass value='1'/></robot>", "my.urdf")
+        >>> document.set(document.root.children[0], "value", "2")
+        >>> document.written()
+        b'<robot> <!-- mine --> <mass value="2"/></robot>'
+    """
+
+    def __init__(self, data: bytes, label: str) -> None:
+        parse_xml(data, label)
+        try:
+            data.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise RobotFileError(
+                f"{label}: cannot be edited in place", expected="UTF-8 text", got=str(error)
+            ) from error
+        self._data, self._edits, open_ = data, list[tuple[int, int, bytes]](), list[Span]()
+        roots: list[Span] = []
+        parser = expat.ParserCreate("utf-8")
+
+        def start(tag: str, attributes: dict[str, str]) -> None:
+            element = self._span(tag, attributes, parser.CurrentByteIndex)
+            (open_[-1].children if open_ else roots).append(element)
+            open_.append(element)
+
+        parser.StartElementHandler = start
+        parser.EndElementHandler = lambda _: open_.pop()
+        parser.Parse(data, True)
+        (self.root,) = roots
+
+    def _span(self, tag: str, attributes: dict[str, str], at: int) -> Span:
+        name = _TAG_NAME.match(self._data, at)
+        assert name is not None
+        values, end = {}, name.end()
+        while (found := _ATTRIBUTE.match(self._data, end)) is not None:
+            values[found[1].decode()] = (found.start(2), found.end(2), found.start())
+            end = found.end()
+        close = self._data.index(b">", end) + 1
+        line = self._data[self._data.rfind(b"\n", 0, at) + 1 : at]
+        indent = line if not line.strip() else b""
+        return Span(
+            tag, attributes, values, name.end(), close, self._data[close - 2 : close] == b"/>", indent
+        )
+
+    def set(self, element: Span, name: str, text: str) -> None:
+        """Give an attribute a value; one that the element lacks is added after the others."""
+        quoted = quoteattr(text).encode()
+        if name in element.values:
+            first, last, _ = element.values[name]
+            self._edits.append((first, last, quoted))
+        else:
+            ends = [last for _, last, _ in element.values.values()]
+            at = max(ends, default=element.head)
+            self._edits.append((at, at, b" " + name.encode() + b"=" + quoted))
+
+    def drop(self, element: Span, name: str) -> None:
+        """Take an attribute away."""
+        if name in element.values:
+            _, last, before = element.values[name]
+            self._edits.append((before, last, b""))
+
+    def add_child(self, element: Span, tag: str, attributes: dict[str, str], inside: str = "") -> None:
+        """Insert an element as the first child; `inside` is its own content, empty tags."""
+        text = "".join(f" {name}={quoteattr(value)}" for name, value in attributes.items())
+        child = f"<{tag}{text}>{inside}</{tag}>" if inside else f"<{tag}{text}/>"
+        step = element.children[0].indent if element.children else element.indent + b"  "
+        newline = b"\r\n" if b"\r\n" in self._data else b"\n"
+        added = newline + step + child.encode()
+        if element.empty:
+            closing = added + newline + element.indent + f"</{element.tag}>".encode()
+            self._edits.append((element.close - 2, element.close, b">" + closing))
+        else:
+            self._edits.append((element.close, element.close, added))
+
+    def written(self) -> bytes:
+        """The document with all changes."""
+        parts, at = [], 0
+        for first, last, text in sorted(self._edits, key=lambda edit: edit[:2]):
+            parts += [self._data[at:first], text]
+            at = last
+        return b"".join([*parts, self._data[at:]])

@@ -1,0 +1,387 @@
+"""A robot's figures written back into the URDF or MJCF file that it came from.
+
+Only attributes of what changed are edited (`edit_xml.py`); meshes, comments, order and formatting stay. A
+link of the robot may be several links of the file, fixed to each other. The heaviest of them that stays
+physically consistent takes the whole change J − J₀ of the pseudo-inertia; where none does, each changes by
+J_k ← E J_k Eᵀ with the E that gives E J₀ Eᵀ = J. The text is read back and compared before it is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from forcegp.errors import RobotFileError
+from forcegp.files import atomic_file
+from forcegp.robot.edit_xml import EditableXml, Span
+from forcegp.robot.inertia import from_pseudo_inertia, pseudo_inertia
+from forcegp.robot.load import read_tree, robot_of, robot_path
+from forcegp.robot.model import RobotModel
+from forcegp.robot.safety import parse_xml, read_bytes
+from forcegp.robot.tree import (
+    Inertial,
+    Tree,
+    checked,
+    inertia_doubt,
+    inertia_error,
+    lock_joints,
+    transform,
+)
+
+CHANGED = 1e-6
+"""Relative change of a figure below which the file keeps its own text."""
+SAME = 1e-6
+"""Relative difference that the text of a written file may leave."""
+ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
+"""Orientations of an inertial frame that MJCF has beside a quaternion."""
+
+
+class Change(NamedTuple):
+    """A figure of the file that changed.
+
+    Attributes:
+        element: link or joint.
+        figure: attribute, such as `mass` or `damping`.
+        before, after: values in SI units.
+    """
+
+    element: str
+    figure: str
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class WrittenRobot:
+    """What was written.
+
+    Attributes:
+        changes: figures that changed.
+        losses: figures of the robot that the format has no place for, one sentence each.
+    """
+
+    changes: tuple[Change, ...]
+    losses: tuple[str, ...]
+
+
+def write_robot(
+    robot: RobotModel,
+    source: str | Path,
+    out: str | Path,
+    *,
+    locked_joints: Mapping[str, float] | None = None,
+) -> WrittenRobot:
+    """Write masses, inertias, damping, friction and armature of a robot into a copy of its file.
+
+    Args:
+        robot: with the figures to write; links and joints are those of the file.
+        source: URDF or MJCF file that the robot was loaded from, or a bundled name.
+        out: where the edited copy goes; it may be `source` itself.
+        locked_joints: as they were given to `load_robot`.
+
+    Returns:
+        What changed, and what the format cannot hold.
+
+    Raises:
+        RobotFileError: the joints are not those of the file, an element to change lies in an included file,
+            no link of the file can take a change, or the written file would not give the robot.
+
+    Example:
+        >>> import tempfile, forcegp
+        >>> robot = forcegp.load_robot("double_pendulum")
+        >>> heavier = robot.replace(mass=1.1 * robot.mass)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     written = write_robot(heavier, "double_pendulum", f"{folder}/heavier.urdf")
+        >>> {change.figure for change in written.changes} >= {"mass"}
+        True
+    """
+    path, robot = robot_path(source), robot.to("cpu", torch.float64)
+    data, locked = read_bytes(path), locked_joints or {}
+    tree = checked(lock_joints(read_tree(data, path), locked))
+    file = robot_of(tree, _world(robot))
+    if file.joint_names != robot.joint_names:
+        raise RobotFileError(
+            f"{path}: the joints are not those of the robot",
+            expected=", ".join(robot.joint_names),
+            got=", ".join(file.joint_names),
+            hint="give the file that the robot was loaded from, with the same locked_joints",
+        )
+    document = EditableXml(data, str(path))
+    writer = (_Urdf if document.root.tag == "robot" else _Mjcf)(document, str(path))
+    changes = [*_joint_changes(writer, robot, file), *_link_changes(writer, tree, robot, file)]
+    written = document.written()
+    losses = _losses(robot, writer.figures)
+    _check(robot, robot_of(checked(lock_joints(read_tree(written, path), locked)), _world(robot)), writer)
+    with atomic_file(out) as temporary:
+        temporary.write_bytes(written)
+    return WrittenRobot(tuple(changes), losses)
+
+
+def is_mjcf(source: str | Path) -> bool:
+    """Whether a robot file is MJCF, whose joints have an armature; otherwise it is URDF."""
+    path = robot_path(source)
+    return parse_xml(read_bytes(path), str(path)).tag == "mujoco"
+
+
+def _world(robot: RobotModel) -> dict[str, np.ndarray]:
+    return {name: getattr(robot, name).numpy() for name in ("base_rotation", "base_position", "gravity")}
+
+
+def _joint_changes(writer: _Urdf | _Mjcf, robot: RobotModel, file: RobotModel) -> list[Change]:
+    """Write the figures of joints that changed."""
+    changes = []
+    for i, joint in enumerate(robot.joint_names):
+        values = {}
+        for figure, attribute in writer.figures.items():
+            before, after = float(getattr(file, figure)[i]), float(getattr(robot, figure)[i])
+            if abs(after - before) > CHANGED * abs(before):
+                values[attribute] = _text(after)
+                changes.append(Change(joint, figure, before, after))
+        if values:
+            writer.set_joint(joint, values)
+    return changes
+
+
+def _link_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: RobotModel) -> list[Change]:
+    """Write the inertia of links that changed."""
+    old = {link.name: link.inertial for link in tree.links}
+    J_old = pseudo_inertia(file.mass, file.com, file.inertia)
+    J_new = pseudo_inertia(robot.mass, robot.com, robot.inertia)
+    changes: list[Change] = []
+    for i, joint in enumerate(robot.joint_names):
+        if bool(((J_new[i] - J_old[i]).abs() <= CHANGED * J_old[i].diagonal().abs().sum()).all()):
+            continue
+        for name, body in _shared(_parts(file, i, old), J_old[i], J_new[i], joint).items():
+            writer.set_inertial(name, body)
+            changes += _listed(name, old[name] or NOTHING, body)
+    return changes
+
+
+NOTHING = Inertial(0.0, np.zeros(3), np.zeros((3, 3)))
+"""The inertia of a link that has none."""
+_MOMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
+_PLACES = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
+
+
+def _listed(name: str, old: Inertial, new: Inertial) -> list[Change]:
+    """The ten parameters of a link before and after."""
+    changes = [Change(name, "mass", old.mass, new.mass)]
+    for axis, before, after in zip("xyz", old.com, new.com, strict=True):
+        changes.append(Change(name, f"com {axis}", float(before), float(after)))
+    for axes, row, column in zip(_MOMENTS, *_PLACES, strict=True):
+        before, after = (float(x.inertia[row, column]) for x in (old, new))
+        changes.append(Change(name, f"inertia {axes}", before, after))
+    return changes
+
+
+class _Part(NamedTuple):
+    """A link of the file that is fixed to a link of the robot.
+
+    Attributes:
+        name: of the link.
+        pose: T `(4, 4)` of its frame in the link of the robot.
+        J: its pseudo-inertia `(4, 4)` there.
+        sound: whether some body has its figures.
+    """
+
+    name: str
+    pose: Tensor
+    J: Tensor
+    sound: bool
+
+
+def _parts(file: RobotModel, i: int, old: Mapping[str, Inertial | None]) -> list[_Part]:
+    """The links of the file that make up link i, the heaviest first."""
+    frames = zip(file.frame_names, file.frame_parents, file.frame_rotation, file.frame_position, strict=True)
+    parts = []
+    for name, parent, R, p in frames:
+        if parent == i and name in old:
+            body = old[name] or NOTHING
+            pose = torch.from_numpy(transform(R.numpy(), p.numpy()))
+            own = [torch.as_tensor(x, dtype=pose.dtype) for x in (body.mass, body.com, body.inertia)]
+            # J = T J_own Tᵀ
+            J = pose @ pseudo_inertia(*own) @ pose.mT
+            parts.append(_Part(name, pose, J, not (inertia_error(body) or inertia_doubt(body))))
+    return sorted(parts, key=lambda part: -float(part.J[3, 3]))
+
+
+def _shared(parts: list[_Part], J_old: Tensor, J_new: Tensor, joint: str) -> dict[str, Inertial]:
+    """New inertia of links that are fixed to each other, of which one takes the change, or all a share."""
+    for part in parts:
+        body = _body(part.pose, part.J + J_new - J_old)
+        if body is not None and not inertia_error(body) and not (part.sound and inertia_doubt(body)):
+            return {part.name: body}
+    values, vectors = torch.linalg.eigh(J_old)
+    if float(values[0]) > 0.0:
+        # E = J₀^-½ (J₀^½ J J₀^½)^½ J₀^-½, so that E J₀ Eᵀ = J, and E J_k Eᵀ > 0 with J_k
+        root = vectors @ torch.diag(values.sqrt()) @ vectors.mT
+        inverse = vectors @ torch.diag(values.rsqrt()) @ vectors.mT
+        inner, axes = torch.linalg.eigh(root @ J_new @ root)
+        E = inverse @ axes @ torch.diag(inner.clamp(min=0.0).sqrt()) @ axes.mT @ inverse
+        bodies = {part.name: _body(part.pose, E @ part.J @ E.mT) for part in parts if part.J.any()}
+        if all(body is not None and not inertia_error(body) for body in bodies.values()):
+            return {name: body for name, body in bodies.items() if body is not None}
+    raise RobotFileError(
+        f"no link of the file can take the change of inertia beyond joint {joint!r}",
+        expected="links that stay physically consistent",
+        got=", ".join(part.name for part in parts) or "no link with a name",
+        hint="correct the <inertial> of these links, which no body has",
+    )
+
+
+def _body(pose: Tensor, J: Tensor) -> Inertial | None:
+    """Mass, centre of mass and inertia in the axes of a link; `None` without mass."""
+    back = torch.linalg.inv(pose)
+    if float(J[3, 3]) <= 0.0:
+        return None
+    mass, com, inertia = from_pseudo_inertia(back @ J @ back.mT)
+    return Inertial(float(mass), com.numpy(), inertia.numpy())
+
+
+def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
+    """What the format has no place for."""
+    losses = []
+    for figure in ("damping", "friction", "stribeck", "armature"):
+        values = getattr(robot, figure)
+        if figure not in figures and bool((values != 0.0).any()):
+            listed = ", ".join(f"{x:.4g}" for x in values.tolist())
+            losses.append(f"the format has no place for {figure} ({listed})")
+    return tuple(losses)
+
+
+def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
+    """Compare a robot with what the written text gives.
+
+    Raises:
+        RobotFileError: they differ.
+    """
+    for figure in ("mass", "com", "inertia", *writer.figures):
+        wanted, got = getattr(robot, figure), getattr(read, figure)
+        error = (wanted - got).abs().flatten(1).amax(-1) if wanted.ndim > 1 else (wanted - got).abs()
+        size = wanted.abs().flatten(1).amax(-1) if wanted.ndim > 1 else wanted.abs()
+        floor = {"com": 1e-2, "mass": 1e-6, "inertia": 1e-7}.get(figure, 0.0)
+        wrong = (error > 10.0 * SAME * (size + floor)).nonzero()[:, 0].tolist()
+        if wrong:
+            raise RobotFileError(
+                f"{writer.label}: the file would not give joint {robot.joint_names[wrong[0]]!r} its {figure}",
+                expected=wanted[wrong[0]].tolist(),
+                got=got[wrong[0]].tolist(),
+                hint="<compiler> settings such as boundmass, inertiafromgeom or settotalmass change figures",
+            )
+
+
+def _text(values: float | np.ndarray) -> str:
+    return " ".join(f"{x:.12g}" for x in np.atleast_1d(values).tolist())
+
+
+class _Urdf:
+    """Attributes of a URDF document."""
+
+    figures: ClassVar = {"damping": "damping", "friction": "friction"}
+
+    def __init__(self, document: EditableXml, label: str) -> None:
+        self.document, self.label = document, label
+        self._named = {(e.tag, e.attributes.get("name")): e for e in document.root.children}
+
+    def set_joint(self, joint: str, values: dict[str, str]) -> None:
+        element = self._named["joint", joint]
+        dynamics = element.find("dynamics")
+        if dynamics is None:
+            self.document.add_child(element, "dynamics", values)
+            return
+        for name, text in values.items():
+            self.document.set(dynamics, name, text)
+
+    def set_inertial(self, link: str, body: Inertial) -> None:
+        element = self._named["link", link]
+        inertial = element.find("inertial")
+        if inertial is None:
+            inside = f'<origin xyz="{_text(body.com)}"/><mass value="{_text(body.mass)}"/><inertia'
+            inside += "".join(f' {name}="{_text(x)}"' for name, x in _urdf_moments(body.inertia)) + "/>"
+            self.document.add_child(element, "inertial", {}, inside)
+            return
+        origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
+        assert mass is not None and inertia is not None
+        R = np.eye(3)
+        if origin is None:
+            self.document.add_child(inertial, "origin", {"xyz": _text(body.com)})
+        else:
+            rpy = [float(x) for x in origin.attributes.get("rpy", "0 0 0").split()]
+            R = Rotation.from_euler("xyz", rpy).as_matrix()
+            self.document.set(origin, "xyz", _text(body.com))
+        self.document.set(mass, "value", _text(body.mass))
+        for name, value in _urdf_moments(R.T @ body.inertia @ R):
+            self.document.set(inertia, name, _text(value))
+
+
+def _urdf_moments(inertia: np.ndarray) -> list[tuple[str, float]]:
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    return list(zip(names, inertia[_PLACES].tolist(), strict=True))
+
+
+class _Mjcf:
+    """Attributes of an MJCF document."""
+
+    figures: ClassVar = {"damping": "damping", "friction": "frictionloss", "armature": "armature"}
+
+    def __init__(self, document: EditableXml, label: str) -> None:
+        self.document, self.label = document, label
+        world = document.root.find("worldbody")
+        bodies = [e for e in world.iter() if e.tag == "body"] if world else []
+        joints = [joint for body in bodies for joint in body.children if joint.tag == "joint"]
+        # MuJoCo numbers the world as body 0, and joints in the order of the document.
+        self._bodies = {body.attributes.get("name", f"body_{i + 1}"): body for i, body in enumerate(bodies)}
+        self._joints = {joint.attributes.get("name", f"joint_{i}"): joint for i, joint in enumerate(joints)}
+
+    def _element(self, kind: str, name: str, among: Mapping[str, Span]) -> Span:
+        if name not in among:
+            raise RobotFileError(
+                f"{self.label}: the {kind} {name!r} does not stand in this file",
+                expected=f"one of {', '.join(among) or 'none'}",
+                hint="write to the file that it is included from, or expand the includes first",
+            )
+        return among[name]
+
+    def set_joint(self, joint: str, values: dict[str, str]) -> None:
+        element = self._element("joint", joint, self._joints)
+        for name, text in values.items():
+            self.document.set(element, name, text)
+
+    def set_inertial(self, link: str, body: Inertial) -> None:
+        element = self._element("body", link, self._bodies)
+        inertial, edit = element.find("inertial"), self.document
+        full = _text(body.inertia[_PLACES])
+        if inertial is None:
+            values = {"pos": _text(body.com), "mass": _text(body.mass), "fullinertia": full}
+            edit.add_child(element, "inertial", values)
+            return
+        edit.set(inertial, "pos", _text(body.com))
+        edit.set(inertial, "mass", _text(body.mass))
+        turned = {"quat", *ORIENTATIONS} & inertial.attributes.keys()
+        if "fullinertia" in inertial.attributes:
+            edit.set(inertial, "fullinertia", full)
+        elif not turned:
+            edit.drop(inertial, "diaginertia")
+            edit.set(inertial, "fullinertia", full)
+        else:
+            moments, axes = _principal(body.inertia)
+            for name in turned & set(ORIENTATIONS):
+                edit.drop(inertial, name)
+            edit.set(inertial, "quat", _text(np.roll(Rotation.from_matrix(axes).as_quat(), 1)))
+            edit.set(inertial, "diaginertia", _text(moments))
+
+
+def _principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Principal moments and axes of an inertia, a right-handed frame."""
+    moments, axes = np.linalg.eigh(inertia)
+    moments, axes = moments[::-1], axes[:, ::-1]
+    if np.linalg.det(axes) < 0.0:
+        axes = axes * np.array([1.0, 1.0, -1.0])
+    return moments, axes

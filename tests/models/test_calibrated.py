@@ -1,0 +1,147 @@
+"""What a fit found as figures of a robot file, beside the robot that made the log."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import forcegp
+from forcegp.dynamics import inverse_dynamics, mass_matrix
+from forcegp.errors import ModelError, ParameterError
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.models.calibrated import calibrated, sampled_robots, with_rings, write_calibrated
+from forcegp.models.structured_fit import StructuredFit
+from forcegp.robot.inertia import pseudo_inertia
+
+DAMPING, DRY = (0.3, 0.1), (1.0, 0.4)
+NOISE = 0.05
+"""Standard deviation of the torque [N m]."""
+
+
+def log_of(robot: forcegp.RobotModel, n: int, seed: int) -> forcegp.Dataset:
+    """A log of sines, whose torques have friction that the file lacks, and noise."""
+    generator = torch.Generator().manual_seed(seed)
+    t = 0.02 * torch.arange(n, dtype=torch.float64)
+    rate = 2.0 * torch.pi * (0.1 + torch.rand(4, robot.nq, generator=generator, dtype=torch.float64))
+    angle = rate * t[:, None, None] + 6.0 * torch.rand(4, robot.nq, generator=generator, dtype=torch.float64)
+    size = 0.6 / rate
+    q, qd, qdd = (
+        (size * torch.sin(angle)).sum(1),
+        (size * rate * torch.cos(angle)).sum(1),
+        -(size * rate**2 * torch.sin(angle)).sum(1),
+    )
+    tau = inverse_dynamics(robot, q, qd, qdd) + torch.tensor(DAMPING) * qd + torch.tensor(DRY) * qd.sign()
+    tau = tau + NOISE * torch.randn(tau.shape, generator=generator, dtype=torch.float64)
+    return forcegp.Dataset(t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names)
+
+
+@pytest.fixture(scope="module")
+def fit() -> StructuredFit:
+    """Links 20 % heavier than in the file, and friction; inertial parameters are uncertain."""
+    robot = forcegp.load_robot("double_pendulum")
+    system = forcegp.ConstrainedSystem(robot)
+    true = robot.replace(mass=1.2 * robot.mass, inertia=1.2 * robot.inertia)
+    model = forcegp.StructuredGP(
+        system, "analytical", force_priors=[JointFrictionPrior(), InertialPrior()], noise=0.2
+    )
+    return model.fit(log_of(true, 1500, 0))
+
+
+def test_friction_and_inertia_are_those_of_the_robot(fit: StructuredFit) -> None:
+    found = calibrated(fit)
+    by_name = {(p.element, p.name): p for p in found.parameters}
+    for j, joint in enumerate(found.robot.joint_names):
+        for name, true in (("damping", DAMPING[j]), ("friction", DRY[j])):
+            parameter = by_name[joint, name]
+            assert parameter.determined and parameter.file == 0.0
+            assert abs(parameter.estimate - true) < 3.0 * parameter.std + 0.02
+    q = torch.tensor([[0.0, 0.0], [0.3, 1.0]], dtype=torch.float64)
+    file = fit.specified.robot
+    ratio = mass_matrix(found.robot, q) / mass_matrix(file, q)
+    torch.testing.assert_close(ratio, torch.full_like(ratio, 1.2), rtol=0.03, atol=0.0)
+    assert float(found.left.max()) < 0.05 * max(DRY)
+    assert len(found.losses) == 2 and "constant force" in found.losses[0]
+
+
+def test_samples_are_consistent_and_spread_as_the_posterior(fit: StructuredFit) -> None:
+    robots = sampled_robots(fit, 100, seed=1)
+    for robot in robots:
+        assert float(torch.linalg.eigvalsh(pseudo_inertia(robot.mass, robot.com, robot.inertia)).min()) > 0.0
+        assert bool((robot.friction >= 0.0).all() and (robot.damping >= 0.0).all())
+    found = calibrated(fit)
+    std = {(p.element, p.name): p.std for p in found.parameters}
+
+    def spread(values: Tensor, name: str) -> None:
+        own = torch.tensor([std[joint, name] for joint in found.robot.joint_names], dtype=torch.float64)
+        torch.testing.assert_close(values.std(0), own, rtol=0.35, atol=1e-6)
+
+    spread(torch.stack([robot.damping for robot in robots]), "damping")
+    spread(torch.stack([robot.mass for robot in robots]), "mass")
+    # The mean of the samples is the estimate.
+    dry = torch.stack([robot.friction for robot in robots])
+    assert bool(((dry.mean(0) - found.robot.friction).abs() < 4.0 * dry.std(0) / 10.0 + 1e-3).all())
+    again = sampled_robots(fit, 2, seed=1)
+    assert torch.equal(again[1].mass, sampled_robots(fit, 2, seed=1)[1].mass)
+    with pytest.raises(ParameterError, match="no such number of samples"):
+        sampled_robots(fit, 0)
+
+
+def test_the_written_file_explains_another_motion(fit: StructuredFit, tmp_path: Path) -> None:
+    """Torques of another log: a tenth of the error of the original file."""
+    found = write_calibrated(fit, "double_pendulum", tmp_path / "found.urdf", samples=2)
+    assert len(found.parameters) == 2 * 13
+    file = fit.specified.robot
+    log = log_of(file.replace(mass=1.2 * file.mass, inertia=1.2 * file.inertia), 500, 3)
+
+    def error(robot: forcegp.RobotModel) -> float:
+        tau = inverse_dynamics(robot, log.q, log.qd, log.qdd)
+        tau = tau + robot.damping * log.qd + robot.friction * log.qd.sign()
+        return float((tau - log.tau).square().mean().sqrt())
+
+    read = forcegp.load_robot(tmp_path / "found.urdf")
+    assert error(read) < 0.1 * error(file)
+    report = json.loads((tmp_path / "found.report.json").read_text())
+    assert {each["name"] for each in report["parameters"]} >= {"damping", "mass"}
+    assert list(report["friction"]) == list(file.joint_names)
+    samples = [forcegp.load_robot(path) for path in sorted(tmp_path.glob("found.sample_*.urdf"))]
+    assert len(samples) == 2 and not torch.equal(samples[0].mass, samples[1].mass)
+
+
+def test_a_ring_takes_the_place_of_an_armature() -> None:
+    """The joint feels the same inertia, and the link stays that of some body."""
+    robot = forcegp.load_robot("kuka_iiwa14")
+    driven = robot.replace(armature=torch.full_like(robot.armature, 0.1))
+    ring = with_rings(driven)
+    q = torch.zeros(7, dtype=torch.float64)
+    M, with_ring = (mass_matrix(each, q) for each in (driven, ring))
+    assert float(ring.armature.abs().max()) == 0.0
+    torch.testing.assert_close(M[-1, -1], with_ring[-1, -1])
+    J = pseudo_inertia(ring.mass, ring.com, ring.inertia)
+    assert float(torch.linalg.eigvalsh(J).min()) > 0.0
+
+
+def test_a_payload_is_part_of_the_robot() -> None:
+    robot = forcegp.load_robot("double_pendulum")
+    prior = PayloadPrior()
+    heavy = prior.around(torch.tensor([0.5, 0.0, 0.0, -1.0], dtype=torch.float64)).loaded(robot)
+    model = forcegp.StructuredGP(
+        forcegp.ConstrainedSystem(robot), "analytical", force_priors=[JointFrictionPrior(), prior], noise=0.2
+    )
+    fit = model.fit(log_of(heavy, 800, 5))
+    one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
+    latent = fit.posterior.means.latent_mean(1, fit.posterior.process.scales[1].apply(one))[0]
+    found = calibrated(fit)
+    assert float(latent[0]) > 0.2
+    assert float(found.robot.mass[-1] - robot.mass[-1]) == pytest.approx(prior.mass * float(latent[0]))
+    mass = {p.element: p for p in found.parameters if p.name == "mass"}
+    assert mass[robot.joint_names[-1]].std > 0.0 and mass[robot.joint_names[0]].std == 0.0
+
+
+def test_forces_around_zero_are_no_calibration(fit: StructuredFit) -> None:
+    robot = fit.specified.robot
+    blind = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(log_of(robot, 60, 1))
+    with pytest.raises(ModelError, match="not those that the robot file lacks"):
+        calibrated(blind)

@@ -1,0 +1,171 @@
+"""Robot files edited in place: what was asked for is in them, and nothing else has changed."""
+
+import difflib
+from pathlib import Path
+
+import mujoco
+import pinocchio
+import pytest
+import torch
+
+import forcegp
+from forcegp.errors import RobotFileError
+from forcegp.robot.edit_xml import EditableXml
+from forcegp.robot.inertia import from_pseudo_inertia, pseudo_inertia
+from forcegp.robot.load import robot_path
+from forcegp.robot.model import RobotModel
+from forcegp.robot.write_back import write_robot
+
+CLASSES = """<?xml version="1.0"?>
+<!-- an arm
+     with a comment -->
+<mujoco model='arm'>
+  <compiler angle="radian"/>
+  <default>
+    <default class="big"> <joint damping="2" armature="0.1" frictionloss="0.3"/> </default>
+  </default>
+  <worldbody>
+    <body name="base" childclass="big">
+      <inertial pos="0 0 0.1" mass="2" diaginertia="0.02 0.02 0.01"/>
+      <joint name="a" axis="0 0 1"   pos="0.1 0 0"/>
+      <geom type="sphere" size="0.1"/>
+      <body name="arm" pos="0 0 0.3" euler="0.3 0 0">
+        <inertial pos="0.1 0 0" mass="1" quat="0.9 0.1 0.2 0.1" diaginertia="0.02 0.015 0.01"/>
+        <joint name="b" axis="0 1 0" damping="0.5"/>
+        <body name="hand" pos="0.3 0 0">
+          <joint name="c" type="slide" axis="1 0 0"/>
+          <geom type="box" size="0.05 0.02 0.03"/>
+        </body>
+        <body name="plate" pos="0 0.2 0"><inertial pos="0 0 0" mass="0.2" euler="0.1 0.2 0.3"
+              diaginertia="0.001 0.001 0.001"/></body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+SAME = 1e-9
+"""Relative error of figures that are written with twelve digits."""
+
+
+def changed(robot: RobotModel, size: float = 0.1) -> RobotModel:
+    """Another robot of the same joints, whose links are those of some mass distribution."""
+    generator = torch.Generator().manual_seed(0)
+
+    def noise(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
+    E = torch.eye(4, dtype=torch.float64) + size * noise(robot.nq, 4, 4)
+    mass, com, inertia = from_pseudo_inertia(E @ J @ E.mT)
+    return robot.replace(
+        mass=mass,
+        com=com,
+        inertia=inertia,
+        damping=robot.damping + noise(robot.nq).abs(),
+        friction=robot.friction + noise(robot.nq).abs(),
+    )
+
+
+def differences(before: Path, after: Path) -> list[str]:
+    lines = difflib.unified_diff(
+        before.read_text().splitlines(), after.read_text().splitlines(), lineterm="", n=0
+    )
+    return [line for line in lines if line[:1] in "+-" and line[:3] not in ("+++", "---")]
+
+
+@pytest.mark.parametrize("name", ["franka_panda", "kuka_iiwa14"])
+def test_urdf_holds_the_robot_and_keeps_its_text(name: str, tmp_path: Path) -> None:
+    robot = changed(forcegp.load_robot(name))
+    out = tmp_path / "out.urdf"
+    written = write_robot(robot, name, out)
+    read = forcegp.load_robot(out)
+    for figure in ("mass", "com", "inertia", "damping", "friction"):
+        torch.testing.assert_close(getattr(read, figure), getattr(robot, figure), rtol=SAME, atol=1e-12)
+    edited = ("<mass", "<inertia ", "<origin", "<dynamics")
+    assert all(line[1:].strip().startswith(edited) for line in differences(robot_path(name), out))
+    assert {change.figure for change in written.changes} >= {"mass", "damping", "friction"}
+    # The mass matrix by another library.
+    model = pinocchio.buildModelFromUrdf(str(out))  # pyright: ignore[reportAttributeAccessIssue]
+    q = torch.linspace(-0.5, 0.5, robot.nq, dtype=torch.float64)
+    M = pinocchio.crba(model, model.createData(), q.numpy())  # pyright: ignore[reportAttributeAccessIssue]
+    torch.testing.assert_close(
+        torch.from_numpy(M).triu(), forcegp.dynamics.mass_matrix(robot, q).triu(), rtol=1e-8, atol=1e-10
+    )
+
+
+def test_what_did_not_change_keeps_every_byte(tmp_path: Path) -> None:
+    for name in ("kuka_iiwa14", "ur5"):
+        out = tmp_path / "same.urdf"
+        written = write_robot(forcegp.load_robot(name), name, out)
+        assert written.changes == () and out.read_bytes() == robot_path(name).read_bytes()
+
+
+def test_mjcf_with_defaults_and_turned_inertias(tmp_path: Path) -> None:
+    """Joint classes, an inertia from geoms, a quaternion, Euler angles, and a body fixed to another."""
+    path, out = tmp_path / "arm.xml", tmp_path / "out.xml"
+    path.write_text(CLASSES)
+    robot = changed(forcegp.load_robot(path), 0.02)
+    robot = robot.replace(armature=robot.armature + 0.05)
+    written = write_robot(robot, path, out)
+    read = forcegp.load_robot(out)
+    for figure in ("mass", "com", "inertia", "damping", "friction", "armature"):
+        torch.testing.assert_close(getattr(read, figure), getattr(robot, figure), rtol=1e-8, atol=1e-10)
+    assert written.losses == ()
+    text = out.read_text()
+    assert "<!-- an arm\n     with a comment -->" in text and "model='arm'" in text
+    model = mujoco.MjModel.from_xml_path(str(out))  # pyright: ignore[reportAttributeAccessIssue]
+    torch.testing.assert_close(torch.from_numpy(model.dof_damping), robot.damping)
+    torch.testing.assert_close(torch.from_numpy(model.dof_armature), robot.armature)
+
+
+def test_fixed_links_share_a_change_that_none_can_take(tmp_path: Path) -> None:
+    """Two equal halves of a link, which becomes lighter than either half."""
+    half = (
+        '<inertial><origin xyz="0 0 {z}"/><mass value="1"/>'
+        '<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>'
+    )
+    path, out = tmp_path / "halves.urdf", tmp_path / "out.urdf"
+    path.write_text(
+        f'<robot name="r"><link name="base"/><link name="a">{half.format(z=0.1)}</link>'
+        f'<link name="b">{half.format(z=-0.1)}</link>'
+        '<joint name="j" type="continuous"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/></joint>'
+        '<joint name="f" type="fixed"><parent link="a"/><child link="b"/></joint></robot>'
+    )
+    robot = forcegp.load_robot(path)
+    lighter = robot.replace(mass=0.3 * robot.mass, inertia=0.3 * robot.inertia)
+    written = write_robot(lighter, path, out)
+    masses = {change.element: change.after for change in written.changes if change.figure == "mass"}
+    assert masses == pytest.approx({"a": 0.3, "b": 0.3})
+    torch.testing.assert_close(forcegp.load_robot(out).inertia, lighter.inertia)
+
+
+def test_refusals_leave_no_file(tmp_path: Path) -> None:
+    robot, out = forcegp.load_robot("kuka_iiwa14"), tmp_path / "out.urdf"
+    with pytest.raises(RobotFileError, match="joints are not those of the robot"):
+        write_robot(robot, "ur5", out)
+    path = tmp_path / "arm.xml"
+    path.write_text(CLASSES)
+    (tmp_path / "outer.xml").write_text('<mujoco><include file="arm.xml"/></mujoco>')
+    outer = forcegp.load_robot(tmp_path / "outer.xml")
+    with pytest.raises(RobotFileError, match="does not stand in this file"):
+        write_robot(outer.replace(damping=outer.damping + 1.0), tmp_path / "outer.xml", out)
+    path.write_text(CLASSES.replace('angle="radian"', 'angle="radian" boundmass="0.15"'))
+    bounded = forcegp.load_robot(path)
+    with pytest.raises(RobotFileError, match="would not give joint 'c' its mass"):
+        write_robot(bounded.replace(mass=0.5 * bounded.mass), path, out)
+    assert not out.exists()
+
+
+def test_an_edit_of_text_with_other_alphabets_and_quotes() -> None:
+    """Positions are bytes; values are escaped; an element without children opens."""
+    document = EditableXml("<r a='ä'><ü x=\"1\"/><!-- <no x='2'/> --></r>".encode(), "file")
+    (child,) = document.root.children
+    document.set(document.root, "a", 'b"<')
+    document.set(child, "x", "2")
+    document.set(child, "y", "3")
+    document.add_child(child, "z", {"q": "4"})
+    assert document.written().decode() == (
+        '<r a=\'b"&lt;\'><ü x="2" y="3">\n  <z q="4"/>\n</ü><!-- <no x=\'2\'/> --></r>'
+    )
+    with pytest.raises(RobotFileError, match="cannot be edited in place"):
+        EditableXml("<r a='ä'/>".encode("utf-16"), "file")
