@@ -12,7 +12,7 @@ from forcegp.dynamics import inverse_dynamics, mass_matrix
 from forcegp.errors import ModelError, ParameterError
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
-from forcegp.models.calibrated import calibrated, sampled_robots, with_rings, write_calibrated
+from forcegp.models.calibrated import calibrated, sampled_robots, without_armature, write_calibrated
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import pseudo_inertia
 
@@ -66,7 +66,7 @@ def test_friction_and_inertia_are_those_of_the_robot(fit: StructuredFit) -> None
     assert len(found.losses) == 2 and "constant force" in found.losses[0]
 
 
-def test_samples_are_consistent_and_spread_as_the_posterior(fit: StructuredFit) -> None:
+def test_samples_are_consistent_and_around_the_estimate(fit: StructuredFit) -> None:
     robots = sampled_robots(fit, 100, seed=1)
     for robot in robots:
         assert float(torch.linalg.eigvalsh(pseudo_inertia(robot.mass, robot.com, robot.inertia)).min()) > 0.0
@@ -79,7 +79,10 @@ def test_samples_are_consistent_and_spread_as_the_posterior(fit: StructuredFit) 
         torch.testing.assert_close(values.std(0), own, rtol=0.35, atol=1e-6)
 
     spread(torch.stack([robot.damping for robot in robots]), "damping")
-    spread(torch.stack([robot.mass for robot in robots]), "mass")
+    M = mass_matrix(found.robot, torch.zeros(2, dtype=torch.float64))
+    sampled = torch.stack([mass_matrix(each, torch.zeros(2, dtype=torch.float64)) for each in robots])
+    error = (sampled / M - 1.0).diagonal(dim1=-2, dim2=-1)
+    assert bool((error.median(0).values.abs() < 0.05).all()) and float(error.abs().median()) < 0.05
     # The mean of the samples is the estimate.
     dry = torch.stack([robot.friction for robot in robots])
     assert bool(((dry.mean(0) - found.robot.friction).abs() < 4.0 * dry.std(0) / 10.0 + 1e-3).all())
@@ -110,17 +113,22 @@ def test_the_written_file_explains_another_motion(fit: StructuredFit, tmp_path: 
     assert len(samples) == 2 and not torch.equal(samples[0].mass, samples[1].mass)
 
 
-def test_a_ring_takes_the_place_of_an_armature() -> None:
-    """The joint feels the same inertia, and the link stays that of some body."""
-    robot = forcegp.load_robot("kuka_iiwa14")
-    driven = robot.replace(armature=torch.full_like(robot.armature, 0.1))
-    ring = with_rings(driven)
-    q = torch.zeros(7, dtype=torch.float64)
-    M, with_ring = (mass_matrix(each, q) for each in (driven, ring))
-    assert float(ring.armature.abs().max()) == 0.0
-    torch.testing.assert_close(M[-1, -1], with_ring[-1, -1])
-    J = pseudo_inertia(ring.mass, ring.com, ring.inertia)
-    assert float(torch.linalg.eigvalsh(J).min()) > 0.0
+def test_links_have_the_inertia_of_drives_where_a_format_has_no_armature() -> None:
+    """Joints feel about the same inertia, and links stay those of some body."""
+    robot = forcegp.load_robot("franka_panda")
+    driven = robot.replace(armature=torch.linspace(0.7, 0.01, 7, dtype=torch.float64))
+    held = without_armature(driven)
+    assert float(held.armature.abs().max()) == 0.0
+    q = torch.randn(20, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    exact, found, none = (
+        mass_matrix(each, q).diagonal(dim1=-2, dim2=-1).log()
+        for each in (driven, held, driven.replace(armature=0.0 * driven.armature))
+    )
+    assert float((found - exact).square().mean()) < 0.3 * float((none - exact).square().mean())
+    J = pseudo_inertia(held.mass, held.com, held.inertia)
+    sound = torch.linalg.eigvalsh(pseudo_inertia(robot.mass, robot.com, robot.inertia))[:, 0] > 0.0
+    assert float(torch.linalg.eigvalsh(J)[sound].min()) > -1e-9
+    assert torch.equal(without_armature(robot).inertia, robot.inertia)
 
 
 def test_a_payload_is_part_of_the_robot() -> None:
@@ -135,7 +143,7 @@ def test_a_payload_is_part_of_the_robot() -> None:
     latent = fit.posterior.means.latent_mean(1, fit.posterior.process.scales[1].apply(one))[0]
     found = calibrated(fit)
     assert float(latent[0]) > 0.2
-    assert float(found.robot.mass[-1] - robot.mass[-1]) == pytest.approx(prior.mass * float(latent[0]))
+    assert float(found.robot.mass[-1] - robot.mass[-1]) == pytest.approx(float(latent[0]), abs=0.01)
     mass = {p.element: p for p in found.parameters if p.name == "mass"}
     assert mass[robot.joint_names[-1]].std > 0.0 and mass[robot.joint_names[0]].std == 0.0
 

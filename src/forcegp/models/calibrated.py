@@ -5,10 +5,12 @@ nearest to the learned friction Q_D(q̇) over the trained speeds, by least squar
 
     min Σ_v (Q_D(v) + d v + f sign v − c)²,   d, f ≥ 0,
 
-averaged over poses where friction depends on the load. What is left, and the offset c, are losses. URDF has
-no armature a either: a ring of inertia a about the joint's axis takes its place in the link, if that brings
-the mass matrix closer. Samples are the same for functions drawn from the posterior, with inertial parameters
-π + S δ (`forces/priors/inertial.py`).
+averaged over poses where friction depends on the load. What is left, and the offset c, are losses. A log
+seldom tells an offset from the weight of the links: where zero is within 2σ of an offset, all the rest is
+conditioned on c = 0. URDF has no armature a either: inertia a about the joint's axis, and as little across it
+as the link needs to stay physically consistent, goes to the link if that brings the mass matrix closer.
+Samples are the same for functions drawn from the posterior, with inertial parameters π + S δ
+(`forces/priors/inertial.py`).
 """
 
 from __future__ import annotations
@@ -42,12 +44,16 @@ SLOWEST = 0.05
 """Least of these speeds, over the largest trained one: below it, dry friction is smooth in the fit."""
 UNTRAINED = 1.0
 """Largest speed where the fit does not say which it has seen [rad/s, m/s]."""
-DRAWS = 100
+DRAWS = 400
 """Function samples from which standard deviations are taken."""
+OPEN = 2.0
+"""Standard deviations from zero up to which an offset is left open by the data."""
 DETERMINED = 0.5
 """A parameter is determined from this fraction of its prior standard deviation, or of its own size, on."""
 SMALLEST = 1e-2
 """ε, the smallest eigenvalue of a sampled link's pseudo-inertia in units of the estimate."""
+HALVINGS = 40
+"""Steps that find the least inertia across an axis."""
 MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """The inertial parameters of a link, about its origin [kg, kg m, kg m²]."""
 
@@ -150,7 +156,7 @@ def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[R
     """
     if samples < 1:
         raise ParameterError("no such number of samples", expected="1 or more", got=samples)
-    return [robot for robot, _ in _Reader.of(fit, seed).robots(samples)[1:]]
+    return [robot for robot, _ in _Reader.of(fit, seed).robots(max(samples, DRAWS))[1 : 1 + samples]]
 
 
 def write_calibrated(
@@ -181,16 +187,15 @@ def write_calibrated(
     """
     found, out = calibrated(fit, seed=seed), Path(out)
     robots = [found.robot, *(sampled_robots(fit, samples, seed=seed) if samples else [])]
-    has_armature = is_mjcf(source)
-    rings = not has_armature and _rings_help(found.robot)
+    drives = not is_mjcf(source) and bool((found.robot.armature != 0.0).any())
     losses: tuple[str, ...] = ()
     for k, robot in enumerate(robots):
         path = out.with_name(f"{out.stem}.sample_{k - 1:03d}{out.suffix}") if k else out
-        holding = with_rings(robot) if rings else robot
+        holding = without_armature(robot) if drives else robot
         losses = losses or write_robot(holding, source, path, locked_joints=locked_joints).losses
-    if rings:
+    if drives:
         values = ", ".join(f"{x:.4g}" for x in found.robot.armature.tolist())
-        losses = (f"URDF has no armature ({values}): rings in the links have its inertia", *losses)
+        losses = (f"URDF has no armature ({values}): links have its inertia as far as they can", *losses)
     report = {
         "parameters": [vars(parameter) for parameter in found.parameters],
         "losses": [*losses, *found.losses],
@@ -264,16 +269,21 @@ class _Reader:
         """The robot of the posterior mean, and of function samples, each with its friction."""
         drawn = self.fit.force_samples(draws, torch.Generator().manual_seed(self.seed))
         assert isinstance(drawn, ForceSamples)
-        mean, *curves = self._curves(drawn)
-        inertias, loads = self._constants(drawn, InertialPrior), self._constants(drawn, PayloadPrior)
-        found = [self._robot(mean, None, self._payload())]
-        for k, curve in enumerate(curves):
-            found.append(
-                self._robot(
-                    curve, None if inertias is None else inertias[k], None if loads is None else loads[k]
-                )
-            )
-        return found
+        curves = torch.stack(list(self._curves(drawn)))
+        parts = [
+            curves.flatten(1),
+            self._constants(drawn, InertialPrior),
+            self._constants(drawn, PayloadPrior),
+        ]
+        sizes = [part.shape[-1] for part in parts]
+        free = _without_offsets(self._offsets(curves), torch.cat(parts, dim=-1))
+        rows = (row.split(sizes) for row in free)
+        return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
+
+    def _offsets(self, curves: Tensor) -> Tensor:
+        """The offset of each curve by least squares `(1 + samples, nq)`."""
+        columns = torch.stack([self.speeds, self.speeds.sign(), torch.ones_like(self.speeds)], dim=-1)
+        return (torch.linalg.pinv(columns.movedim(1, 0)) @ curves.movedim(-1, 1)[..., None])[..., 2, 0]
 
     def _curves(self, drawn: ForceSamples) -> Iterator[Tensor]:
         """The friction Q_D over speeds `(k, nq)` of the posterior mean and of samples, mean over poses."""
@@ -293,38 +303,42 @@ class _Reader:
     def _over_poses(self, force: Tensor) -> Tensor:
         return force.unflatten(0, (POSES, len(self.speeds))).mean(0)
 
-    def _constants(self, drawn: ForceSamples, kind: type) -> Tensor | None:
-        """Samples of the constants of the first prior of a kind `(samples, components)`."""
+    def _constants(self, drawn: ForceSamples, kind: type) -> Tensor:
+        """Mean and samples of the constants of the first prior of a kind `(1 + samples, components)`."""
         for p, prior in enumerate(self.fit.force_priors):
             if isinstance(prior, kind):
                 one = {name: x[:1] for name, x in self._features(p).items()}
-                values = drawn.functions.latent(p, one, None)[:, 0]
-                return values + self.fit.posterior.shift(p, one)
-        return None
+                mean = self.fit.posterior.means.latent_mean(p, one)
+                return torch.cat(
+                    [mean, drawn.functions.latent(p, one)[:, 0] + self.fit.posterior.shift(p, one)]
+                )
+        return self.speeds.new_zeros(1 + drawn.count, 0)
 
     def _features(self, p: int) -> dict[str, Tensor]:
         return self.fit.posterior.process.features(p, self.fit.system, self.at)
 
-    def _payload(self) -> Tensor | None:
-        """Posterior mean of the constants of a payload."""
-        for p, prior in enumerate(self.fit.force_priors):
-            if isinstance(prior, PayloadPrior):
-                return self.fit.posterior.means.latent_mean(
-                    p, {k: x[:1] for k, x in self._features(p).items()}
-                )[0]
-        return None
-
-    def _robot(self, curve: Tensor, delta: Tensor | None, load: Tensor | None) -> tuple[RobotModel, Curve]:
+    def _robot(self, curve: Tensor, delta: Tensor, load: Tensor) -> tuple[RobotModel, Curve]:
         """The robot with a friction curve, a deviation δ of its inertial parameters and a payload."""
         robot = self.fit.system.robot
         damping, friction, left, offset = _projected(self.speeds, curve)
         robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction)
-        if delta is not None and self.scale is not None:
+        if self.scale is not None:
             robot = _moved(robot, delta.reshape(self.scale.shape) * self.scale)
         prior = next((p for p in self.fit.force_priors if isinstance(p, PayloadPrior)), None)
-        if load is not None and prior is not None:
+        if prior is not None:
             robot = prior.around(load).loaded(robot)
         return robot, (curve, left, offset)
+
+
+def _without_offsets(offset: Tensor, values: Tensor) -> Tensor:
+    """The mean and samples of values `(1 + samples, d)` given that offsets `(1 + samples, nq)` are zero where
+    the data leave that open.
+
+    With the samples' covariances, E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c.
+    """
+    c = offset[:, offset[0].abs() <= OPEN * offset[1:].std(0)]
+    gain = torch.linalg.lstsq(c[1:] - c[1:].mean(0), values[1:] - values[1:].mean(0)).solution
+    return values - c @ gain
 
 
 def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -371,27 +385,48 @@ def _pseudo(pi: Tensor) -> Tensor:
     return torch.cat([top, torch.cat([pi[:, None, 1:4], pi[:, None, :1]], dim=-1)], dim=-2)
 
 
-def with_rings(robot: RobotModel) -> RobotModel:
-    """The robot with a ring about each revolute axis in the link, in place of the armature of its joint.
+def without_armature(robot: RobotModel) -> RobotModel:
+    """The robot whose links have the inertia of the drives, where that brings its mass matrix closer.
 
-    Its inertia is a about the axis and a/2 across it, the least that a body without mass can have.
+    Joints are taken in the order of their armature, the largest first.
     """
-    along = robot.axis[:, :, None] * robot.axis[:, None, :]
-    eye = torch.eye(3, dtype=robot.dtype, device=robot.device)
-    ring = robot.armature[:, None, None] * robot.revolute[:, None, None] * 0.5 * (eye + along)
-    armature = robot.armature * (1.0 - robot.revolute)
-    return robot.replace(inertia=robot.inertia + ring, armature=armature)
-
-
-def _rings_help(robot: RobotModel) -> bool:
-    """Whether the diagonal of the mass matrix is closer to that with armature than without anything."""
     share = torch.rand(POSES, robot.nq, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    q = (2.0 * torch.pi * share.to(robot.mass)).contiguous()
-    exact, rings, nothing = (
-        dynamics.mass_matrix(each, q).diagonal(dim1=-2, dim2=-1).log()
-        for each in (robot, with_rings(robot), robot.replace(armature=0.0 * robot.armature))
+    q = (2.0 * torch.pi * share).to(robot.mass)
+
+    def diagonal(each: RobotModel) -> Tensor:
+        return dynamics.mass_matrix(each, q).diagonal(dim1=-2, dim2=-1).log()
+
+    exact, held = diagonal(robot), robot.replace(armature=torch.zeros_like(robot.armature))
+    error = (diagonal(held) - exact).square().sum()
+    for i in robot.armature.argsort(descending=True).tolist():
+        if robot.joint_types[i] == "revolute" and float(robot.armature[i]) > 0.0:
+            tried = _with_ring(held, i, robot.armature[i])
+            closer = (diagonal(tried) - exact).square().sum()
+            if closer < error:
+                held, error = tried, closer
+    return held
+
+
+def _with_ring(robot: RobotModel, i: int, a: Tensor) -> RobotModel:
+    """The robot with inertia a about the axis of joint i in its link, and across it the least needed."""
+    along = robot.axis[i].outer(robot.axis[i])
+    across = torch.eye(3).to(along) - along
+    ring = robot.inertia[i] + a * along
+    # tr I/2 − I > 0 holds across the axis where I_axis ≤ the sum of the others
+    low, high = torch.zeros_like(a), 0.5 * a
+    for _ in range(HALVINGS if not _physical(ring) else 0):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if _physical(ring + middle * across) else (middle, high)
+    needed = 0.0 if _physical(ring) else high
+    return robot.replace(
+        inertia=robot.inertia.index_put((torch.tensor([i]),), (ring + needed * across)[None])
     )
-    return bool((rings - exact).square().mean() < (nothing - exact).square().mean())
+
+
+def _physical(inertia: Tensor) -> bool:
+    """Whether some body has the inertia about its centre of mass."""
+    moments = torch.linalg.eigvalsh(inertia)
+    return float(moments[0]) > 0.0 and float(moments[2]) <= float(moments[0] + moments[1])
 
 
 def _parameters(

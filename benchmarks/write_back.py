@@ -1,0 +1,148 @@
+"""Robot files calibrated from a log, simulated by MuJoCo, beside the original file and least squares.
+
+    python benchmarks/write_back.py --json result.json       # about a minute for each arm and seed
+    python benchmarks/write_back.py --arm ur5 --seed 0 1 2 3 4 --right-file
+
+Arms of `solver_arms.py` whose links are off by up to 30 % and whose joints have friction and drives that the
+file lacks. The calibrated URDF is read back, and MuJoCo computes from it the torques of another motion, and
+the motion of the next second under the logged torques. `least squares` is physically consistent too, and has
+drives only as inertia of links; its torque error is that of its own equations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from real_cases import moving
+from results_page import table
+from solver_arms import ARMS, STEP, Arm, Imperfections, case_of
+
+import forcegp
+from forcegp.dynamics import inverse_dynamics
+from forcegp.evaluation.least_squares import identify_rigid
+from forcegp.kinematics import frame_pose
+from forcegp.models.calibrated import write_calibrated
+from forcegp.robot.model import RobotModel
+from forcegp.simulate.urdf import write_urdf
+
+WRONG = Imperfections(mass=0.3, gain=0.0, offset=0.0)
+"""Links off by up to 30 %, undeclared friction and drives; torque sensors are right."""
+RIGHT = replace(WRONG, mass=0.0, drive=0.0, dry=0.0, viscous=0.0)
+STARTS, AHEAD = 30, 1.0
+"""Open-loop motions, and how long each lasts [s]."""
+
+Array = NDArray[np.float64]
+
+
+def simulated(robot: RobotModel) -> mujoco.MjModel:
+    """A robot file in MuJoCo, with its joint friction."""
+    model = mujoco.MjModel.from_xml_string(write_urdf(robot))
+    model.opt.gravity[:] = robot.gravity.numpy()
+    model.opt.timestep = STEP
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    model.dof_damping[:], model.dof_armature[:] = robot.damping.numpy(), robot.armature.numpy()
+    model.dof_frictionloss[:] = robot.friction.numpy()
+    return model
+
+
+def torques(robot: RobotModel, log: forcegp.Dataset) -> Array:
+    """Inverse dynamics of a robot file along a log, dry friction against the motion."""
+    model = simulated(robot)
+    model.dof_frictionloss[:] = 0.0
+    data, found = mujoco.MjData(model), []
+    for q, qd, qdd in zip(log.q.numpy(), log.qd.numpy(), log.qdd.numpy(), strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, qd, qdd
+        mujoco.mj_inverse(model, data)
+        found.append(data.qfrc_inverse + robot.friction.numpy() * np.sign(qd))
+    return np.array(found)
+
+
+def ahead(robot: RobotModel, log: forcegp.Dataset) -> Array:
+    """Positions of the joints a second after each start, under the logged torques."""
+    model, period = simulated(robot), float(log.t[1] - log.t[0])
+    steps, each = round(AHEAD / period), round(period / STEP)
+    data, found = mujoco.MjData(model), []
+    for start in np.linspace(0, len(log) - steps - 1, STARTS).astype(int):
+        data.qpos[:], data.qvel[:] = log.q[start].numpy(), log.qd[start].numpy()
+        for k in range(start, start + steps):
+            data.qfrc_applied[:] = log.tau[k].numpy()
+            for _ in range(each):
+                mujoco.mj_step(model, data)
+        found.append([start + steps, *data.qpos])
+    return np.array(found)
+
+
+def tip_error(robot: RobotModel, log: forcegp.Dataset) -> float:
+    """Median distance of the last frame from where it was a second after each start [m]."""
+    found = ahead(robot, log)
+    rows, frame = found[:, 0].astype(int), robot.frame_names[-1]
+    there, was = (
+        frame_pose(robot, q, frame)[1] for q in (torch.from_numpy(found[:, 1:].copy()), log.q[rows])
+    )
+    return float((there - was).norm(dim=-1).median())
+
+
+def measured(name: str, seed: int, wrong: Imperfections, folder: Path) -> dict:
+    """Errors of the original file, the calibrated one and least squares on another motion."""
+    robot = forcegp.load_robot(name)
+    arm = Arm(robot, wrong, np.random.default_rng(seed))
+    case = case_of(name, arm, folder)
+    test = case.tests["test"]
+    fit = forcegp.StructuredGP(case.system, "analytical").fit(case.train)
+    write_calibrated(fit, name, folder / "calibrated.urdf")
+    files = {"file": robot, "calibrated": forcegp.load_robot(folder / "calibrated.urdf")}
+    rows = moving(test)
+    errors = {key: torques(each, rows) - rows.tau.numpy() for key, each in files.items()}
+    squares = identify_rigid(case.system, case.train)
+    rigid = inverse_dynamics(squares.system.robot, rows.q, rows.qd, rows.qdd)
+    errors["least squares"] = (rigid + squares.losses(rows.qd) - rows.tau).numpy()
+    rmse = {key: np.sqrt((error**2).mean(0)) for key, error in errors.items()}
+    tip = {key: tip_error(each, test) for key, each in files.items()}
+    by_file, by_squares = rmse["calibrated"] / rmse["file"], rmse["calibrated"] / rmse["least squares"]
+    return {
+        "torque_rmse": {key: value.tolist() for key, value in rmse.items()},
+        "over_file": float(np.exp(np.log(by_file).mean())),
+        "over_least_squares": float(np.exp(np.log(by_squares).mean())),
+        "worst_joint_over_least_squares": float(by_squares.max()),
+        "tip_m": tip,
+        "tip_over_file": tip["calibrated"] / tip["file"],
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--arm", choices=ARMS, nargs="*", default=list(ARMS))
+    parser.add_argument("--seed", type=int, nargs="*", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--right-file", action="store_true", help="arms whose file is right")
+    parser.add_argument("--json", type=Path, help="write all results to this file")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
+    result = {}
+    keys = ("over_file", "over_least_squares", "worst_joint_over_least_squares", "tip_over_file")
+    for name in options.arm:
+        for seed in options.seed:
+            with tempfile.TemporaryDirectory() as folder:
+                wrong = RIGHT if options.right_file else WRONG
+                found = result[f"{name}, seed {seed}"] = measured(name, seed, wrong, Path(folder))
+            print(f"{name}, seed {seed}:", *(f"{key} {found[key]:.3f}" for key in keys), flush=True)
+    head = ["arm, seed", "torque ÷ file", "÷ least squares", "worst joint", "tip after 1 s ÷ file"]
+    print(table(head, [[name, *(f"{found[key]:.2f}" for key in keys)] for name, found in result.items()]))
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
