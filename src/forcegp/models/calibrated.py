@@ -52,6 +52,8 @@ DETERMINED = 0.5
 """A parameter is determined from this fraction of its prior standard deviation, or of its own size, on."""
 SMALLEST = 1e-2
 """ε, the smallest eigenvalue of a sampled link's pseudo-inertia in units of the estimate."""
+MARGIN = 1e-6
+"""Distance from the triangle inequality, so that the text of a file keeps it."""
 HALVINGS = 40
 """Steps that find the least inertia across an axis."""
 MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
@@ -426,7 +428,7 @@ def _with_ring(robot: RobotModel, i: int, a: Tensor) -> RobotModel:
 def _physical(inertia: Tensor) -> bool:
     """Whether some body has the inertia about its centre of mass."""
     moments = torch.linalg.eigvalsh(inertia)
-    return float(moments[0]) > 0.0 and float(moments[2]) <= float(moments[0] + moments[1])
+    return float(moments[0]) > 0.0 and float(moments[2]) <= (1.0 - MARGIN) * float(moments[0] + moments[1])
 
 
 def _parameters(
