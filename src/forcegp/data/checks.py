@@ -104,9 +104,14 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 
 
 def check_values(data: Fields) -> None:
-    """Check that every number is finite, and that time increases within each segment."""
+    """Check that every number is finite, and that time increases within each segment.
+
+    Predictions of what is not determined are NaN.
+    """
     for name, value in (("t", data.t), *named_columns(data).items()):
         wrong = ~(value.abs() <= LOGGED_VALUE)
+        if name.startswith("predicted_"):
+            wrong &= ~value.isnan()
         if bool(wrong.any()):
             place = torch.nonzero(wrong)[0].tolist()
             column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]

@@ -185,7 +185,9 @@ class StructuredGP(Model[StructuredFit]):
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
         warnings = (*task.doubts, *lesson.warnings)
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
-        return dataclasses.replace(fit, result=dataclasses.replace(fit.result, comparison=comparison))
+        warnings = (*fit.result.warnings, *(each.doubt for each in comparison if each.chosen and each.doubt))
+        result = dataclasses.replace(fit.result, comparison=comparison, warnings=warnings)
+        return dataclasses.replace(fit, result=result)
 
     def _continued(self, after: StructuredFit) -> Specification:
         """This model with the priors of an earlier fit, which those that were left to its data belong to.
