@@ -1,7 +1,9 @@
-"""Forces of contacts that motion does not determine are NaN under a mask, and said; never a zero."""
+"""What motion does not determine is NaN under a mask, never a zero; misfits and idle options are said."""
 
 from __future__ import annotations
 
+import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +15,11 @@ import forcegp
 from forcegp.cli import app
 from forcegp.constraints import PointConnection, SurfaceContact
 from forcegp.constraints.contact import Constraint
+from forcegp.data import RobotMismatchWarning
 from forcegp.errors import ModelError, NumericalError
 from forcegp.evaluation.predicted import multiplier_scores
+from forcegp.forces.priors.sets import SETS
+from forcegp.models import selection
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate
@@ -150,3 +155,63 @@ def test_nan_stands_under_the_mask_only() -> None:
     for mask in (None, torch.tensor([[False, True]])):
         with pytest.raises(NumericalError, match="the mean of a prediction is not finite"):
             Prediction(mean, determined=mask)
+
+
+def doubts_of(data: forcegp.Dataset, **settings: object) -> str:
+    """Warnings of a fit of the scene."""
+    model = forcegp.StructuredGP(SYSTEM, **{"mean": "analytical", "noise": 0.1, **settings})  # type: ignore[arg-type]
+    return " | ".join(model.fit(data, learn=[]).result.warnings)
+
+
+@pytest.mark.parametrize("inference", ["exact", "sparse"])
+def test_a_model_that_misses_its_data_by_far_says_by_how_much(data: forcegp.Dataset, inference: str) -> None:
+    settings = {"force_priors": "sliding", "inference": inference}
+    assert "misses" not in doubts_of(data, **settings)
+    # Two newton metres at one joint that nothing in the model explains.
+    pushed = data.replace(tau=data.tau + 2.0 * torch.eye(7, dtype=torch.float64)[1])
+    found = re.search(
+        r"misses its training data by far: residuals are ([\d.]+) times", doubts_of(pushed, **settings)
+    )
+    assert found is not None and float(found[1]) > 3.0
+
+
+def test_held_out_stretches_show_a_model_that_misses_the_log(
+    data: forcegp.Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = simulate(SYSTEM, replace(SCENE.simulation, duration=6.0)).data[::10]
+    monkeypatch.setattr(selection, "candidates_of", lambda _: [selection.Candidate(SETS["sliding"])])
+    for push, misses in ((0.0, False), (2.0, True)):
+        pushed = log.replace(tau=log.tau + push * torch.eye(7, dtype=torch.float64)[1])
+        result = forcegp.StructuredGP(SYSTEM, "analytical", noise=0.1).fit(pushed).result
+        (chosen,) = (each for each in result.comparison if each.chosen)
+        assert chosen.coverage is not None and (chosen.coverage < 0.8) == misses
+        assert any(f"±2σ holds {chosen.coverage:.0%}" in text for text in result.warnings) == misses
+
+
+def test_options_without_effect_are_said(data: forcegp.Dataset) -> None:
+    joint = [forcegp.JointForcePrior()]
+    assert 'inertia="auto" has no effect' in doubts_of(data, force_priors=joint, inertia="auto")
+    exact = {"force_priors": joint, "inference": "exact"}
+    assert "inducing_points=50 has no effect: the fit has exact" in doubts_of(
+        data, inducing_points=50, **exact
+    )
+    friction = [forcegp.JointFrictionPrior()]
+    finite = {"force_priors": friction, "inference": "sparse", "inducing_points": 50}
+    assert "priors of finite features" in doubts_of(data, **finite)
+    used = {"force_priors": joint, "inference": "sparse", "inducing_points": 20}
+    for settings in (exact, used, {"force_priors": "friction", "inertia": "auto"}):
+        assert "no effect" not in doubts_of(data, **settings)
+
+
+def test_planes_that_cannot_both_be_touched_and_angles_in_degrees_are_said(data: forcegp.Dataset) -> None:
+    upper = replace(TABLE, name="upper", surface=forcegp.Plane(offset=0.255))  # type: ignore[type-var]
+    log = closed_on(data, ["table", "upper"])
+    said = fitted(with_contacts(TABLE, upper), log).result.warnings
+    assert any("contact upper is closed up to 200 mm off its surface" in text for text in said)
+    assert not any("table is closed up to" in text for text in said)
+    degrees = data.replace(q=data.q * 57.29577951308232)
+    with pytest.warns(RobotMismatchWarning, match="logged in degrees"):
+        fitted(SYSTEM, degrees)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RobotMismatchWarning)
+        fitted(SYSTEM, data)

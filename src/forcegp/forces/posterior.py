@@ -258,6 +258,8 @@ def draw_samples(
 
 CORRELATION_STATES = 50
 """Training states at which the correlation of Q and Q_z is evaluated after a fit."""
+FAR = 0.02
+"""Distance from its surface at which a closed contact is doubted [m]."""
 UNDETERMINED = 10.0
 """Standard deviations of the multiplier per its size from which a fit warns."""
 MISSED = 2.0
@@ -321,6 +323,14 @@ def doubts_of(
     means, variances, correlations, warnings = [], [], [], ()
     for m in (m for m in closed if len(m.q)):
         at = m.at(system)
+        off = at.eom.c.abs().where(at.eom.holds, 0.0).amax(0).tolist()
+        names = [c.name for c in system.contacts for _ in range(c.rows)]
+        warnings += tuple(
+            f"contact {name} is closed up to {1e3 * c:.3g} mm off its surface: check surface, point and "
+            "labels (`forcegp check`)"
+            for name, c in zip(names, off, strict=True)
+            if c > FAR
+        )
         mean, covariance = posterior.read(system, at, affine_map(system, at, "multiplier"))
         loaded, hidden = at.eom.holds, hidden_forces(system, at, {"multiplier": slice(0, system.m)})
         if hidden is not None:
@@ -330,8 +340,9 @@ def doubts_of(
         if {JOINT, CONTACT} <= targets:
             correlations.append(force_correlation(posterior, system, at))
     correlation = float(torch.cat(correlations).mean()) if correlations else None
+    warnings = tuple(dict.fromkeys(warnings))
     if means and len(torch.cat(means)):
-        warnings = (*dict.fromkeys(warnings), *_on_multiplier(torch.cat(means), torch.cat(variances)))
+        warnings += _on_multiplier(torch.cat(means), torch.cat(variances))
     never = training.never_closed(system)
     warnings += (OPEN[0].format(", ".join(never)),) if never else ()
     residual = (posterior.latent.residual / power) ** 0.5

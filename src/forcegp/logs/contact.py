@@ -233,16 +233,17 @@ def _misplaced(
     Raises:
         DataError: the tip never touches: the surface lies elsewhere, or two joints are exchanged.
     """
+    if len(c) < 2 or (np.abs(c) <= TOUCHING).mean() > TOUCHED:
+        return 0.0
     p, name = _rowwise(signals, ("q",), lambda q: _tip(system, contact, q)), contact.name
     moves = np.linalg.norm(np.gradient(p, axis=0), axis=1) > SLIDING * np.median(np.diff(signals.t))
-    if (np.abs(c) <= TOUCHING).mean() > TOUCHED:
-        return 0.0
     level, (middle, spread) = level_of(c[moves], TOUCHING, LEVEL), level_and_spread(1e3 * c)
     where = f"{middle:.3g} ± {spread:.2g} mm"
     if level is not None and displaced:
         report.find("contact", f"contact {name!r} was taken where the tip slides, {1e3 * level:.3g} mm off")
         return level
-    exchanged = _exchanged(signals, system, contact, moves)
+    pair = exchanged_joints(system, contact, signals.vectors["q"][moves])
+    exchanged = " and ".join(signals.joint_names[j] for j in pair)
     if exchanged or level is not None or (c < -TOUCHING).mean() > INSIDE:
         raise DataError(
             f"the tip is {where} from the surface of contact {name!r} (below 0: inside the solid)"
@@ -256,19 +257,16 @@ def _misplaced(
     return 0.0
 
 
-def _exchanged(
-    signals: Signals, system: ConstrainedSystem, contact: SurfaceContact, moves: NDArray[np.bool_]
-) -> str:
-    """The two joints whose exchange puts a moving tip on its surface; empty if there are none."""
-    rows = np.flatnonzero(moves)[:: max(1, int(moves.sum()) // TRIED_ROWS)]
-    q = signals.vectors["q"][rows]
-    for pair in combinations(range(q.shape[1]), 2):
+def exchanged_joints(system: ConstrainedSystem, contact: SurfaceContact, q: Array) -> tuple[int, ...]:
+    """The two joints whose exchange puts the tip on its surface in some of the rows, if there are such."""
+    q = q[:: max(1, len(q) // TRIED_ROWS)]
+    for pair in combinations(range(q.shape[1]) if len(q) else (), 2):
         order = np.arange(q.shape[1])
         order[list(pair)] = pair[::-1]
-        tip = _tip(system, contact, torch.from_numpy(q[:, order]))
-        if len(rows) and float((contact.center_surface.value(tip).abs() <= TOUCHING).double().mean()) > LEVEL:
-            return " and ".join(signals.joint_names[j] for j in pair)
-    return ""
+        c = contact.center_surface.value(_tip(system, contact, torch.from_numpy(q[:, order])))
+        if float((c.abs() <= TOUCHING).double().mean()) > LEVEL:
+            return pair
+    return ()
 
 
 def _detect(

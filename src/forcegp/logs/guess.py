@@ -16,6 +16,7 @@ import torch
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.data.checks import MOST_RADIANS
 from forcegp.data.derivative import cross_validated_window
 from forcegp.errors import DataError
 from forcegp.logs import units
@@ -35,8 +36,8 @@ ROWS = 100_000
 """Rows that are looked at."""
 TRIED_ROWS = 3000
 """Rows on which the inverse dynamics are evaluated."""
-MOST_RADIANS, LEAST_DEGREES = 60.0, 3.2
-"""Positions beyond the first are in degrees; below the second, an arm in degrees would hardly move."""
+LEAST_DEGREES = 3.2
+"""Largest position [°] below which an arm in degrees would hardly move."""
 CLEARER = 1.5
 """A unit is certain if the torque fits so much better than in the other one."""
 NEAR = 1.3

@@ -108,7 +108,7 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
     draft.say("time", text, doubt)
     for other in (s for s in table.streams if s is not stream and len(s) != len(stream)):
         stamps = [name for name in other.columns if _TIME.match(re.sub(r"\[\d+\]$", "", name.lower()))]
-        if stamps and not other.name:
+        if stamps and len(stamps) == len(other.columns):
             told = f"{', '.join(stamps)} was left out: {len(other)} rows, where the joints have {len(stream)}"
             draft.say("time", told, doubt=True)
     segment = next((name for name in _SEGMENTS if name in stream.columns), None)
