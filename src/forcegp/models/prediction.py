@@ -60,8 +60,8 @@ class Prediction:
     parts: dict[str, slice] = field(default_factory=dict)
     beyond: Tensor | None = None
     joint_names: tuple[str, ...] = ()
-    determined: Tensor | None = None
-    doubts: tuple[str, ...] = ()
+    determined: Tensor | None = field(default=None, kw_only=True)
+    doubts: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not finite, and covariances that are none.

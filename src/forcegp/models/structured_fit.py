@@ -55,6 +55,8 @@ from forcegp.models.structured_learning import Specification, constant_inputs, p
 from forcegp.storage.model_file import ModelHeader
 
 KIND = "structured_gp"
+JOINED = 256
+"""Updates after which the digests of their samples become one tensor."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -162,7 +164,8 @@ class StructuredFit(FittedModel):
             parts,
             None if beyond is None else beyond.reshape(*batch, system.robot.nq),
             system.robot.joint_names,
-            *(() if hidden is None else (~hidden.whole.reshape(*batch, -1), hidden.doubts)),
+            determined=None if hidden is None else ~hidden.whole.reshape(*batch, -1),
+            doubts=() if hidden is None else hidden.doubts,
         )
 
     def external_wrench(
@@ -270,7 +273,8 @@ class StructuredFit(FittedModel):
         measurements = self._with_slopes(measurements)
         problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
-        updated = self._with(self.posterior.latent.updated(rows), (*self.added, measurements.digests))
+        before = self.added if len(self.added) < JOINED else (torch.cat(self.added),)
+        updated = self._with(self.posterior.latent.updated(rows), (*before, measurements.digests))
         never = set(self.result.never_closed) & set(measurements.never_closed(self.system))
         result = dataclasses.replace(self.result, never_closed=tuple(sorted(never)))
         updated = dataclasses.replace(updated, result=result)

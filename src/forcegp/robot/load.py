@@ -32,8 +32,8 @@ FRICTION_VELOCITY = 0.1
 SINGULAR = 1e-12
 """Smallest eigenvalue of the scaled mass matrix below which it counts as singular in double precision."""
 LIMB_JOINTS, WALKING_JOINTS, BODY_MASS = 2, 6, 1.0
-"""Joints from which a chain counts as a limb; those of all limbs, and mass of the base, from which a robot may
-walk [kg]: a hand is lighter."""
+"""Joints from which a chain counts as a limb; those of all limbs and mass of the base [kg] from which a robot
+may walk: a hand is lighter."""
 OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
 """What the robot takes from the joints of the file as it is."""
 
