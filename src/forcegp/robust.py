@@ -1,4 +1,4 @@
-"""Standard deviations that outliers do not spoil."""
+"""Levels and standard deviations that outliers do not spoil."""
 
 from __future__ import annotations
 
@@ -15,3 +15,16 @@ def robust_std(x: NDArray[Any], axis: int = 0) -> NDArray[Any]:
     """Standard deviation of a normal distribution with the same median absolute deviation."""
     centre = np.median(x, axis=axis, keepdims=True)
     return np.asarray(MAD_TO_STD * np.median(np.abs(x - centre), axis=axis))
+
+
+def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
+    """Median of the values within `width` of the fullest bin, if these are more than a share of all.
+
+    >>> level_of(np.array([5.0, 5.1, 4.9, 40.0, -7.0]), 1.0, 0.5)
+    5.0
+    """
+    if not len(x):
+        return None
+    bins, counts = np.unique(np.floor(x / width), return_counts=True)
+    near = x[np.abs(x - width * (bins[counts.argmax()] + 0.5)) <= width]
+    return float(np.median(near)) if len(near) > share * len(x) else None

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 import forcegp
 from forcegp.errors import DataError, MappingError
-from forcegp.logs import contact, parse_mapping
+from forcegp.logs import contact, import_log, parse_mapping
 from forcegp.logs.mapping import ContactStateSection
 from forcegp.logs.signals import ImportReport, Signals
+from forcegp.logs.surface_fit import fit_surface
+from forcegp.simulate import simulate
 
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
 DT, ROWS = 1.0 / 200.0, 1600
@@ -142,3 +147,71 @@ def test_the_tip_coming_near_is_not_taken_for_contact() -> None:
     # A surface that is known to a millimetre only: nothing nearer than that tells the two apart.
     assert contact.touching(random.uniform(-3e-3, 3e-3, 500)) == contact.TOUCHING
     assert contact.touching(near + 1.0) == contact.TOUCHING
+
+
+SLIDING = (
+    '[time]\ncolumn = "t"\n[position]\ncolumn = "{joint}"\nunit = "rad"\n'
+    '[torque]\ncolumn = "tau_{joint}"\nunit = "Nm"\n[contact.table]\nsource = "distance"\n'
+)
+
+
+@pytest.fixture(scope="module")
+def slides(tmp_path_factory: pytest.TempPathFactory) -> tuple[forcegp.Dataset, Path]:
+    """The bundled scene's motion, all of it in contact, and a place for logs."""
+    scene = forcegp.load_scene("kuka_plane")
+    data = simulate(scene.system(), replace(scene.simulation, duration=5.0)).data
+    return data, tmp_path_factory.mktemp("logs")
+
+
+def logged(slides: tuple[forcegp.Dataset, Path], order: tuple[int, ...] = ()) -> Path:
+    """The motion as CSV, with the columns of joints in another order."""
+    data, folder = slides
+    index = list(order) or list(range(data.nq))
+    names = data.joint_names
+    columns = np.column_stack([data.t, data.q[:, index], data.tau[:, index]])
+    heading = ",".join(["t", *names, *(f"tau_{name}" for name in names)])
+    np.savetxt(folder / "run.csv", columns, delimiter=",", header=heading, comments="", fmt="%.12g")
+    return folder / "run.csv"
+
+
+def with_table(offset: float) -> forcegp.ConstrainedSystem:
+    """The bundled scene with its table at another height."""
+    system = forcegp.load_scene("kuka_plane").system()
+    table = replace(system.contacts[0], surface=forcegp.Plane(offset=0.055 + offset))  # type: ignore[type-var]
+    return forcegp.ConstrainedSystem(system.robot, [table])
+
+
+@pytest.mark.parametrize(("offset", "seen"), [(5e-3, "-5.01 ± "), (-5e-3, "4.99 ± ")])
+def test_a_table_that_lies_elsewhere_is_an_error_that_names_the_distance_and_the_remedy(
+    slides: tuple[forcegp.Dataset, Path], offset: float, seen: str
+) -> None:
+    log, mapping = logged(slides), parse_mapping(SLIDING.encode(), "m.toml")
+    with pytest.raises(DataError, match="the tip is " + seen + r".* mm from .*'table'") as caught:
+        import_log(log, with_table(offset), mapping)
+    assert "--fit-surface" in str(caught.value) and 'source = "never"' in str(caught.value)
+    imported = import_log(log, with_table(offset), mapping, displaced=True)
+    assert float(imported.data.contact["table"].double().mean()) > 0.9
+    assert "where the tip slides" in imported.report.findings[0].message
+    fit = fit_surface(imported.data, with_table(offset), "table", "plane")
+    assert fit.surface.offset == pytest.approx(0.055, abs=1e-4)  # type: ignore[union-attr]
+
+
+def test_exchanged_joints_are_named_by_the_surface_that_they_leave(
+    slides: tuple[forcegp.Dataset, Path],
+) -> None:
+    log = logged(slides, (0, 2, 1, 3, 4, 5, 6))
+    with pytest.raises(DataError, match="the columns of lbr_iiwa_joint_2 and lbr_iiwa_joint_3 exchanged"):
+        import_log(log, "kuka_plane", parse_mapping(SLIDING.encode(), "m.toml"))
+
+
+def test_free_motion_that_never_touches_is_no_error(slides: tuple[forcegp.Dataset, Path]) -> None:
+    data, _ = slides
+    phase = torch.arange(len(data))[:, None] * torch.linspace(0.004, 0.007, 7, dtype=torch.float64)
+    above = torch.tensor([0.0, 0.2, 0.0, -0.9, 0.0, 0.9, 0.0], dtype=torch.float64) + 0.2 * torch.sin(phase)
+    log = logged((data.replace(q=above), slides[1]))
+    imported = import_log(log, "kuka_plane", parse_mapping(SLIDING.encode(), "m.toml"))
+    said = [finding.message for finding in imported.report.findings]
+    assert not imported.data.contact["table"].any()
+    assert any("closed in hardly any row" in text for text in said) and not any(
+        "nan" in text for text in said
+    )

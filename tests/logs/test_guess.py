@@ -153,3 +153,60 @@ def test_the_window_follows_the_noise(tmp_path: Path) -> None:
         )
         errors[window] = float(np.sqrt(((data.qdd.numpy() - true)[200:-200] ** 2).mean()))
     assert errors[proposal.window] < 0.1 * errors[11]
+
+
+def archive(folder: Path, log: dict[str, np.ndarray], **more: np.ndarray) -> Path:
+    """A NumPy archive of one array per quantity."""
+    np.savez(folder / "run.npz", t=log["t"], q=log["q"], tau=log["tau"], **more)  # type: ignore[arg-type]
+    return folder / "run.npz"
+
+
+def test_derivatives_spelled_with_d_are_no_positions(tmp_path: Path) -> None:
+    system, log = kuka_log()
+    qdd = np.gradient(log["qd"], DT, axis=0)
+    proposal = guess.guess_mapping(archive(tmp_path, log, d_q=log["qd"], d_d_q=qdd), system)
+    patterns = {name: family.pattern for name, family in proposal.families.items()}
+    assert patterns == {
+        "position": "q[{joint}]",
+        "velocity": "d_q[{joint}]",
+        "acceleration": "d_d_q[{joint}]",
+        "torque": "tau[{joint}]",
+    }
+    assert not any("also there" in doubt for doubt in proposal.doubts)
+
+
+def test_a_velocity_of_the_other_sign_is_asked_about(tmp_path: Path) -> None:
+    system, log = kuka_log()
+    turned = log["qd"] * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0])
+    proposal = guess.guess_mapping(archive(tmp_path, log, dq=turned), system)
+    assert list(proposal.families["velocity"].sign.values()) == [1.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0]  # type: ignore[union-attr]
+    assert "# CHECK: the velocity of some joints is minus" in proposal.toml()
+    proposal = guess.guess_mapping(archive(tmp_path, log, dq=log["qd"]), system)
+    assert not any("minus" in doubt for doubt in proposal.doubts)
+
+
+def test_a_boolean_array_is_the_state_of_the_contacts(tmp_path: Path) -> None:
+    _, log = kuka_log()
+    two = forcegp.load_scene("kuka_two_points").system()
+    closed = np.stack([log["t"] % 1.0 < 0.5, log["t"] % 0.7 < 0.3], axis=1)
+    proposal = guess.guess_mapping(archive(tmp_path, log, contact=closed), two)
+    found = {name: table["column"] for name, table in proposal.further.items()}
+    assert found == {f"contact.{name}": f"contact[{i}]" for i, name in enumerate(two.contact_names)}
+    assert any("in the order of the columns" in doubt for doubt in proposal.doubts)
+    one = guess.guess_mapping(archive(tmp_path, log, contact=closed[:, :1]), kuka_log()[0])
+    assert one.further["contact.table"] == {"source": "column", "column": "contact"}
+
+
+@pytest.mark.parametrize("rest", [("q", "qd", "tau"), ("own", "q", "qd", "tau")])
+def test_a_file_of_times_that_does_not_fit_is_named(tmp_path: Path, rest: tuple[str, ...]) -> None:
+    system, log = kuka_log()
+    files = {"time": np.append(log["t"], 9.0)[:, None], "own": log["t"][:, None], **log}
+    (tmp_path / "run").mkdir()
+    for name in ("time", *rest):
+        np.savetxt(tmp_path / "run" / f"{name}.txt", files[name])
+    if "own" not in rest:
+        with pytest.raises(MappingError, match=r"like time, with 600 rows[\s\S]*time\[0\] \(601 rows\)"):
+            guess.guess_mapping(tmp_path / "run", system)
+    else:
+        proposal = guess.guess_mapping(tmp_path / "run", system)
+        assert any("time[0] was left out: 601 rows" in doubt for doubt in proposal.doubts)

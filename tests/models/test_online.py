@@ -78,3 +78,30 @@ def test_samples_at_rest_change_no_fit_of_a_measured_robot(inference: str) -> No
     torch.testing.assert_close(one.mean, other.mean, rtol=SAME, atol=SAME)
     if inference == "sparse":
         assert fit.forget(still) is fit
+
+
+def test_only_samples_that_were_added_can_be_forgotten(tmp_path: Path) -> None:
+    fit = model().fit(data[:16], learn=[]).update(data[16:20])
+    grown = fit.update(data[20:])
+    states = draw(5, seed=3)
+    for each in (grown, grown.forget(data[:4])):
+        each.save(tmp_path / "model")
+        loaded = forcegp.load_model(tmp_path / "model")
+        assert isinstance(loaded, type(fit))
+        back = loaded.forget(data[20:])
+        same = fit if each is grown else fit.forget(data[:4])
+        for a, b in zip(
+            *((x.predict(*states).mean, x.predict(*states).covariance) for x in (back, same)), strict=True
+        ):
+            torch.testing.assert_close(a, b, rtol=SAME, atol=SAME)
+        with pytest.raises(ModelError, match="4 of 4 samples to forget were never added"):
+            back.forget(data[20:])
+    with pytest.raises(ModelError, match="1 of 5 samples to forget were never added"):
+        fit.forget(data[16:21])
+    other = data.replace(tau=data.tau + 1e-9)
+    with pytest.raises(ModelError, match="4 of 4 samples to forget were never added"):
+        fit.forget(other[:4])
+    with pytest.raises(ModelError, match="2 of 4 samples"):
+        fit.forget(data[[3, 3, 3, 4]])
+    with pytest.raises(ModelError, match="with their full weight"):
+        fit.forget(0.9).forget(data[:4])

@@ -140,3 +140,45 @@ def test_two_processes_equal_one(tmp_path: Path) -> None:
         want = fit.posterior.latent.weights  # type: ignore[attr-defined]
         assert float((got["weights"] - want).abs().max()) < ADDED * float(want.abs().max())
         assert float(got["likelihood"]) == pytest.approx(fit.log_marginal_likelihood, rel=ADDED)
+
+
+def refusals(folder: Path, processes: int, stops: bool = False) -> list[str]:
+    """What each of some processes says of a fit that cannot be made; none of them hangs."""
+    (folder / "store").unlink(missing_ok=True)
+    for file in folder.glob("*.error"):
+        file.unlink()
+    torch.multiprocessing.spawn(run, args=(processes, str(folder), stops), nprocs=processes)
+    return [file.read_text() for file in sorted(folder.glob("*.error"))]
+
+
+def test_processes_with_different_files_refuse_the_fit(tmp_path: Path) -> None:
+    data.write(tmp_path / "log.parquet")
+    data.replace(tau=data.tau + 1.0).write(tmp_path / "log.1.parquet")
+    said = refusals(tmp_path, 2)
+    assert len(said) == 2 and all("differ in the log" in text and "process 1" in text for text in said)
+
+
+@pytest.mark.parametrize(("processes", "missing"), [(1, False), (3, False), (2, True)])
+def test_a_distributed_fit_resumes_with_its_own_processes_only(
+    tmp_path: Path, processes: int, missing: bool
+) -> None:
+    data.write(tmp_path / "log.parquet")
+    (tmp_path / "recorded").touch()
+    assert len(refusals(tmp_path, 2, stops=True)) == 2
+    parts = sorted(tmp_path.glob("fit.part.sums.*"))
+    assert len(parts) == 2
+    if missing:
+        parts[1].unlink()
+    said = refusals(tmp_path, processes)
+    assert len(said) == processes and all("checkpoint" in text for text in said)
+    assert not list(tmp_path.glob("*.safetensors"))
+
+
+def test_a_distributed_fit_resumes(tmp_path: Path) -> None:
+    data.write(tmp_path / "log.parquet")
+    (tmp_path / "recorded").touch()
+    assert len(refusals(tmp_path, 2, stops=True)) == 2
+    assert not refusals(tmp_path, 2)
+    want = model().fit(data, learn=[]).posterior.latent.weights  # type: ignore[attr-defined]
+    got = load_file(tmp_path / "1.safetensors")["weights"]
+    assert float((got - want).abs().max()) < ADDED * float(want.abs().max())

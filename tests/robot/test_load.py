@@ -429,3 +429,24 @@ def test_joint_figures_are_read(tmp_path: Path) -> None:
 def test_options_are_checked(name: str, value: object) -> None:
     with pytest.raises(ShapeError, match=f"{name} is not valid"):
         forcegp.load_robot("kuka_iiwa", **{name: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("file", "limbs"),
+    [
+        ("anymal_b_simple_description/robots/anymal.urdf", 4),
+        ("hyq_description/robots/hyq_no_sensors.urdf", 4),
+        ("solo_description/robots/solo.urdf", 4),
+        ("allegro_hand_description/urdf/allegro_right_hand.urdf", 0),
+        ("ur_description/urdf/ur5_robot.urdf", 0),
+        ("tiago_description/robots/tiago_no_hand.urdf", 0),
+    ],
+)
+def test_a_walking_robot_without_a_base_joint_is_said_to_be_held(file: str, limbs: int) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        robot = forcegp.load_robot(example_data() / file)
+    held = [str(w.message) for w in caught if "no joint connects the base" in str(w.message)]
+    assert len(held) == (1 if limbs else 0)
+    assert all(f"with {limbs} limbs" in text and "floating base" in text for text in held)
+    assert [text for text in robot.remarks if "no joint connects" in text] == held

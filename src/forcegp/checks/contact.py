@@ -17,7 +17,8 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors
 from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
-from forcegp.robust import robust_std
+from forcegp.logs.contact import LEVEL, TOUCHING
+from forcegp.robust import level_of, robust_std
 from forcegp.rows import Intervals, describe, intervals
 
 OFFSET, TILT = 5e-4, np.radians(0.2)
@@ -109,8 +110,26 @@ def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
                 findings += [*placement, *_labels(contact, path, closed, usable, distance, log)]
             else:
                 slides = usable & ~closed & (path.approach <= CREEP)
-                findings += _missed(contact, path, slides, path.c, TOUCH, log)
+                missed = _missed(contact, path, slides, path.c, TOUCH, log)
+                findings += missed or _beside(contact, path, usable)
     return findings, log
+
+
+def _beside(contact: SurfaceContact, path: Path, usable: np.ndarray) -> list[Finding]:
+    """A tip that keeps one distance from the surface of a contact that is closed in no row."""
+    rows = usable & (np.linalg.norm(path.along, axis=1) > SLIDING_SLOW)
+    level = level_of(path.c[rows], TOUCHING, LEVEL)
+    if level is None or abs(level) <= TOUCHING:
+        return []
+    spread = 1e3 * float(robust_std(path.c[rows & (np.abs(path.c - level) <= TOUCHING)]))
+    text = (
+        f"contact {contact.name!r} is closed in no row, and the tip slides {1e3 * level:.3g} ± {spread:.2g} "
+        "mm from its surface: it may lie there (`forcegp import --fit-surface`), or the motion is free"
+    )
+    # A tip may hover over a surface, but not move inside the solid.
+    weight = "error" if level < 0.0 else "warning"
+    evidence = {"offset_m": level}
+    return [Finding("contact-far", text, intervals(rows), (), contact.name, evidence, weight)]
 
 
 def _placement(

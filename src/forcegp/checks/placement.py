@@ -11,11 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from forcegp.checks.contact import FAR, OFFSET, fit_surface, tip_path, touching
+from forcegp.checks.contact import FAR, OFFSET, SLIDING_SLOW, fit_surface, tip_path, touching
 from forcegp.checks.finding import Finding
-from forcegp.checks.hypotheses import Hypothesis, corrected, discrete, unchanged
+from forcegp.checks.fit import labelled_contacts
+from forcegp.checks.hypotheses import Hypothesis, changed, corrected, discrete, unchanged
 from forcegp.checks.log import Log, Outcome, displacement, evenly
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.logs.contact import LEVEL, TOUCHING, exchanged_joints
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
 
@@ -38,6 +40,20 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
         outcome = _explanation(system, contact, log, rows, min(OFFSET, BETTER * float(scatter)))
         if outcome is not None:
             return outcome
+    for contact in labelled_contacts(system, log):
+        # Labels by distance are lost with the place of the tip.
+        if isinstance(contact, SurfaceContact) and not log.contact[contact.name].any():
+            path = tip_path(system, contact, log)
+            moves = log.usable & (np.linalg.norm(path.v, axis=1) > SLIDING_SLOW)
+            on = (np.abs(path.c[moves]) <= TOUCHING).sum() > LEVEL * moves.sum()
+            if not on and (pair := exchanged_joints(system, contact, log.q[moves])):
+                both, c = tuple(log.joint_names[j] for j in pair), 1e3 * path.c[moves]
+                text = (
+                    f"the tip is {np.median(c):+.3g} ± {robust_std(c):.2g} mm from the surface of "
+                    f"{contact.name!r}, and on it if {' and '.join(both)} are exchanged"
+                )
+                found = log.finding("joint-order", text, both)
+                return [found], changed(log, ("q", "qd", "qdd", "tau"), order=pair)
     return [], log
 
 
@@ -58,7 +74,7 @@ def _explanation(
     """The change of angles that leaves the tip on the surface, if there is one."""
     angles = ((h, h.change(log)) for h in discrete(log) if h.name in ("joint-sign", "joint-order"))
     for candidates in (angles, _offsets(system, contact, log, rows)):
-        near = [(h, changed) for h, changed in candidates if _off(system, contact, changed, rows) <= most]
+        near = [(h, other) for h, other in candidates if _off(system, contact, other, rows) <= most]
         if near:
             # Two joints that turn in one plane and their mirror image touch alike.
             alike = [h for h, _ in near if h.name == near[0][0].name]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -146,11 +146,11 @@ def model_table(config: Path | None, scene: str | None) -> ModelTable:
     return default_model_table() if scene is None else load_scene(scene).model
 
 
-def warn_beyond(model: Predictor, data: Dataset) -> None:
-    """Print a warning where a model is asked for states far from those that it was trained on."""
+def warn_beyond(model: Predictor, data: Dataset, doubts: Iterable[str] = ()) -> None:
+    """Print doubts about predictions, and whether states are far from those that the model was trained on."""
     from forcegp.forces.noise import warnings_beyond
     from forcegp.models.structured_fit import StructuredFit
 
     beyond = model.beyond(data.qd, data.tau) if isinstance(model, StructuredFit) else None
-    for doubt in () if beyond is None else warnings_beyond(beyond, data.joint_names):
+    for doubt in (*doubts, *(() if beyond is None else warnings_beyond(beyond, data.joint_names))):
         typer.secho(f"warning: {doubt}", fg="yellow", err=True)

@@ -80,7 +80,7 @@ def import_(
         show(_guess(log, system, guess), as_json)
         return
     with progress_bar(f"reading {log.name}", 1) as advance:
-        imported = import_log(log, system, mapping, progress=advance)
+        imported = import_log(log, system, mapping, advance, displaced=fit_surface is not None)
     write_or_keep(imported.data.write, place)
     result = _json(imported) if as_json else _summary(imported)
     if fit_surface is not None:

@@ -92,9 +92,10 @@ def predict(
     if sensor and quantity != "multiplier":
         raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
     with progress_bar(f"predicting {quantity}", len(test)) as progress:
-        predicted = partial(_predicted, regression, quantity=quantity, noise=noise, sensor=sensor)
+        doubts: dict[str, None] = {}
+        predicted = partial(_predicted, regression, doubts, quantity=quantity, noise=noise, sensor=sensor)
         mean, std = in_chunks(predicted, test, progress)
-    warn_beyond(regression, test)
+    warn_beyond(regression, test, doubts)
     test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", mean)
     if std is not None:
         test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}_std", std)
@@ -103,8 +104,10 @@ def predict(
     show({**result, "file": str(out)}, as_json)
 
 
-def _predicted(model: Predictor, part: Dataset, quantity: str, noise: bool, sensor: bool) -> Moments:
-    """Mean and standard deviation of a quantity at some states."""
+def _predicted(
+    model: Predictor, doubts: dict[str, None], part: Dataset, quantity: str, noise: bool, sensor: bool
+) -> Moments:
+    """Mean and standard deviation of a quantity at some states; `doubts` gets what is not determined."""
     from forcegp.errors import ModelError
     from forcegp.models.sensed import force_from_sensor
     from forcegp.models.structured_fit import StructuredFit
@@ -119,6 +122,7 @@ def _predicted(model: Predictor, part: Dataset, quantity: str, noise: bool, sens
         prediction = model.predict(*states, quantity, active=active, noise=True)
     else:
         prediction = model.predict(*states, quantity, active=active)
+    doubts.update(dict.fromkeys(prediction.doubts))
     return prediction.mean, prediction.std
 
 

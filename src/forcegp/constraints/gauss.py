@@ -43,6 +43,11 @@ def rank_tolerance(dtype: torch.dtype) -> float:
     return max(RANK_TOLERANCE, ROUNDING * torch.finfo(dtype).eps)
 
 
+def nothing(dtype: torch.dtype) -> float:
+    """Size of a row of A G⁻ᵀ that is rounding of zero [1/√kg]: of a point that cannot move."""
+    return ROUNDING * torch.finfo(dtype).eps
+
+
 FACING_DOWN = 1e-6
 """A normal is −e_z where 1 + n_z is below this; the smallest rotation has no direction there."""
 
@@ -110,6 +115,8 @@ class Equations:
         contact_points: the touching point of each surface contact, by name.
         links: computes the poses and the motion of the links at the states, where more of the kinematics is
             asked for.
+        holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, along the surface where they
+            stick.
     """
 
     M: JointMatrix
@@ -122,6 +129,7 @@ class Equations:
     Q_D: JointVector
     contact_points: dict[str, ContactPoint]
     links: Callable[[], tuple[LinkPoses, LinkMotion]]
+    holds: Tensor
 
     @cached_property
     def _links(self) -> tuple[LinkPoses, LinkMotion]:
@@ -167,9 +175,9 @@ class Equations:
         if W.shape[-2] == 1:
             # w⁺ = w/|w|²
             square = W.square().sum(-1, keepdim=True)
-            # An inactive row is zero, and stays so.
-            return (W / square.masked_fill(square == 0.0, 1.0)).mT
-        return torch.linalg.pinv(W, rtol=rank_tolerance(W.dtype))
+            # The row of an inactive contact, or of a point that cannot move, is zero, and stays so.
+            return (W / square.masked_fill(square <= nothing(W.dtype) ** 2, torch.inf)).mT
+        return torch.linalg.pinv(W, atol=nothing(W.dtype), rtol=rank_tolerance(W.dtype))
 
     @cached_property
     def constraint_inertia(self) -> Tensor:
@@ -181,8 +189,15 @@ class Equations:
         """`(*batch,)` number of independent active constraint rows."""
         W = self.scaled_jacobian
         if W.shape[-2] <= 1:
-            return W.any(-1).sum(-1)
-        return torch.linalg.matrix_rank(W, rtol=rank_tolerance(W.dtype))
+            return (W.square().sum(-1) > nothing(W.dtype) ** 2).sum(-1)
+        return torch.linalg.matrix_rank(W, atol=nothing(W.dtype), rtol=rank_tolerance(W.dtype))
+
+    @cached_property
+    def hidden(self) -> Tensor:
+        """Projector on multipliers of rows that hold and change no motion, Aᵀμ = 0 `(*batch, m, m)`: ones of
+        points that cannot move, fractions where contacts share their load."""
+        # R = 1 − W W⁺
+        return torch.diag_embed(self.holds.to(self.M)) - self.scaled_jacobian @ self.scaled_inverse
 
     @cached_property
     def L(self) -> ConstraintInverse:

@@ -215,11 +215,11 @@ class ConstrainedSystem:
         links: Callable[[], tuple[LinkPoses, LinkMotion]],
     ) -> Equations:
         """The equations of motion from M, Q_C, Q_G and Q_D of the robot and the terms of the constraints."""
-        c, cd, A, b = self._rows(q, qd, terms, active)
+        c, cd, A, b, holds = self._rows(q, qd, terms, active)
         touching = zip(self.contact_names, (term.point for term in terms), strict=True)
         points = {name: point for name, point in touching if point is not None}
         M, Q_C, Q_G, Q_D = robot_terms
-        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, links)
+        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, links, holds)
 
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
@@ -251,7 +251,7 @@ class ConstrainedSystem:
             eom = self.equations(q, qd, active)
 
         def rows(q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-            return self._rows(q, qd, self._terms(q, qd)[2], active)[2:]
+            return self._rows(q, qd, self._terms(q, qd)[2], active)[2:4]
 
         return linearize(self.robot, eom, rows, q, qd, force)
 
@@ -274,8 +274,8 @@ class ConstrainedSystem:
 
     def _rows(
         self, q: Tensor, qd: Tensor, terms: Sequence[ConstraintTerms], active: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """c and ċ of all contacts, and the stabilized A and b of the active ones."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """c and ċ of all contacts, the stabilized A and b of the active ones, and which rows hold."""
         if len(terms) == 1:
             c, A, b = terms[0].c, terms[0].A, terms[0].b
         else:
@@ -292,4 +292,4 @@ class ConstrainedSystem:
         if any(term.holds is not None for term in terms):
             holds = [torch.ones_like(t.b, dtype=torch.bool) if t.holds is None else t.holds for t in terms]
             open_ = open_ | torch.cat(holds, dim=-1).logical_not()
-        return c, cd, A.masked_fill(open_[..., None], 0.0), b.masked_fill(open_, 0.0)
+        return c, cd, A.masked_fill(open_[..., None], 0.0), b.masked_fill(open_, 0.0), ~open_

@@ -104,9 +104,14 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 
 
 def check_values(data: Fields) -> None:
-    """Check that every number is finite, and that time increases within each segment."""
+    """Check that every number is finite, and that time increases within each segment.
+
+    Predictions of what is not determined are NaN.
+    """
     for name, value in (("t", data.t), *named_columns(data).items()):
         wrong = ~(value.abs() <= LOGGED_VALUE)
+        if name.startswith("predicted_"):
+            wrong &= ~value.isnan()
         if bool(wrong.any()):
             place = torch.nonzero(wrong)[0].tolist()
             column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]
@@ -172,6 +177,10 @@ def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
     return torch.where(index < 0, index + n, index).to(torch.int64)
 
 
+TURN, MOST_RADIANS = 6.3, 60.0
+"""Angles beyond which a joint has turned once, and at most, if it has no limit [rad]."""
+
+
 class RobotMismatchWarning(UserWarning):
     """The data were logged on a robot whose parameters differ from those of the robot they are used with."""
 
@@ -199,8 +208,22 @@ def lock_hint(joints: Sequence[str]) -> str:
 
 
 def check_robot(data: Fields, robot: RobotModel) -> None:
-    """Check that a log is of a robot's joints, in its order; other parameters of the robot are a warning."""
+    """Check that a log is of a robot's joints, in its order; other parameters of the robot are a warning, and
+    so are angles that look like degrees."""
     check_joints(data.joint_names, robot.joint_names, robot.name)
+    q, free = data.q.to(robot.lower) * robot.revolute, torch.full_like(robot.lower, MOST_RADIANS)
+    low, high = (
+        robot.lower.where(robot.lower.isfinite(), -free),
+        robot.upper.where(robot.upper.isfinite(), free),
+    )
+    beyond, most = int(((q < low) | (q > high)).any(-1).sum()), float(q.abs().max()) if len(data) else 0.0
+    if most > TURN and 2 * beyond > len(data):
+        warnings.warn(
+            f"angles reach {most:.4g} rad, beyond the range of {robot.name!r} in {beyond} of {len(data)} "
+            "rows: were they logged in degrees? (`forcegp check`)",
+            RobotMismatchWarning,
+            stacklevel=3,
+        )
     logged = data.header.robot_fingerprint
     if logged is not None and logged != robot.fingerprint:
         warnings.warn(

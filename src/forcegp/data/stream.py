@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -197,6 +198,16 @@ class StreamedDataset:
     def files(self) -> tuple[Path, ...]:
         """The files as paths."""
         return tuple(map(Path, (self.paths,) if isinstance(self.paths, str | Path) else self.paths))
+
+    @property
+    def digest(self) -> int:
+        """A number that belongs to the bytes of all files."""
+        digest = hashlib.sha256()
+        for path in self.files:
+            with path.open("rb") as file:
+                for part in iter(lambda file=file: file.read(1 << 20), b""):
+                    digest.update(part)
+        return int.from_bytes(digest.digest()[:8], "little", signed=True)
 
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:

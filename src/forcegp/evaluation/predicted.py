@@ -151,9 +151,10 @@ def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...
 
 
 def _comparable(model: Predictor, data: Dataset) -> bool:
-    """Whether the normal force was logged for one of the contacts."""
+    """Whether the normal force was logged for one of the contacts that the model was trained on."""
     logged = data.contact_extras.get("multiplier", {})
-    return any(name in logged for name in model.system.contact_names)
+    never = model.result.never_closed if isinstance(model, StructuredFit) else ()
+    return any(name in logged and name not in never for name in model.system.contact_names)
 
 
 def _scores(model: Predictor, data: Dataset, mean: Tensor, std: Tensor | None) -> tuple[MultiplierScore, ...]:
@@ -161,7 +162,7 @@ def _scores(model: Predictor, data: Dataset, mean: Tensor, std: Tensor | None) -
     names = model.system.contact_names
     scores, logged, active = [], data.contact_extras["multiplier"], data.active(names)
     for i, (name, rows) in enumerate(zip(names, active.T, strict=True)):
-        if name not in logged or int(rows.sum()) < 2:
+        if name not in logged or int(rows.sum()) < 2 or bool(mean[rows, i].isnan().any()):
             continue
         both = torch.stack([mean[rows, i], logged[name][rows]])
         error, varies = both[0] - both[1], bool((both.std(1) > 0.0).all())

@@ -69,6 +69,13 @@ class Measurement:
         time = torch.stack([self.t, self.segment.to(self.t)], dim=-1)
         return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
 
+    @property
+    def digests(self) -> Tensor:
+        """A number for each sample that no other one has, but by a rare chance `(n,)`."""
+        x = torch.cat([part.double() for part in self.tensors], dim=-1).contiguous().view(torch.int64)
+        odd = torch.randint(2**62, x.shape[-1:], generator=torch.Generator().manual_seed(0)).to(x) * 2 + 1
+        return ((x ^ (x >> 32)) * odd).sum(-1)
+
     def __getitem__(self, rows: Tensor) -> Measurement:
         """The values at some of the states."""
         return Measurement(self.quantity, *(part[rows] for part in (*self.tensors, self.segment, self.t)))
@@ -126,6 +133,16 @@ class Training:
         """Most accelerations in free motion that one measurement has."""
         free = [int((~m.active.any(-1)).sum()) for m in self.measurements if m.quantity == "qdd"]
         return max(free, default=0)
+
+    @property
+    def digests(self) -> Tensor:
+        """A number for each sample of all measurements."""
+        return torch.cat([m.digests for m in self.measurements])
+
+    def never_closed(self, system: ConstrainedSystem) -> tuple[str, ...]:
+        """Contacts that are closed at no sample."""
+        closed = torch.stack([m.active.any(0) for m in self.measurements]).any(0).tolist()
+        return tuple(name for name, seen in zip(system.contact_names, closed, strict=True) if not seen)
 
     def thinned(self, samples: int) -> Training:
         """About this many samples: the farthest points among the distinct states of each measurement."""

@@ -25,7 +25,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombFriction, coupled, with_coulomb
-from forcegp.forces.quantities import AffineMap, States, affine_map
+from forcegp.forces.quantities import OPEN, AffineMap, States, affine_map, hidden_forces
 from forcegp.gp.draws import FunctionSamples
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Features, Standardization
@@ -258,8 +258,12 @@ def draw_samples(
 
 CORRELATION_STATES = 50
 """Training states at which the correlation of Q and Q_z is evaluated after a fit."""
+FAR = 0.02
+"""Distance from its surface at which a closed contact is doubted [m]."""
 UNDETERMINED = 10.0
 """Standard deviations of the multiplier per its size from which a fit warns."""
+MISSED = 2.0
+"""Root mean square of residuals, in units of the noise, from which a fit warns."""
 LARGE_JITTER = 0.01
 """Jitter, relative to unit noise, from which a fit warns: the noise grows by half of it."""
 
@@ -301,29 +305,52 @@ class Doubts:
     warnings: tuple[str, ...]
 
 
-def doubts_of(posterior: ForcePosterior, system: ConstrainedSystem, training: Training) -> Doubts:
-    """What a posterior is doubtful about at some of its training states in contact.
+def doubts_of(
+    posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float = 1.0
+) -> Doubts:
+    """What a posterior is doubtful about, at some of its training states in contact and on the whole.
 
     Args:
         posterior: over latent forces.
         system: robot and contacts.
         training: what the posterior is conditioned on.
+        power: κ, by which the rows of the posterior are tempered.
     """
     few = training.evenly(min(CORRELATION_STATES, training.samples)).measurements if training.samples else ()
     # Elsewhere Q_z is zero, and there is no multiplier.
     closed = [m[m.active.any(-1).nonzero()[:, 0]] for m in few]
     targets = {prior.target for prior in posterior.priors}
-    means, variances, correlations = [], [], []
+    means, variances, correlations, warnings = [], [], [], ()
     for m in (m for m in closed if len(m.q)):
         at = m.at(system)
+        off = at.eom.c.abs().where(at.eom.holds, 0.0).amax(0).tolist()
+        names = [c.name for c in system.contacts for _ in range(c.rows)]
+        warnings += tuple(
+            f"contact {name} is closed up to {1e3 * c:.3g} mm off its surface: check surface, point and "
+            "labels (`forcegp check`)"
+            for name, c in zip(names, off, strict=True)
+            if c > FAR
+        )
         mean, covariance = posterior.read(system, at, affine_map(system, at, "multiplier"))
-        loaded = system.active_rows(m.active, m.active.shape[:-1])
+        loaded, hidden = at.eom.holds, hidden_forces(system, at, {"multiplier": slice(0, system.m)})
+        if hidden is not None:
+            loaded, warnings = loaded & ~hidden.whole, (*warnings, *hidden.doubts)
         means.append(mean[loaded])
         variances.append(covariance.diagonal(dim1=-2, dim2=-1)[loaded])
         if {JOINT, CONTACT} <= targets:
             correlations.append(force_correlation(posterior, system, at))
     correlation = float(torch.cat(correlations).mean()) if correlations else None
-    warnings = _on_multiplier(torch.cat(means), torch.cat(variances)) if means else ()
+    warnings = tuple(dict.fromkeys(warnings))
+    if means and len(torch.cat(means)):
+        warnings += _on_multiplier(torch.cat(means), torch.cat(variances))
+    never = training.never_closed(system)
+    warnings += (OPEN[0].format(", ".join(never)),) if never else ()
+    residual = (posterior.latent.residual / power) ** 0.5
+    if residual > MISSED:
+        warnings += (
+            f"the model misses its training data by far: residuals are {residual:.3g} times the noise; check "
+            "the log and the robot file (`forcegp check`), or allow for other forces or a larger noise",
+        )
     jitter = posterior.latent.jitter
     if jitter >= LARGE_JITTER:
         warnings += (

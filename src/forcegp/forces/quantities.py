@@ -14,7 +14,7 @@ The mechanics are differentiated in closed form, the force field by autograd.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -181,15 +181,18 @@ def _constraint_force(system: ConstrainedSystem, at: States) -> AffineMap:
 def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
     """F_I = ∇c λ of each surface contact, and (t_1, t_2) λ_t where it sticks: three Cartesian components per
     contact, in the order of the contacts."""
-    multiplier = _multiplier(system, at)
-    # F_I = N λ, with the directions of each contact in its rows and columns of N
+    return _times(_directions(system, at), _multiplier(system, at))
+
+
+def _directions(system: ConstrainedSystem, at: States) -> Tensor:
+    """N with F_I = N λ `(n, 3 k, m)`: the directions of each surface contact in its rows and columns."""
     blocks, first = [at.q.new_zeros(len(at.q), 0, system.m)], 0
     for contact in system.contacts:
         if contact.name in at.eom.contact_points:
             own = at.eom.contact_points[contact.name].directions(contact.rows)
             blocks.append(torch.nn.functional.pad(own, (first, system.m - first - contact.rows)))
         first += contact.rows
-    return _times(torch.cat(blocks, dim=1), multiplier)
+    return torch.cat(blocks, dim=1)
 
 
 def _total_force(system: ConstrainedSystem, at: States) -> AffineMap:
@@ -247,6 +250,92 @@ def affine_maps(
         return next(iter(maps.values())), rows
     filled = [z._replace(B_N=torch.zeros_like(z.B_Q)) if z.B_N is None else z for z in maps.values()]
     return AffineMap(*(torch.cat(parts, dim=1) for parts in zip(*filled, strict=True))), rows
+
+
+ROUNDED = 1e-6
+"""Entries of the projector on hidden multipliers that are rounding of 0, or of 1."""
+OPEN = (
+    "contact {} was closed in no training sample: its force is not determined",
+    "the point of contact {} cannot move against it: its force is not determined",
+    "contacts {} hold the robot in the same direction: only the sum of their forces is determined",
+)
+"""What motion leaves open of the forces of contacts."""
+
+
+class Hidden(NamedTuple):
+    """What motion leaves open of quantities.
+
+    Attributes:
+        whole: `(n, d)` bool, components that are not determined at all.
+        shared: `(n, d, d)` C R Cᵀ, how contacts share their load, where R projects on Aᵀμ = 0.
+        seen: `(n,)` number of directions that motion shows of the load that is shared.
+        doubts: the same in words.
+    """
+
+    whole: Tensor
+    shared: Tensor
+    seen: Tensor
+    doubts: tuple[str, ...]
+
+    def applied(self, mean: Tensor, covariance: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Mean `(n, d)` and covariance with NaN for what is not determined; a direction that motion does not
+        show has as prior variance the mean square of those that it shows."""
+        if covariance is not None:
+            square = mean.square() + covariance.diagonal(dim1=-2, dim2=-1)
+            of_shared = square * (self.shared.diagonal(dim1=-2, dim2=-1) > 0.0)
+            prior = of_shared.sum(-1) / self.seen.clamp(min=ROUNDED)
+            covariance = covariance + prior[:, None, None] * self.shared
+            covariance = covariance.masked_fill(self.whole[..., None] | self.whole[:, None], torch.nan)
+        return mean.masked_fill(self.whole, torch.nan), covariance
+
+
+def hidden_forces(
+    system: ConstrainedSystem, at: States, parts: Mapping[str, slice], never: Sequence[str] = ()
+) -> Hidden | None:
+    """What is hidden of some quantities; `None` where all of them are determined.
+
+    Args:
+        system: robot and contacts.
+        at: n states.
+        parts: the rows of each quantity, as `affine_maps` gives them.
+        never: contacts that were closed in no training sample.
+
+    Raises:
+        ModelError: nothing is asked for but forces of such contacts.
+    """
+    names = [c.name for c in system.contacts for _ in range(c.rows)]
+    if not names or not {"multiplier", "contact_force", "constraint_force"} & set(parts):
+        return None
+    unseen = torch.tensor([name in never for name in names], device=at.q.device)
+    R = at.eom.hidden
+    part = R.diagonal(dim1=-2, dim2=-1)
+    fixed, shares = part > 1.0 - ROUNDED, (part > ROUNDED) & (part <= 1.0 - ROUNDED)
+    found = [rows.reshape(-1, system.m).any(0).tolist() for rows in (unseen, fixed & ~unseen, shares)]
+    if not any(map(any, found)):
+        return None
+    C = at.q.new_zeros(len(at.q), max(rows.stop for rows in parts.values()), system.m)
+    whole = torch.zeros_like(C[..., 0], dtype=torch.bool)
+    for quantity, rows in parts.items():
+        if quantity == "multiplier":
+            C[:, rows], whole[:, rows] = torch.eye(system.m).to(at.q), fixed | unseen
+        elif quantity == "contact_force":
+            C[:, rows] = _directions(system, at)
+            own = ((C[:, rows] != 0.0) & (fixed | unseen)[:, None]).any(-1).unflatten(-1, (-1, 3))
+            whole[:, rows] = own.any(-1, keepdim=True).expand_as(own).flatten(1)
+        elif quantity == "constraint_force":
+            whole[:, rows] = unseen.any()
+    if bool(whole.all()) and any(found[0]):
+        raise ModelError(
+            OPEN[0].format(", ".join(never)),
+            expected="motion in contact among the training data",
+            hint="check where its surface lies (`forcegp check`); to read forces that were learned in free "
+            "motion, pass predict the system with the contact",
+        )
+    listed = (", ".join(dict.fromkeys(n for n, hit in zip(names, own, strict=True) if hit)) for own in found)
+    doubts = tuple(text.format(own) for text, own in zip(OPEN, listed, strict=True) if own)
+    seen = ((1.0 - part) * shares).sum(-1) * len({"multiplier", "contact_force"} & set(parts))
+    shared = C @ (R * shares[..., None]) @ C.mT
+    return Hidden(whole, shared, seen, doubts) if bool(whole.any() | shared.any()) else None
 
 
 def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:

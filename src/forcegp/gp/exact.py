@@ -75,6 +75,12 @@ class ExactPosterior:
         return condition(self.processes, self.params, self.blocks)
 
     @property
+    def residual(self) -> float:
+        """Mean square of what the posterior mean leaves of the rows, in units of the noise."""
+        # y − K α = α
+        return float(self.alpha.square().mean()) if len(self.alpha) else 0.0
+
+    @property
     def jitter(self) -> float:
         """Added to the diagonal to factorise, relative to unit noise."""
         return self.conditioned.jitter

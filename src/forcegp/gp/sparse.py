@@ -186,6 +186,13 @@ class SparsePosterior:
         """A⁻¹v, the posterior mean of the basis functions' weights `(size,)`."""
         return torch.cholesky_solve(self.moments.v[:, None], self.L)[:, 0]
 
+    @property
+    def residual(self) -> float:
+        """Mean square of what the posterior mean leaves of the rows, in units of the noise."""
+        # |y − Φ w|² = yᵀy − vᵀw − wᵀw with (I + ΦᵀΦ) w = v
+        w, rows = self.weights, self.moments.rows.clamp(min=1.0)
+        return max(0.0, float((self.moments.yy - self.moments.v @ w - w @ w) / rows))
+
     @cached_property
     def measured(self) -> tuple[bool, ...]:
         """Of each process, whether any row shows it; the samples change nothing about the others."""

@@ -249,6 +249,22 @@ def add_over_processes(x: Tensor) -> Tensor:
     return total
 
 
+def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
+    """Check that some numbers are the same in all processes; it raises in all of them, or in none.
+
+    Raises:
+        ModelError: they differ, or no group of processes has been initialised.
+    """
+    _require_processes()
+    own = torch.tensor(values, dtype=torch.int64)
+    every = [torch.empty_like(own) for _ in range(dist.get_world_size())]
+    dist.all_gather(every, own)
+    differ = [str(rank) for rank, x in enumerate(every) if not torch.equal(x, every[0])]
+    if differ:
+        got = f"another one in process {', '.join(differ)} than in process 0"
+        raise ModelError(f"the processes of a distributed fit differ in {what}", got=got, hint=hint)
+
+
 def share_basis(basis: LatentBasis) -> LatentBasis:
     """The basis of the first process in all of them, which must hold one of the same shapes.
 

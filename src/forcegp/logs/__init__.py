@@ -95,8 +95,12 @@ def import_log(
     scene: Scene | ConstrainedSystem | RobotModel | str | Path,
     mapping: Mapping | str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    displaced: bool = False,
 ) -> Imported:
-    """Read a log as `read_log` does, and say what was found and done; `progress` gets work done and total."""
+    """Read a log as `read_log` does, and say what was found and done; `progress` gets work done and total.
+
+    With `displaced`, a contact by distance whose tip slides beside the surface of the scene is closed there.
+    """
     system = system_of(scene)
     robot = system.robot
     if mapping is None:
@@ -110,7 +114,7 @@ def import_log(
         numbers = NUMBERS * len(signals.joint_names) * len(signals)
         announce_memory(8 * numbers, f"importing {len(signals):,} rows")
         even_clock(signals, log_mapping.sections.time.period, report)
-        evidence = _contacts(signals, system, log_mapping, report)
+        evidence = _contacts(signals, system, log_mapping, report, displaced)
         std = add_derivatives(signals, log_mapping.sections.derivatives, report)
         data = _dataset(signals, std, log_mapping, system, report)
     except DataError as error:
@@ -128,11 +132,11 @@ def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> Con
 
 
 def _contacts(
-    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
+    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport, displaced: bool
 ) -> list[Evidence]:
     """Find the state of each contact; λ needs accelerations, which are first computed across the switches."""
     if not any(section.source == "multiplier" for section in mapping.sections.contact.values()):
-        return detect(signals, system, mapping, report)
+        return detect(signals, system, mapping, report, displaced)
     copies = {name: value.copy() for name, value in signals.vectors.items()}
     trial = replace(signals, vectors=copies, contact={}, row=np.arange(len(signals)))
     add_derivatives(trial, mapping.sections.derivatives, ImportReport(report.source))
@@ -140,7 +144,7 @@ def _contacts(
     kept[trial.row] = True
     signals.keep(kept)
     signals.segment, trial.row, trial.contact = trial.segment, signals.row, signals.contact
-    evidence = detect(trial, system, mapping, report)
+    evidence = detect(trial, system, mapping, report, displaced)
     signals.contact = trial.contact
     return evidence
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from forcegp.errors import DataError
 from forcegp.logs.mapping import ContactStateSection, Mapping
 from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.robot import RobotModel
-from forcegp.robust import robust_std
+from forcegp.robust import level_of, robust_std
 from forcegp.rows import runs
 
 CHUNK = 1 << 12
@@ -121,6 +122,15 @@ closed from where the force leaves the open level by so many of them."""
 TOUCHING, DISTANCE_STD, SMALLEST_DISTANCE = 1e-3, 6.0, 1e-6
 """A contact is closed up to so many deviations of the distances of the closed contact above their median, at
 least for rounding and at most [m], unless the mapping says otherwise."""
+TOUCHED, LEVEL, INSIDE = 0.02, 0.2, 0.95
+"""Share of rows on the surface from which a contact is where the scene says; shares of moving rows at one
+distance, and of rows inside the solid, from which it is not."""
+SLIDING, TRIED_ROWS = 0.01, 500
+"""Speed from which a tip moves [m/s], and rows on which exchanged joints are tried."""
+ELSEWHERE = (
+    "see where it slides with --fit-surface plane (or sphere), and correct the scene; "
+    'for free motion, set source = "never" under [contact.{}]'
+)
 BINS = 512
 """Bins of the histogram that the two levels are told apart in."""
 
@@ -148,20 +158,32 @@ class Evidence:
     def sentence(self) -> str:
         """The evidence in one sentence."""
         unit, scale = ("mm", 1e3) if self.source == "distance" else ("N", 1.0)
-        closed = f"{scale * self.closed_level:.3g} ± {scale * self.closed_spread:.2g} {unit}"
-        open_ = f"{scale * self.open_level:.3g} ± {scale * self.open_spread:.2g} {unit}"
+        states = (
+            (self.closed_level, self.closed_spread, "closed"),
+            (self.open_level, self.open_spread, "open"),
+        )
+        listing = "".join(
+            f", {scale * level:.3g} ± {scale * spread:.2g} {unit} {state}"
+            for level, spread, state in states
+            if np.isfinite(level)
+        )
         return (
-            f"contact {self.contact!r} by {self.source}: {len(self.intervals)} closed intervals, "
-            f"{closed} closed, {open_} open, threshold {scale * self.threshold:.3g} {unit}"
+            f"contact {self.contact!r} by {self.source}: {len(self.intervals)} closed intervals{listing}, "
+            f"threshold {scale * self.threshold:.3g} {unit}"
         )
 
 
 def detect(
-    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
+    signals: Signals,
+    system: ConstrainedSystem,
+    mapping: Mapping,
+    report: ImportReport,
+    displaced: bool = False,
 ) -> list[Evidence]:
     """Set `signals.contact` for every contact of the scene, and return the evidence for those detected.
 
-    Contacts found from λ need `qd` and `qdd`.
+    Contacts found from λ need `qd` and `qdd`. A tip that slides beside its surface is an error, or with
+    `displaced` in contact with a surface that lies elsewhere.
     """
     sections = mapping.sections.contact
     for name in sections:
@@ -187,6 +209,8 @@ def detect(
             raise mapping.error(("contact", name, "source"), text, "column, always or never")
         else:
             values = _evidence(signals, system, mapping, contact, source)
+            if source == "distance" and sections[name].threshold is None:
+                values = values - _misplaced(signals, system, contact, values, displaced, report)
             states[name], detection = _detect(signals, values, name, sections[name])
             evidence.append(detection)
             report.find("contact", detection.sentence(), signals.row[states[name]])
@@ -194,6 +218,55 @@ def detect(
                 report.find("short contact", f"{detection.merged} intervals of {name!r} were too short")
     signals.contact = states
     return evidence
+
+
+def _misplaced(
+    signals: Signals,
+    system: ConstrainedSystem,
+    contact: SurfaceContact,
+    c: Array,
+    displaced: bool,
+    report: ImportReport,
+) -> float:
+    """Distance from the scene's surface at which the tip slides [m], 0 where it touches.
+
+    Raises:
+        DataError: the tip never touches: the surface lies elsewhere, or two joints are exchanged.
+    """
+    if len(c) < 2 or (np.abs(c) <= TOUCHING).mean() > TOUCHED:
+        return 0.0
+    p, name = _rowwise(signals, ("q",), lambda q: _tip(system, contact, q)), contact.name
+    moves = np.linalg.norm(np.gradient(p, axis=0), axis=1) > SLIDING * np.median(np.diff(signals.t))
+    level, (middle, spread) = level_of(c[moves], TOUCHING, LEVEL), level_and_spread(1e3 * c)
+    where = f"{middle:.3g} ± {spread:.2g} mm"
+    if level is not None and displaced:
+        report.find("contact", f"contact {name!r} was taken where the tip slides, {1e3 * level:.3g} mm off")
+        return level
+    pair = exchanged_joints(system, contact, signals.vectors["q"][moves])
+    exchanged = " and ".join(signals.joint_names[j] for j in pair)
+    if exchanged or level is not None or (c < -TOUCHING).mean() > INSIDE:
+        raise DataError(
+            f"the tip is {where} from the surface of contact {name!r} (below 0: inside the solid)"
+            + (f", and on it with the columns of {exchanged} exchanged" if exchanged else ""),
+            expected=f"rows within {1e3 * TOUCHING:g} mm",
+            got="none" if level is None else f"sliding at {1e3 * level:.3g} mm",
+            hint="match columns to joints by name in the mapping" if exchanged else ELSEWHERE.format(name),
+        )
+    nearest = 1e3 * float(np.abs(c).min())
+    report.find("contact", f"contact {name!r} is closed in hardly any row: {where}, {nearest:.3g} at least")
+    return 0.0
+
+
+def exchanged_joints(system: ConstrainedSystem, contact: SurfaceContact, q: Array) -> tuple[int, ...]:
+    """The two joints whose exchange puts the tip on its surface in some of the rows, if there are such."""
+    q = q[:: max(1, len(q) // TRIED_ROWS)]
+    for pair in combinations(range(q.shape[1]) if len(q) else (), 2):
+        order = np.arange(q.shape[1])
+        order[list(pair)] = pair[::-1]
+        c = contact.center_surface.value(_tip(system, contact, torch.from_numpy(q[:, order])))
+        if float((c.abs() <= TOUCHING).double().mean()) > LEVEL:
+            return pair
+    return ()
 
 
 def _detect(

@@ -16,6 +16,7 @@ import torch
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.data.checks import MOST_RADIANS
 from forcegp.data.derivative import cross_validated_window
 from forcegp.errors import DataError
 from forcegp.logs import units
@@ -35,8 +36,8 @@ ROWS = 100_000
 """Rows that are looked at."""
 TRIED_ROWS = 3000
 """Rows on which the inverse dynamics are evaluated."""
-MOST_RADIANS, LEAST_DEGREES = 60.0, 3.2
-"""Positions beyond the first are in degrees; below the second, an arm in degrees would hardly move."""
+LEAST_DEGREES = 3.2
+"""Largest position [°] below which an arm in degrees would hardly move."""
 CLEARER = 1.5
 """A unit is certain if the torque fits so much better than in the other one."""
 NEAR = 1.3
@@ -142,6 +143,9 @@ def _velocity_unit(draft: Draft, trial: Signals) -> None:
         family.unit = unit
         draft.say("velocity", f"{unit}: {slope:.3g} times the derivative of the position in rad/s")
     family.sign = _signs(slopes, moving, trial.joint_names)
+    if family.sign != 1.0:
+        turned = "all joints" if family.sign == -1.0 else "some joints"
+        draft.say("velocity", f"the velocity of {turned} is minus the derivative of the position", doubt=True)
 
 
 def _signs(slopes: Array, clear: np.ndarray, joints: tuple[str, ...]) -> float | dict[str, float]:
@@ -210,12 +214,16 @@ def propose_contacts(
     log: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
 ) -> None:
     """Write into a draft how the state of each contact of the scene may be known; `signals` reads the log."""
-    for contact in system.contacts:
+    named = [(c, x) for s in log.streams for c, x in s.columns.items() if "contact" in c.lower()]
+    flags = [name for name, x in named if np.isin(x, (0.0, 1.0)).all()]
+    in_order = flags if len(system.contacts) in (1, len(flags)) else []
+    for number, contact in enumerate(system.contacts):
         name, table = contact.name, f"contact.{quoted(contact.name)}"
-        named = (c for c in log.names if "contact" in c.lower() and (name in c or system.m == 1))
-        column = next(named, None)
-        if column is not None and np.isin(log.stream_of(column).columns[column], (0.0, 1.0)).all():
+        column = next((c for c in flags if name in c), next(iter(in_order[number:]), None))
+        if column is not None:
             draft.further[table] = {"source": "column", "column": column}
+            if name not in column and len(flags) > 1:
+                draft.say(table, "contacts were taken in the order of the columns", doubt=True)
         elif "wrench" in draft.further or not isinstance(contact, SurfaceContact):
             draft.further[table] = {"source": "wrench" if "wrench" in draft.further else "always"}
         else:

@@ -53,13 +53,18 @@ _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
 
 
 def tokens(name: str) -> list[str]:
-    """Words of a heading, in lower case.
+    """Words of a heading, in lower case; derivatives of q are one word.
 
     >>> tokens("actualJointPos_3 [deg]")
     ['actual', 'joint', 'pos', '3', 'deg']
+    >>> tokens("d_d_q_3"), tokens("qDot1")
+    (['ddq', '3'], ['qdot', '1'])
     """
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
-    return re.findall(r"[a-z]+|\d+", spaced.lower())
+    words = " ".join(re.findall(r"[a-z]+|\d+", spaced.lower()))
+    return re.sub(
+        r"\b(?:d |dd )+(?=q\b)|\bq (?=d*dot\b)", lambda part: part[0].replace(" ", ""), words
+    ).split()
 
 
 def declared_unit(name: str, stream: Stream) -> str | None:
@@ -86,10 +91,11 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
         named = bool(_TIME.match(name.lower())) or name == "header"
         candidates.append((2.0 * named + even + (name == "header"), name, step))
     if not candidates:
+        rows = (f"{name} ({len(other)} rows)" for other in table.streams for name in other.columns)
         raise MappingError(
-            f"{table.source}: no column increases like time",
-            expected="a column of time stamps",
-            got=", ".join(stream.columns)[:300],
+            f"{table.source}: no column increases like time, with {len(stream)} rows as the joints",
+            expected="a column of time stamps with as many rows",
+            got=", ".join(sorted(rows, key=lambda name: not _TIME.match(name)))[:300],
         )
     _, column, step = max(candidates)
     unit, doubt = declared_unit(column, stream), False
@@ -100,6 +106,11 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
         unit = "s" if step <= 0.1 else "ms" if step <= 100.0 else "us" if step <= 1e5 else "ns"
         text, doubt = f"steps of {step:.6g} were taken for {unit}", unit != "s"
     draft.say("time", text, doubt)
+    for other in (s for s in table.streams if s is not stream and len(s) != len(stream)):
+        stamps = [name for name in other.columns if _TIME.match(re.sub(r"\[\d+\]$", "", name.lower()))]
+        if stamps and len(stamps) == len(other.columns):
+            told = f"{', '.join(stamps)} was left out: {len(other)} rows, where the joints have {len(stream)}"
+            draft.say("time", told, doubt=True)
     segment = next((name for name in _SEGMENTS if name in stream.columns), None)
     draft.time = {"column": column, "unit": unit, "segment": segment}
     return stream

@@ -19,7 +19,7 @@ from forcegp.errors import ForceGPError, ModelError
 from forcegp.files import Record
 from forcegp.forces.measurements import Measurement, Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
-from forcegp.forces.quantities import FlatStates, ForceField, affine_maps, states
+from forcegp.forces.quantities import FlatStates, ForceField, affine_maps, hidden_forces, states
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model, PointwiseFit
 from forcegp.models.fit_result import FitResult
@@ -143,10 +143,14 @@ class AnalyticalFit(PointwiseFit):
 
     def at(
         self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
-    ) -> tuple[Tensor, None, dict[str, slice]]:
+    ) -> tuple[Tensor, None, dict[str, slice], tuple[str, ...]]:
         here = states(system, at.q, at.qd, at.tau, at.active)
         z, parts = affine_maps(system, here, quantity)
-        return z.o + (z.B_Q @ AnalyticalMean()(system, here)[..., None])[..., 0], None, parts
+        mean = z.o + (z.B_Q @ AnalyticalMean()(system, here)[..., None])[..., 0]
+        hidden = hidden_forces(system, here, parts)
+        if hidden is None:
+            return mean, None, parts, ()
+        return hidden.applied(mean, None)[0], None, parts, hidden.doubts
 
     def force_field(self) -> ForceField:
         """Q_C + Q_G + Q_D + Q_u at states."""

@@ -150,18 +150,21 @@ class PointwiseFit(FittedModel):
         starts = range(0, max(len(flat.q), 1), CHUNK)
         chunks = (flat.rows(slice(first, first + CHUNK)) for first in starts)
         values = [self.at(chunk, quantity, system or self.system, covariance) for chunk in chunks]
-        mean = torch.cat([mean for mean, _, _ in values])
+        mean = torch.cat([mean for mean, *_ in values])
         mean = mean.reshape(*flat.batch, mean.shape[-1])
-        variances, spread = [variance for _, variance, _ in values if variance is not None], None
+        variances, spread = [variance for _, variance, *_ in values if variance is not None], None
         if variances:
             spread = torch.diag_embed(torch.cat(variances).reshape(mean.shape))
-        return Prediction(mean, spread, values[0][2])
+        doubts = tuple(dict.fromkeys(doubt for *_, own in values for doubt in own))
+        determined = ~mean.isnan() if doubts else None
+        return Prediction(mean, spread, values[0][2], determined=determined, doubts=doubts)
 
     @abstractmethod
     def at(
         self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
-    ) -> tuple[Tensor, Tensor | None, dict[str, slice]]:
-        """Mean `(n, d)`, variance `(n, d)` if the model has one, and the slice of each quantity."""
+    ) -> tuple[Tensor, Tensor | None, dict[str, slice], tuple[str, ...]]:
+        """Mean `(n, d)`, variance `(n, d)` if the model has one, the slice of each quantity, and what is NaN
+        since it is not determined, in words."""
 
 
 class AccelerationFit(PointwiseFit):
@@ -169,7 +172,7 @@ class AccelerationFit(PointwiseFit):
 
     def at(
         self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
-    ) -> tuple[Tensor, Tensor | None, dict[str, slice]]:
+    ) -> tuple[Tensor, Tensor | None, dict[str, slice], tuple[str, ...]]:
         if quantity != "qdd":
             raise ModelError(
                 f"a {self.kind!r} model predicts accelerations only",
@@ -183,7 +186,7 @@ class AccelerationFit(PointwiseFit):
                 hint="use StructuredGP, or leave out `system`",
             )
         mean, spread = self.accelerations(at, variance)
-        return mean, spread, {"qdd": slice(0, mean.shape[-1])}
+        return mean, spread, {"qdd": slice(0, mean.shape[-1])}, ()
 
     @abstractmethod
     def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:

@@ -12,6 +12,9 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.notebook import html_table
 
+COVERED = 0.8
+"""Share of held-out values within ±2σ below which a fit warns: less than with half the right deviation."""
+
 
 @dataclass(frozen=True)
 class Compared:
@@ -25,6 +28,7 @@ class Compared:
         standard_error: of that difference.
         chosen: whether the model has this set.
         note: why a set was not tested, or not on all stretches.
+        coverage: share of held-out values within ±2σ, 0.95 where the error bars are right.
     """
 
     name: str
@@ -33,6 +37,17 @@ class Compared:
     standard_error: float | None = None
     chosen: bool = False
     note: str = ""
+    coverage: float | None = None
+
+    @property
+    def doubt(self) -> str:
+        """The warning of a model that misses held-out data by far, or nothing."""
+        if self.coverage is None or self.coverage >= COVERED:
+            return ""
+        return (
+            f"the model misses held-out stretches of this log: ±2σ holds {self.coverage:.0%} of their "
+            "values, and 95% is right; check the log and the robot file (`forcegp check`)"
+        )
 
     def __str__(self) -> str:
         name = f"{self.name} (chosen)" if self.chosen else self.name
@@ -70,6 +85,7 @@ class FitResult:
             variance; what noise leaves of all rows is `determined` in the same units.
         more_points_would_help: whether `missed` is a tenth of `determined` or more.
         comparison: the sets of force priors that the data chose between; empty if the caller named them.
+        never_closed: contacts that are closed in no training sample; their forces are not determined.
     """
 
     converged: bool
@@ -91,6 +107,7 @@ class FitResult:
     missed: float | None = None
     more_points_would_help: bool | None = None
     comparison: tuple[Compared, ...] = ()
+    never_closed: tuple[str, ...] = ()
 
 
 T = TypeVar("T")

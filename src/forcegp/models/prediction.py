@@ -51,6 +51,8 @@ class Prediction:
         beyond: `(*batch, nq)` how far the speed and torque of each joint lie beyond those of the training
             data, in training standard deviations; `None` for models that do not know.
         joint_names: the joints, in the order of `beyond`.
+        determined: `(*batch, d)` bool, what data and motion determine; the rest is NaN. `None` for all.
+        doubts: what is not determined, in words.
     """
 
     mean: Tensor
@@ -58,22 +60,31 @@ class Prediction:
     parts: dict[str, slice] = field(default_factory=dict)
     beyond: Tensor | None = None
     joint_names: tuple[str, ...] = ()
+    determined: Tensor | None = field(default=None, kw_only=True)
+    doubts: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not finite, and covariances that are none.
 
         Raises:
-            NumericalError: the mean or the covariance is not finite, or an eigenvalue is clearly negative.
+            NumericalError: the mean or the covariance is not finite where it is determined, or an eigenvalue
+                is clearly negative.
         """
-        for name, value in (("mean", self.mean), ("covariance", self.covariance)):
+        mean, covariance = self.mean, self.covariance
+        if self.determined is not None:
+            mean = mean.where(self.determined, 0.0)
+            if covariance is not None:
+                both = self.determined[..., None] & self.determined[..., None, :]
+                covariance = covariance.where(both, 0.0)
+        for name, value in (("mean", mean), ("covariance", covariance)):
             if value is not None and not bool(torch.isfinite(value).all()):
                 raise NumericalError(
                     f"the {name} of a prediction is not finite",
                     got=f"{int((~torch.isfinite(value)).sum())} of {value.numel()} numbers",
                     hint="states beyond what a robot can do overflow; check q, qd and tau",
                 )
-        if self.covariance is not None:
-            require_semidefinite(self.covariance)
+        if covariance is not None:
+            require_semidefinite(covariance)
 
     @property
     def variance(self) -> Tensor | None:
@@ -88,8 +99,9 @@ class Prediction:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts about the prediction, each with a remedy: states far beyond the training data."""
-        return () if self.beyond is None else warnings_beyond(self.beyond, self.joint_names)
+        """Doubts about the prediction: what is not determined, states far beyond the training data."""
+        beyond = () if self.beyond is None else warnings_beyond(self.beyond, self.joint_names)
+        return (*self.doubts, *beyond)
 
     def __repr__(self) -> str:
         """One line with shapes, without the numbers."""

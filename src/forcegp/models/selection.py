@@ -139,6 +139,7 @@ class Trial:
     Attributes:
         candidate: what is tried.
         scores: on each half, by block.
+        coverage: on each half, share of measured values within ±2σ.
         begin: hyperparameters that the first half taught.
         inertia_found: whether an inertia other than that of the robot file was found.
         note: why the candidate is not tried any more.
@@ -146,6 +147,7 @@ class Trial:
 
     candidate: Candidate
     scores: list[Tensor] = field(default_factory=list)
+    coverage: list[float] = field(default_factory=list)
     begin: Mapping[str, Tensor] | None = None
     inertia_found: bool = False
     note: str = ""
@@ -156,7 +158,8 @@ class Trial:
             return Compared(self.candidate.name, note=self.note)
         own = torch.cat(self.scores)
         behind, error = difference(best[: len(own)], own)
-        return Compared(self.candidate.name, float(own.mean()), behind, error, chosen, self.note)
+        coverage = sum(self.coverage) / len(self.coverage)
+        return Compared(self.candidate.name, float(own.mean()), behind, error, chosen, self.note, coverage)
 
 
 def _score(
@@ -178,10 +181,13 @@ def _score(
             same = other.candidate == Candidate(candidate.set) and not other.note
             if same and len(other.scores) == len(trial.scores) + 1:
                 trial.scores.append(other.scores[-1])
+                trial.coverage.append(other.coverage[-1])
                 return
     try:
         fit = trained(spec.with_set(candidate.set), inertia, train, trial.begin)
-        trial.scores.append(blocks_of(log_density(fit, test)))
+        density, coverage = log_density(fit, test)
+        trial.scores.append(blocks_of(density))
+        trial.coverage.append(coverage)
         trial.begin = fit.hyperparameters
     except NumericalError as cause:
         trial.note = f"not computed: {str(cause).splitlines()[0]}"
@@ -253,14 +259,15 @@ def trained(
 
 
 @torch.no_grad()
-def log_density(fit: StructuredFit, test: Training) -> Tensor:
-    """log N(y_i; E z, Var z + Σ) of each sample `(n,)`: of accelerations, or else of all measured values.
+def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
+    """log N(y_i; E z, Var z + Σ) of each sample `(n,)`: of accelerations, or else of all measured values; and
+    the share of these within ±2σ.
 
     Raises:
         NumericalError: a covariance is not positive definite.
     """
     judged = [m for m in test.measurements if m.quantity == "qdd"] or test.measurements
-    densities = []
+    densities, within = [], []
     for m in judged:
         prediction = fit.predict(m.q, m.qd, m.tau, m.quantity, active=m.active, noise=True)
         # Σ = L Lᵀ
@@ -269,7 +276,9 @@ def log_density(fit: StructuredFit, test: Training) -> Tensor:
             raise NumericalError("a predictive covariance is not positive definite")
         normal = torch.distributions.MultivariateNormal(prediction.mean, scale_tril=L, validate_args=False)
         densities.append(normal.log_prob(m.values))
-    return torch.cat(densities)
+        assert prediction.std is not None
+        within.append(((m.values - prediction.mean).abs() <= 2.0 * prediction.std).flatten())
+    return torch.cat(densities), float(torch.cat(within).double().mean())
 
 
 def blocks_of(density: Tensor) -> Tensor:

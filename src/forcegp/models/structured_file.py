@@ -74,7 +74,7 @@ IN_TIME = ("segment", "t")
 """What is kept beside it where a prior is a function of time."""
 NOT_REAL = (
     (re.compile(r"data\.\d+\.active"), torch.bool),
-    (re.compile(r"data\.\d+\.segment|sparse\..*\.(components|dropped)"), torch.int64),
+    (re.compile(r"added|data\.\d+\.segment|sparse\..*\.(components|dropped)"), torch.int64),
 )
 """Names of the tensors that are not of real numbers, with their type."""
 Parts = tuple[

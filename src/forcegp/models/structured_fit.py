@@ -35,7 +35,14 @@ from forcegp.forces.problem import (
     lost_by_inducing,
     typical,
 )
-from forcegp.forces.quantities import AffineMap, ForceField, affine_map, affine_maps, states_at
+from forcegp.forces.quantities import (
+    AffineMap,
+    ForceField,
+    affine_map,
+    affine_maps,
+    hidden_forces,
+    states_at,
+)
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
@@ -49,6 +56,8 @@ from forcegp.rollout.inputs import Disturbance
 from forcegp.storage.model_file import ModelHeader
 
 KIND = "structured_gp"
+JOINED = 256
+"""Updates after which the digests of their samples become one tensor."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,6 +72,7 @@ class StructuredFit(FittedModel):
         result: how the fit went.
         system: robot and contacts, with learned parameters.
         noise: standard deviation of a measurement of each measured quantity, `(d,)`.
+        added: digests of the samples of a sparse posterior, which `forget` can remove.
     """
 
     specification: Specification
@@ -72,6 +82,7 @@ class StructuredFit(FittedModel):
     result: FitResult
     system: ConstrainedSystem
     noise: Mapping[str, Tensor]
+    added: tuple[Tensor, ...] = ()
 
     kind = KIND
     has_function_samples = True
@@ -115,7 +126,8 @@ class StructuredFit(FittedModel):
             quantity: a name of `QUANTITIES`, or several for their joint distribution.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
             covariance: whether to compute the covariance, which costs more than the mean.
-            system: read the forces on another system, such as another surface or none at all.
+            system: read the forces on another system, such as another surface or none at all; on that of the
+                fit, contacts that the training data never close have no determined force.
             noise: whether the covariance is that of a measurement, noise of torque and sensor included.
 
         Returns:
@@ -124,8 +136,9 @@ class StructuredFit(FittedModel):
         Raises:
             UnknownNameError: no such quantity.
             ShapeError: a state or `active` does not fit the system.
+            ModelError: nothing but forces of contacts that were closed in no training sample.
         """
-        system = system or self.system
+        unseen, system = (self.result.never_closed, self.system) if system is None else ((), system)
         at, batch = states_at(system, q, qd, tau, active)
         if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
             # Errors of the inertia are multiplied by the predicted acceleration.
@@ -142,6 +155,9 @@ class StructuredFit(FittedModel):
             spread = spread + _carried(z, unknown)
             if noise:
                 spread = spread + self._noise_covariance(z, parts)
+        hidden = hidden_forces(system, at, parts, unseen)
+        if hidden is not None:
+            mean, spread = hidden.applied(mean, spread)
         beyond = self.beyond(at.qd, at.tau)
         return Prediction(
             mean.reshape(*batch, z.o.shape[-1]),
@@ -149,6 +165,8 @@ class StructuredFit(FittedModel):
             parts,
             None if beyond is None else beyond.reshape(*batch, system.robot.nq),
             system.robot.joint_names,
+            determined=None if hidden is None else ~hidden.whole.reshape(*batch, -1),
+            doubts=() if hidden is None else hidden.doubts,
         )
 
     def external_wrench(
@@ -256,7 +274,11 @@ class StructuredFit(FittedModel):
         measurements = self._with_slopes(measurements)
         problem = self._problem_of(measurements)
         rows = problem.rows(self.hyperparameters).blocks
-        updated = self._with(self.posterior.latent.updated(rows))
+        before = self.added if len(self.added) < JOINED else (torch.cat(self.added),)
+        updated = self._with(self.posterior.latent.updated(rows), (*before, measurements.digests))
+        never = set(self.result.never_closed) & set(measurements.never_closed(self.system))
+        result = dataclasses.replace(self.result, never_closed=tuple(sorted(never)))
+        updated = dataclasses.replace(updated, result=result)
         if isinstance(self.posterior.latent, SparsePosterior):
             return updated
         noise = [problem.noise_at(self.hyperparameters, i) for i in range(len(measurements.measurements))]
@@ -287,9 +309,9 @@ class StructuredFit(FittedModel):
                 drift towards their prior, and the factor is the correlation with what they were.
 
         Raises:
-            ModelError: inference is exact, or the factor is out of range.
+            ModelError: inference is exact, the factor is out of range, or samples to remove were never added,
+                are partly forgotten, or belong to a log that was read piece by piece.
             UnknownNameError: no such prior.
-            NumericalError: the samples to remove were not among those of the fit.
         """
         latent = self.posterior.latent
         if not isinstance(latent, SparsePosterior):
@@ -301,7 +323,9 @@ class StructuredFit(FittedModel):
             without, _ = training_for(self.specification, self.problem, what, learned=(), fewest=0)
             if not without.samples:
                 return self
-            return self._with(latent.without(self._problem_of(without).rows(self.hyperparameters).blocks))
+            left = _without(self.added, without.digests)
+            rows = self._problem_of(without).rows(self.hyperparameters)
+            return self._with(latent.without(rows.blocks), left)
         factor = float(what)
         if priors is not None:
             names = [prior.name for prior in self.posterior.priors]
@@ -313,20 +337,25 @@ class StructuredFit(FittedModel):
             raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)
         return self._with(latent.forgetting(factor))
 
-    def _with(self, latent: ExactPosterior | SparsePosterior) -> StructuredFit:
-        """The fit with another posterior of the latent processes."""
-        return dataclasses.replace(self, posterior=dataclasses.replace(self.posterior, latent=latent))
+    def _with(
+        self, latent: ExactPosterior | SparsePosterior, added: tuple[Tensor, ...] = ()
+    ) -> StructuredFit:
+        """The fit with another posterior of the latent processes, which can forget the samples `added`."""
+        posterior = dataclasses.replace(self.posterior, latent=latent)
+        return dataclasses.replace(self, posterior=posterior, added=added)
 
     @classmethod
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> StructuredFit:
-        return cls(*unpack(header, tensors, system, source))
+        added = (tensors["added"],) if "added" in tensors else ()
+        return cls(*unpack(header, tensors, system, source), added)
 
     def record(self) -> tuple[Record, dict[str, Tensor]]:
         settings, tensors = pack(
             self.specification, self.problem, self.hyperparameters, self.posterior, self.result
         )
+        tensors |= {"added": torch.cat(self.added)} if self.added else {}
         return settings, tensors | {f"noise_std.{name}": std for name, std in self.noise.items()}
 
     @property
@@ -396,6 +425,23 @@ class StructuredFit(FittedModel):
         return noise.reshape(*batch, z.o.shape[-1])
 
 
+def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
+    """Digests of samples without some of them.
+
+    Raises:
+        ModelError: one to remove is not among them.
+    """
+    values, counts = torch.cat([*added, removed]).unique(return_counts=True)
+    _, own = torch.cat([values, removed]).unique(return_counts=True)
+    left = counts - 2 * (own - 1)
+    if bool((left < 0).any()):
+        raise ModelError(
+            f"{int(-left.clamp(max=0).sum())} of {len(removed)} samples to forget were never added",
+            expected="samples of this fit, not of a log that is read piece by piece, with their full weight",
+        )
+    return (values.repeat_interleave(left),)
+
+
 def _carried(z: AffineMap, variance: Tensor) -> Tensor:
     """B Σ Bᵀ of white noise on the joint force, `(n, d, d)`."""
     return (z.B_Q * variance[..., None, :]) @ z.B_Q.mT
@@ -432,7 +478,7 @@ def conditioned(
     likelihood, jitter = log_likelihood(posterior) - float(constant), posterior.latent.jitter
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     training, system = problem.training, problem.system_at(hyperparameters)
-    doubts = doubts_of(posterior, system, training)
+    doubts = doubts_of(posterior, system, training, problem.power)
     result = FitResult(
         **learned.outcome,
         log_marginal_likelihood=likelihood,
@@ -442,6 +488,9 @@ def conditioned(
         warnings=(*warnings, *learned.doubts, *doubts.warnings, *more_points),
         samples=training.all_samples,
         learned_on=learned_on,
+        never_closed=training.never_closed(system),
         **lost,
     )
-    return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise)
+    remembers = forces is None and isinstance(posterior.latent, SparsePosterior)
+    added = (training.digests,) if remembers else ()
+    return StructuredFit(specification, problem, hyperparameters, posterior, result, system, noise, added)

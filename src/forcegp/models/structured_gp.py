@@ -8,7 +8,7 @@ equation 10 is made of `gram` in `gp/likelihood.py`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from torch import nn
@@ -19,7 +19,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.measurements import NoiseStd, Observation
 from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.priors.base import ForcePrior, check_priors
-from forcegp.forces.priors.joint import AnalyticalMean, mean_of
+from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior, mean_of
 from forcegp.forces.priors.sets import priors_of
 from forcegp.forces.problem import require_double
 from forcegp.gp.inducing import LIMIT
@@ -185,7 +185,21 @@ class StructuredGP(Model[StructuredFit]):
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
         warnings = (*task.doubts, *lesson.warnings)
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
-        return dataclasses.replace(fit, result=dataclasses.replace(fit.result, comparison=comparison))
+        missed = (each.doubt for each in comparison if each.chosen and each.doubt)
+        warnings = (*fit.result.warnings, *missed, *self._without_effect(fit))
+        result = dataclasses.replace(fit.result, comparison=comparison, warnings=warnings)
+        return dataclasses.replace(fit, result=result)
+
+    def _without_effect(self, fit: StructuredFit) -> Iterator[str]:
+        """Options that were given and had no effect on a fit."""
+        points = [x for Z in fit.problem.inducing or () for x in Z.values()]
+        if self._params["inducing_points"] != LIMIT and not any(map(len, points)):
+            how = "exact inference" if fit.problem.inducing is None else "priors of finite features"
+            yield f"inducing_points={self._params['inducing_points']} has no effect: the fit has {how}"
+        friction = any(isinstance(prior, JointFrictionPrior) for prior in fit.force_priors)
+        if self._params["inertia"] == "auto" and not (friction and "actuation" in self.mean.terms):
+            lacks = "the motor torque in its mean" if friction else "a JointFrictionPrior"
+            yield f'inertia="auto" has no effect: the model lacks {lacks}'
 
     def _continued(self, after: StructuredFit) -> Specification:
         """This model with the priors of an earlier fit, which those that were left to its data belong to.

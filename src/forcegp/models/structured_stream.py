@@ -26,7 +26,7 @@ from forcegp.forces.problem import Problem, Totals, basis_of, posterior_of, tota
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.features import Standardization
 from forcegp.gp.kernels import sub
-from forcegp.gp.sums import Sums, share_basis
+from forcegp.gp.sums import Sums, require_agreement, share_basis
 from forcegp.models.base import FitProgress
 from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, Specification, identity
 from forcegp.storage.checkpoint import Checkpoint, beside
@@ -75,8 +75,11 @@ def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
 
     Raises:
         DataError: a file is damaged, or holds no samples.
-        ModelError: exact inference is asked for on more samples than are read at once.
+        ModelError: processes read different logs, or exact inference is asked for on more samples than are
+            read at once.
     """
+    if data.distributed:
+        require_agreement("the log", data.digest, len(data), hint="give each the same files")
     moving = spec.automatic or spec.noise.learns_torque
     rows, stretches, count = _rows_of(data, moving_rows if moving else None)
     if moving and count < FEWEST_MOVING:
@@ -163,7 +166,18 @@ class Pass:
         saved = None
         if self.checkpoint is not None:
             saved = Checkpoint(self._own_file(), self._key(problem, hyperparameters))
-        kept = {} if saved is None else saved.read(_tensors(basis, Totals.zero(problem, basis)))
+        kept, refused = {}, None
+        if saved is not None:
+            try:
+                kept = saved.read(_tensors(basis, Totals.zero(problem, basis)))
+            except ModelError as cause:
+                refused = cause
+            if self.log.distributed:
+                # Where one process stops, the others must not wait for it.
+                hint = "resume with as many processes as began, or remove all parts of the checkpoint"
+                require_agreement("their parts of the checkpoint", 2 if refused else bool(kept), hint=hint)
+            if refused is not None:
+                raise refused
         if kept:
             basis, begin = _restored(basis, kept)
         elif self.log.distributed:
@@ -205,7 +219,8 @@ class Pass:
         files = [(path.name, path.stat().st_size) for path in self.log.files]
         points = [x for Z in problem.inducing or () for x in Z.values()]
         named = [part for pair in sorted(hyperparameters.items()) for part in pair]
-        streamed = (problem.power, files, self.log.differentiate)
+        processes = dist.get_world_size() if self.log.distributed else 1
+        streamed = (problem.power, files, self.log.differentiate, processes)
         return Checkpoint.key_of(*identity(problem), *streamed, *points, *named)
 
 

@@ -31,6 +31,9 @@ FRICTION_VELOCITY = 0.1
 """Default speed over which Coulomb friction changes sign [rad/s, m/s]; robot files do not specify it."""
 SINGULAR = 1e-12
 """Smallest eigenvalue of the scaled mass matrix below which it counts as singular in double precision."""
+LIMB_JOINTS, WALKING_JOINTS, BODY_MASS = 2, 6, 1.0
+"""Joints from which a chain counts as a limb; those of all limbs and mass of the base [kg] from which a robot
+may walk: a hand is lighter."""
 OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
 """What the robot takes from the joints of the file as it is."""
 
@@ -54,6 +57,7 @@ def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
     """
     remarks, placed = list(tree.remarks), _place(tree.joints)
     bodies = _merge(tree, placed)
+    remarks += _held_base(tree, placed)
     _check_mass_matrix(tree, placed, bodies)
     frames = _frames(tree, placed, remarks)
     for remark in remarks:
@@ -96,6 +100,22 @@ def _place(joints: tuple[Joint, ...]) -> _Placed:
             placed.parents.append(index)
             placed.placements.append(T)
     return placed
+
+
+def _held_base(tree: Tree, placed: _Placed) -> list[str]:
+    """A remark where a base with mass carries several limbs, as of a walking robot, and no joint moves it."""
+    limb: list[int] = []
+    for i, parent in enumerate(placed.parents):
+        limb.append(i if parent == BASE else limb[parent])
+    limbs = [limb.count(i) for i in set(limb) if limb.count(i) >= LIMB_JOINTS]
+    held = (link.inertial for link in tree.links if placed.links[link.name][0] == BASE)
+    mass, root = sum(body.mass for body in held if body is not None), tree.joints[0].parent
+    if len(limbs) < 2 or sum(limbs) < WALKING_JOINTS or mass < BODY_MASS:
+        return []
+    return [
+        f"{tree.label}: no joint connects the base {root!r} ({mass:.3g} kg, with {len(limbs)} limbs) to the "
+        "world, so that it is held fixed; a robot that walks needs a floating base, which is not supported"
+    ]
 
 
 def _merge(tree: Tree, placed: _Placed) -> list[Inertial]:

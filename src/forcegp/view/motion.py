@@ -14,7 +14,7 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError
-from forcegp.models.base import Predictor
+from forcegp.models.base import FittedModel, Predictor
 from forcegp.plots import as_array
 from forcegp.report.animation import FRAMES_PER_SECOND
 from forcegp.rollout import Rollout, RolloutOptions
@@ -119,7 +119,8 @@ def _forces(system: ConstrainedSystem, data: Dataset, model: Predictor | None) -
     with torch.no_grad():
         eom = system.equations(data.q, data.qd, active)
     value = std = None
-    if model is not None and model.force_field() is not None:
+    never = set(model.result.never_closed) if isinstance(model, FittedModel) else set()
+    if model is not None and model.force_field() is not None and never != set(system.contact_names):
         prediction = model.predict(data.q, data.qd, data.tau, "multiplier", active=active)
         value, std = prediction.mean, prediction.std
     forces, row, logged = [], 0, data.contact_extras.get("multiplier", {})
