@@ -17,6 +17,7 @@ from forcegp import limits
 from forcegp.data.fields import DataHeader
 from forcegp.errors import DataError, near_names
 from forcegp.files import atomic_file
+from forcegp.guards import allowed_bytes, damaged
 from forcegp.resources import announce_memory
 
 if TYPE_CHECKING:
@@ -122,16 +123,6 @@ def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], Data
         raise damaged(str(file), "Parquet", cause) from cause
 
 
-def damaged(source: str, kind: str, cause: BaseException) -> DataError:
-    """The error for a file that a parser of some kind of files fails on."""
-    lines = str(cause).splitlines()
-    return DataError(
-        f"{source}: the file is damaged, truncated or not {kind}",
-        got=lines[0][:300] if lines else type(cause).__name__,
-        hint="write it again from its source; an interrupted copy is the usual cause",
-    )
-
-
 def _check_count(file: Path, columns: int) -> None:
     if columns > limits.COLUMNS:
         most, hint = f"at most {limits.COLUMNS}", "write only the columns of the robot"
@@ -151,11 +142,11 @@ def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
 def _check_size(file: Path, rows: int, columns: int) -> None:
     """Check the size in memory before anything is unpacked: a small file can claim to hold more than fits."""
     size = rows * columns * 8
-    allowed = max(limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file.stat().st_size)
-    if size > min(allowed, limits.TABLE_BYTES):
+    allowed = min(allowed_bytes(file.stat().st_size), limits.TABLE_BYTES)
+    if size > allowed:
         raise DataError(
             f"{file}: the file claims to be larger than what is read at once",
-            expected=f"at most {min(allowed, limits.TABLE_BYTES) // 8:,} numbers in a file of this size",
+            expected=f"at most {allowed // 8:,} numbers in a file of this size",
             got=f"{rows:,} rows × {columns} columns",
             hint="split the log into several files",
         )

@@ -9,9 +9,10 @@ The layouts are those of the ROS distributions; definitions that a bag carries a
 
 from __future__ import annotations
 
+import io
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ import numpy as np
 
 from forcegp import limits
 from forcegp.errors import DataError, optional_module
-from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, check_count, foreign
+from forcegp.guards import Unpacking, bounded, check_count, check_tables, foreign, starts_with, within
+from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
@@ -65,8 +67,9 @@ class Messages:
     def stream(self, name: str, origin: np.ndarray, wanted: Wanted) -> Stream:
         """The columns that are wanted and hold numbers, with times from `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
-        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps.T), strict=True))
-        values = np.ascontiguousarray(np.array(self.rows, dtype=np.float64).T)
+        order = np.argsort(stamps[:, 1], kind="stable")
+        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps[order].T), strict=True))
+        values = np.ascontiguousarray(np.array(self.rows, dtype=np.float64)[order].T)
         for column, numbers in zip(self.columns, values, strict=True):
             if not np.isnan(numbers).all() and wanted(column):
                 columns[column] = numbers
@@ -78,6 +81,7 @@ class Collector:
     """Gathers the messages of a bag, one stream for each topic and set of joints."""
 
     source: str
+    unpacking: Unpacking
     _streams: dict[tuple[str, frozenset[str]], Messages] = field(default_factory=dict)
     _numbers: int = 0
 
@@ -148,37 +152,50 @@ def _wrench(message: Any) -> dict[str, float]:
 
 def read_rosbag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
     """Read the joint states and wrenches of a bag of ROS 1 or ROS 2."""
-    with (path if path.is_file() else path / "metadata.yaml").open("rb") as file:
-        first = file.read(12) == b"#ROSBAG V2.0"
-    number, encoding = (1, "ros1") if first else (2, "cdr")
-    package = optional_module(f"rosbags.rosbag{number}", f"Reading ROS {number} bags", "import")
-    if path.is_dir():
-        _check_metadata(path)
-    elif not first and path.suffix != ".db3":
+    files = _files(path) if path.is_dir() else [path]
+    if path.is_dir() and any(file.suffix == ".mcap" for file in files):
+        return _read_mcap(path, [file for file in files if file.suffix == ".mcap"], wanted, rows, progress)
+    first = path.is_file() and starts_with(path, b"#ROSBAG V2.0")
+    encoding = "ros1" if first else "cdr"
+    package = optional_module(f"rosbags.rosbag{2 - first}", "Reading ROS bags", "import")
+    if path.is_file() and not first and path.suffix != ".db3":
         raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
-    collector = Collector(str(path))
-    with foreign(str(path), "a bag"), package.Reader(path) as bag:
-        check_count(str(path), "topics", len(bag.connections), limits.LOG_STREAMS)
-        check_count(str(path), "messages", bag.message_count, limits.LOG_MESSAGES)
-        topics = {c.topic: c.msgtype for c in bag.connections}
-        used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
-        decoders = {c.msgtype: decoder(canonical(c.msgtype), encoding) for c in used}
-        total = sum(c.msgcount for c in used)
-        for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else []):
-            kind = canonical(connection.msgtype)
-            collector.add(connection.topic, kind, stamp, raw, decoders[connection.msgtype])
-            if progress is not None and done % 1024 == 0:
-                progress(done, total)
-            if rows is not None and collector.rows >= rows:
-                break
-        return collector.table(f"rosbag{number}", topics, wanted)
+    collector = Collector(str(path), Unpacking(str(path), sum(file.stat().st_size for file in files)))
+    with foreign(str(path), "a bag"):
+        for file in files:
+            check_tables(file)
+        reader = bounded(package.Reader, collector.unpacking) if first else package.Reader
+        with reader(path) as bag:
+            return _collected(collector, bag, encoding, wanted, rows, progress)
 
 
-def _check_metadata(path: Path) -> None:
-    """Refuse a bag whose unpacked size nobody knows."""
-    file = path / "metadata.yaml"
-    check_count(str(file), "bytes", file.stat().st_size, 8 << 20)
-    text = file.read_text(encoding="utf-8", errors="replace")
+def _collected(
+    collector: Collector, bag: Any, encoding: str, wanted: Wanted, rows: int | None, progress: Progress | None
+) -> LogTable:
+    check_count(collector.source, "topics", len(bag.connections), limits.LOG_STREAMS)
+    check_count(collector.source, "messages", bag.message_count, limits.LOG_MESSAGES)
+    used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
+    decoders = {c.msgtype: decoder(canonical(c.msgtype), encoding) for c in used}
+    total = sum(c.msgcount for c in used)
+    for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else []):
+        kind = canonical(connection.msgtype)
+        collector.unpacking.read(len(raw))
+        collector.unpacking.record()
+        collector.add(connection.topic, kind, stamp, raw, decoders[connection.msgtype])
+        if progress is not None and done % 1024 == 0:
+            progress(done, total)
+        if rows is not None and collector.rows >= rows:
+            break
+    topics = {c.topic: c.msgtype for c in bag.connections}
+    return collector.table("rosbag1" if encoding == "ros1" else "rosbag2", topics, wanted)
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of a folder that is a bag, but for its description; refused if they are compressed."""
+    description = path / "metadata.yaml"
+    files = within(path, sorted(file for file in path.iterdir() if file.is_file()))
+    check_count(str(description), "bytes", description.stat().st_size, limits.LISTING_BYTES)
+    text = description.read_text(encoding="utf-8", errors="replace")
     compression = re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE)
     if compression:
         raise DataError(
@@ -186,36 +203,74 @@ def _check_metadata(path: Path) -> None:
             expected="a bag without compression, or MCAP with compressed chunks",
             hint="unpack it with `ros2 bag convert`",
         )
-
-
-RECORD_BYTES = 256 << 20
-"""Largest record, packed, that is loaded."""
+    return [file for file in files if file != description]
 
 
 def read_mcap(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of an MCAP file, also of one that was cut off and has no index."""
-    package = optional_module("mcap.reader", "Reading MCAP files", "import")
-    collector = Collector(str(path))
-    decoders: dict[int, Decode | None] = {}
-    topics: dict[str, str] = {}
-    with foreign(str(path), "MCAP"), path.open("rb") as file:
-        reader = package.SeekingReader(file, record_size_limit=RECORD_BYTES)
-        summary = reader.get_summary()
-        statistics = summary.statistics if summary is not None else None
-        total = statistics.message_count if statistics is not None else 0
-        check_count(str(path), "messages", total, limits.LOG_MESSAGES)
-        for schema, channel, message in reader.iter_messages():
-            if channel.id not in decoders:
-                kind = canonical(schema.name) if schema is not None else ""
-                topics[channel.topic] = kind or channel.message_encoding
-                check_count(str(path), "topics", len(decoders), limits.LOG_STREAMS)
-                readable = kind in KINDS and channel.message_encoding in ("cdr", "ros1")
-                decoders[channel.id] = decoder(kind, channel.message_encoding) if readable else None
-            decode = decoders[channel.id]
-            if decode is not None:
-                collector.add(channel.topic, topics[channel.topic], message.log_time, message.data, decode)
-                if progress is not None and collector.rows % 1024 == 0:
-                    progress(collector.rows, max(total, collector.rows))
-                if rows is not None and collector.rows >= rows:
-                    break
-        return collector.table("mcap", topics, wanted)
+    """Read the joint states and wrenches of an MCAP file, also of one without an index."""
+    return _read_mcap(path, [path], wanted, rows, progress)
+
+
+def _read_mcap(
+    path: Path, files: Sequence[Path], wanted: Wanted, rows: int | None, progress: Progress | None
+) -> LogTable:
+    size = sum(file.stat().st_size for file in files)
+    collector, topics = Collector(str(path), Unpacking(str(path), size)), dict[str, str]()
+    with foreign(str(path), "MCAP"):
+        for file in files:
+            with file.open("rb") as opened:
+                _collect_mcap(opened, collector, topics, rows, progress)
+    return collector.table("mcap", topics, wanted)
+
+
+def _collect_mcap(
+    file: io.BufferedReader,
+    collector: Collector,
+    topics: dict[str, str],
+    rows: int | None,
+    progress: Progress | None,
+) -> None:
+    records = optional_module("mcap.records", "Reading MCAP files", "import")
+    schemas, channels, decoders = {}, {}, {}
+    for record in _mcap_records(file, collector.unpacking):
+        if isinstance(record, records.Schema):
+            schemas[record.id] = canonical(record.name)
+        elif isinstance(record, records.Channel):
+            kind = schemas[record.schema_id] if record.schema_id else record.message_encoding
+            topics[record.topic], channels[record.id] = kind, record
+            check_count(collector.source, "topics", len(channels), limits.LOG_STREAMS)
+        elif isinstance(record, records.Message):
+            channel = channels[record.channel_id]
+            kind, encoding = topics[channel.topic], channel.message_encoding
+            if kind in KINDS and encoding in ("cdr", "ros1"):
+                if (kind, encoding) not in decoders:
+                    decoders[kind, encoding] = decoder(kind, encoding)
+                collector.add(channel.topic, kind, record.log_time, record.data, decoders[kind, encoding])
+            if progress is not None and collector.unpacking.records % 1024 == 0:
+                progress(file.tell(), collector.unpacking.file)
+            if rows is not None and collector.rows >= rows:
+                return
+
+
+def _mcap_records(file: io.BufferedReader, unpacking: Unpacking) -> Iterator[Any]:
+    """The records of an MCAP file in its order; chunks are unpacked one at a time, record by record."""
+    records = optional_module("mcap.records", "Reading MCAP files", "import")
+    streams = optional_module("mcap.stream_reader", "Reading MCAP files", "import")
+    reader = streams.StreamReader(file, emit_chunks=True, record_size_limit=limits.RECORD_BYTES)
+    for record in reader.records:
+        if not isinstance(record, records.Chunk):
+            yield record
+            continue
+        content = unpacking.unpack(record.data, record.compression)
+        part = streams.ReadDataStream(io.BytesIO(content))
+        while part.count < len(content):
+            opcode, size = part.read1(), part.read8()
+            unpacking.record()
+            if opcode == streams.Opcode.MESSAGE:
+                yield records.Message.read(part, size)
+            elif opcode == streams.Opcode.SCHEMA:
+                yield records.Schema.read(part)
+            elif opcode == streams.Opcode.CHANNEL:
+                yield records.Channel.read(part)
+            else:
+                part.read(size)
