@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from forcegp.data.fields import AXES
 from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, UnknownNameError
 from forcegp.forces.measurements import COLUMNS
 from forcegp.forces.noise import warnings_beyond
-from forcegp.forces.quantities import ForceField, ForceLinearization, linearize_field
+from forcegp.forces.quantities import FlatStates, ForceField, ForceLinearization, linearize_field
 from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Torque
 from forcegp.rollout.trajectory import Rollout
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 CHUNK = 2000
 """States that are predicted at once, to bound the memory."""
+CHECKED = 1 << 16
+"""Covariances that are checked at once."""
 MOST_SAMPLES = 2000
 """Samples that are predicted and drawn: more cannot be told apart."""
 
@@ -66,14 +68,17 @@ class Prediction:
             NumericalError: the mean or the covariance is not finite, or an eigenvalue is clearly negative.
         """
         for name, value in (("mean", self.mean), ("covariance", self.covariance)):
-            if value is not None and not bool(torch.isfinite(value).all()):
+            pieces = () if value is None else value.reshape(-1).split(1 << 20)
+            if wrong := sum(int((~torch.isfinite(piece)).sum()) for piece in pieces):
                 raise NumericalError(
                     f"the {name} of a prediction is not finite",
-                    got=f"{int((~torch.isfinite(value)).sum())} of {value.numel()} numbers",
+                    got=f"{wrong} of {value.numel()} numbers",
                     hint="states beyond what a robot can do overflow; check q, qd and tau",
                 )
         if self.covariance is not None:
-            require_semidefinite(self.covariance)
+            d = self.covariance.shape[-1]
+            for piece in self.covariance.reshape(-1, d, d).split(CHECKED) if d else ():
+                require_semidefinite(piece)
 
     @property
     def variance(self) -> Tensor | None:
@@ -153,6 +158,20 @@ class Prediction:
         curves = [] if true is None else [Curve(true[:, i], "measured", MEASURED, width=0.7)]
         band = None if self.std is None else self.std[:, i]
         return Panel(name, label, [*curves, Curve(self.mean[:, i], "predicted", PREDICTED, band)])
+
+
+def in_pieces(
+    at: FlatStates, read: Callable[[FlatStates], tuple[Tensor | None, ...]]
+) -> tuple[Tensor | None, ...]:
+    """What `read` gives at states, asked for `CHUNK` at a time; memory holds the result and one piece."""
+    whole, n = list[Tensor | None](), len(at.q)
+    for first in range(0, max(n, 1), CHUNK):
+        piece = read(at.rows(slice(first, first + CHUNK)))
+        whole = whole or [x if x is None or n <= CHUNK else x.new_empty(n, *x.shape[1:]) for x in piece]
+        for target, x in zip(whole, piece, strict=True):
+            if target is not None and x is not None and target is not x:
+                target[first : first + CHUNK] = x
+    return tuple(x if x is None else x.reshape(*at.batch, *x.shape[1:]) for x in whole)
 
 
 def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:

@@ -35,14 +35,14 @@ from forcegp.forces.problem import (
     lost_by_inducing,
     typical,
 )
-from forcegp.forces.quantities import AffineMap, ForceField, affine_map, affine_maps, states_at
+from forcegp.forces.quantities import AffineMap, FlatStates, ForceField, affine_map, affine_maps, flat_states
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
-from forcegp.models.prediction import Prediction
+from forcegp.models.prediction import Prediction, in_pieces
 from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
 from forcegp.storage.model_file import ModelHeader
@@ -124,31 +124,28 @@ class StructuredFit(FittedModel):
             UnknownNameError: no such quantity.
             ShapeError: a state or `active` does not fit the system.
         """
-        system = system or self.system
-        at, batch = states_at(system, q, qd, tau, active)
-        if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
-            # Errors of the inertia are multiplied by the predicted acceleration.
-            qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
-            at = dataclasses.replace(at, qdd=qdd)
-        z, parts = affine_maps(system, at, quantity)
-        spread = None
-        if not covariance:
-            mean = self.posterior.read_mean(system, at, z)
-        else:
+        system, slices = system or self.system, dict[str, slice]()
+
+        def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
+            at = flat.with_equations(system)
+            if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
+                # Errors of the inertia are multiplied by the predicted acceleration.
+                qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
+                at = dataclasses.replace(at, qdd=qdd)
+            z, parts = affine_maps(system, at, quantity)
+            slices.update(parts)
+            beyond = self.beyond(at.qd, at.tau)
+            if not covariance:
+                return self.posterior.read_mean(system, at, z), None, beyond
             mean, spread = self.posterior.read(system, at, z)
             z = self.posterior.process.coupled(system, at, z)
             unknown = unknown_variance(self.hyperparameters, at, self.problem.external_std)
             spread = spread + _carried(z, unknown)
-            if noise:
-                spread = spread + self._noise_covariance(z, parts)
-        beyond = self.beyond(at.qd, at.tau)
-        return Prediction(
-            mean.reshape(*batch, z.o.shape[-1]),
-            None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
-            parts,
-            None if beyond is None else beyond.reshape(*batch, system.robot.nq),
-            system.robot.joint_names,
-        )
+            return mean, spread + self._noise_covariance(z, parts) if noise else spread, beyond
+
+        mean, spread, beyond = in_pieces(flat_states(system, q, qd, tau, active), read)
+        assert mean is not None
+        return Prediction(mean, spread, slices, beyond, system.robot.joint_names)
 
     def external_wrench(
         self,
@@ -383,11 +380,16 @@ class StructuredFit(FittedModel):
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
             sensor: whether the noise of the quantity's own sensor counts beside that of the torque.
         """
-        at, batch = states_at(self.system, q, qd, tau, active)
-        z, parts = affine_maps(self.system, at, quantity)
-        z = self.posterior.process.coupled(self.system, at, z)
-        noise = self._noise_covariance(z, parts if sensor else {}).diagonal(dim1=-2, dim2=-1)
-        return noise.reshape(*batch, z.o.shape[-1])
+
+        def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
+            at = flat.with_equations(self.system)
+            z, parts = affine_maps(self.system, at, quantity)
+            z = self.posterior.process.coupled(self.system, at, z)
+            return (self._noise_covariance(z, parts if sensor else {}).diagonal(dim1=-2, dim2=-1),)
+
+        [noise] = in_pieces(flat_states(self.system, q, qd, tau, active), read)
+        assert noise is not None
+        return noise
 
 
 def _carried(z: AffineMap, variance: Tensor) -> Tensor:
