@@ -11,7 +11,8 @@ inducing points and hyperparameters must be those of all.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -243,9 +244,9 @@ def reduce_sums(sums: Sums) -> Sums:
 
 def add_over_processes(x: Tensor) -> Tensor:
     """The tensors of all processes added, the same in each of them."""
-    _require_processes()
     total = x.detach().clone()
-    dist.all_reduce(total, op=dist.ReduceOp.SUM)
+    with _processes():
+        dist.all_reduce(total, op=dist.ReduceOp.SUM)
     return total
 
 
@@ -255,7 +256,6 @@ def share_basis(basis: LatentBasis) -> LatentBasis:
     Raises:
         ModelError: no group of processes has been initialised.
     """
-    _require_processes()
     dropped = [s.dropped for part in basis.parts for s in part.spectra]
     counts = iter(_broadcast(torch.tensor(dropped)).tolist())
     parts = []
@@ -274,13 +274,21 @@ def _shared(tensors: Parameters | Features) -> dict[str, Tensor]:
 
 def _broadcast(x: Tensor) -> Tensor:
     copy = x.detach().clone(memory_format=torch.contiguous_format)
-    dist.broadcast(copy, src=0)
+    with _processes():
+        dist.broadcast(copy, src=0)
     return copy
 
 
-def _require_processes() -> None:
+@contextmanager
+def _processes() -> Iterator[None]:
+    """Exchange with the other processes; `ModelError` without them, or if one is lost."""
     if not (dist.is_available() and dist.is_initialized()):
         raise ModelError(
             "no group of processes has been initialised",
             hint='start with torchrun, and call torch.distributed.init_process_group("gloo") first',
         )
+    try:
+        yield
+    except RuntimeError as cause:
+        hint = "start all of them again; a fit with a checkpoint resumes"
+        raise ModelError("another process of the fit was lost", got=str(cause)[:300], hint=hint) from cause

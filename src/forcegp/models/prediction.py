@@ -69,7 +69,8 @@ class Prediction:
         """
         for name, value in (("mean", self.mean), ("covariance", self.covariance)):
             pieces = () if value is None else value.reshape(-1).split(1 << 20)
-            if wrong := sum(int((~torch.isfinite(piece)).sum()) for piece in pieces):
+            wrong = sum(int((~torch.isfinite(piece)).sum()) for piece in pieces)
+            if value is not None and wrong:
                 raise NumericalError(
                     f"the {name} of a prediction is not finite",
                     got=f"{wrong} of {value.numel()} numbers",
@@ -333,10 +334,9 @@ class Predictor(ABC):
         data.check_robot(self.specified.robot)
         if len(data) < 2:
             raise DataError("a score needs two samples or more", got=len(data))
-        true, chunks = measured(self.system, data, quantity), range(0, len(data), CHUNK)
-        parts = (data[first : first + CHUNK] for first in chunks)
-        means = [self._at_logged(part, quantity, covariance=False).mean for part in parts]
-        unexplained = (true - torch.cat(means)).square().sum(0)
+        true = measured(self.system, data, quantity)
+        mean = self._at_logged(data, quantity, covariance=False).mean
+        unexplained = (true - mean).square().sum(0)
         spread = (true - true.mean(0)).square().sum(0)
         if not bool((spread > 0.0).any()):
             raise DataError(f"{quantity} is constant in the data, so that a score is not defined")

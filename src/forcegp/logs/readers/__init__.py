@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 
 from forcegp.errors import DataError
+from forcegp.guards import foreign
 from forcegp.logs.table import LogTable, Progress, Wanted
 
 _READERS = {
@@ -65,7 +66,8 @@ def read(
     [1.5, 1.75]
     """
     place = Path(path)
-    module, _, name = _READERS[format_of(place)][1].partition(".")
+    with foreign(str(path), "a log"):
+        module, _, name = _READERS[format_of(place)][1].partition(".")
     reader: Callable[..., LogTable] = getattr(import_module(f"forcegp.logs.readers.{module}"), name)
     keep: Wanted = wanted if wanted is not None else lambda name: True
     return reader(place, wanted=keep, rows=rows, progress=progress)

@@ -45,13 +45,13 @@ def read_columns(
     chunks: dict[str, list[Column]] = {}
     total = 0
     for path in paths:
-        with pq.ParquetFile(path, pre_buffer=False) as file:
+        with pq.ParquetFile(path.absolute(), pre_buffer=False) as file:
             total += _check(path, file, set(_readable(file, wanted, [])))
             table.check_values(str(path), total, 1)
     length = sum(path.stat().st_size for path in paths)
     done = 0
     for path in paths:
-        with pq.ParquetFile(path, pre_buffer=False) as file:
+        with pq.ParquetFile(path.absolute(), pre_buffer=False) as file:
             names = _readable(file, wanted, remarks)
             for batch in file.iter_batches(BATCH_ROWS, columns=names, use_threads=False):
                 for name in names:
