@@ -12,6 +12,7 @@ import warnings
 
 import typer
 
+from forcegp.cli.common import printable, warn
 from forcegp.cli.evaluate import evaluate
 from forcegp.cli.fit import fit, sweep
 from forcegp.cli.logs import check, import_, select
@@ -108,10 +109,9 @@ def _end_when_interrupted() -> None:
 
 def _fail(message: str) -> None:
     typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
-    typer.echo(message, err=True)
+    typer.echo(printable(message), err=True)
     sys.exit(USER_ERROR)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    typer.secho("warning: ", fg="yellow", nl=False, err=True)
-    typer.echo(str(message), err=True)
+    warn(message)

@@ -6,7 +6,9 @@ v = Σ V_i c_i, with V_i the basis functions of each component at sample i.
 Processes of `torch.distributed`, by gloo on processors or NCCL on GPUs, sum over samples of their own. The
 inducing points and hyperparameters must be those of all.
 
-    torchrun --nproc-per-node 2 script.py        # script.py starts with dist.init_process_group("gloo")
+    torchrun --standalone --nproc-per-node 2 script.py
+
+The script starts with `dist.init_process_group("gloo")`.
 """
 
 from __future__ import annotations
