@@ -30,6 +30,8 @@ SEGMENT_NUMBER = 2**53
 
 LOG_VALUES = 1 << 28
 """Numbers read from the log of another program: 2 GiB of float64."""
+FREE_ROWS = 100_000
+"""Rows that a log is resampled to, whatever its own; more are at most `TABLE_EXPANSION` for each row."""
 LOG_STREAMS = 1024
 """Topics, groups or arrays of different length in a log."""
 LOG_FILES = 20_000

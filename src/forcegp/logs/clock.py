@@ -9,9 +9,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from forcegp import limits
 from forcegp.errors import DataError
+from forcegp.guards import check_count
 from forcegp.logs.signals import Array, ImportReport, Signals
-from forcegp.logs.table import check_values
 from forcegp.rows import describe, numbered
 
 RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
@@ -174,8 +175,8 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
     step = period if period is not None else usual_step(signals.t)
     grids, nearest = [], []
     length = sum(float(signals.t[rows.stop - 1] - signals.t[rows.start]) for rows in stretches)
-    numbers = len(signals.vectors) * len(signals.joint_names) + 1
-    check_values(report.source, math.ceil(min(length / step, 2.0**62)), numbers)
+    most = max(limits.FREE_ROWS, limits.TABLE_EXPANSION * len(signals))
+    check_count(report.source, "rows on an even clock", math.ceil(min(length / step, 2.0**62)), most)
     for rows in stretches:
         t = signals.t[rows]
         count = int(np.floor((t[-1] - t[0]) / step + 1e-6)) + 1

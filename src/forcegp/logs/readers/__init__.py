@@ -18,9 +18,9 @@ _READERS = {
     "numpy": ("NumPy .npz or .npy", "arrays.read_numpy"),
     "matlab": ("MATLAB .mat", "arrays.read_matlab"),
     "hdf5": ("HDF5", "arrays.read_hdf5"),
-    "rosbag1": ("ROS 1 bag", "bags.read_rosbag"),
-    "rosbag2": ("ROS 2 bag", "bags.read_rosbag"),
-    "mcap": ("MCAP", "bags.read_mcap"),
+    "rosbag1": ("ROS 1 bag", "bags.read_bag"),
+    "rosbag2": ("ROS 2 bag", "bags.read_bag"),
+    "mcap": ("MCAP", "bags.read_bag"),
     "lerobot": ("LeRobot data set", "parquet.read_lerobot"),
 }
 FORMATS = {kind: name for kind, (name, _) in _READERS.items()}

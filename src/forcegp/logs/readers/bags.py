@@ -12,8 +12,9 @@ from __future__ import annotations
 import io
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ CLOCKS = ("header", "receive")
 """Columns of time that every topic has."""
 
 Decode = Callable[[bytes], Any]
+Found = tuple[str, str, str, int, bytes, int]
+"""Topic, type, encoding, time of recording [ns] and content of a message, and how much was read by then."""
 
 
 def canonical(kind: str) -> str:
@@ -46,6 +49,7 @@ def canonical(kind: str) -> str:
     return f"{package}/msg/{name}" if "/" not in name else kind
 
 
+@cache
 def decoder(kind: str, encoding: str) -> Decode:
     """Decodes messages of a type in `KINDS`, in the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
@@ -85,7 +89,19 @@ class Collector:
     _streams: dict[tuple[str, frozenset[str]], Messages] = field(default_factory=dict)
     _numbers: int = 0
 
-    def add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
+    def take(
+        self, messages: Iterable[Found], rows: int | None, progress: Progress | None, total: int
+    ) -> None:
+        """Take the messages of types that are read, until a stream has `rows` of them."""
+        for topic, kind, encoding, receive_ns, raw, done in messages:
+            if kind in KINDS and encoding in ("cdr", "ros1"):
+                self._add(topic, kind, receive_ns, raw, decoder(kind, encoding))
+            if progress is not None and self.unpacking.records % 1024 == 0:
+                progress(done, total)
+            if rows is not None and self.rows >= rows:
+                return
+
+    def _add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
         """Take one message; `DataError` if it is too large, or its arrays do not fit its joint names."""
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
@@ -150,44 +166,40 @@ def _wrench(message: Any) -> dict[str, float]:
     return {f"{part}.{axis}": getattr(vector, axis) for part, vector in parts.items() for axis in "xyz"}
 
 
-def read_rosbag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2."""
+def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2, or of an MCAP file."""
     files = _files(path) if path.is_dir() else [path]
-    if path.is_dir() and any(file.suffix == ".mcap" for file in files):
-        return _read_mcap(path, [file for file in files if file.suffix == ".mcap"], wanted, rows, progress)
+    unpacking = Unpacking(str(path), sum(file.stat().st_size for file in files))
+    collector, topics = Collector(str(path), unpacking), dict[str, str]()
+    if mcaps := [file for file in files if starts_with(file, b"\x89MCAP0")]:
+        with foreign(str(path), "MCAP"):
+            messages = (message for file in mcaps for message in _mcap_messages(file, unpacking, topics))
+            collector.take(messages, rows, progress, unpacking.file)
+        return collector.table("mcap", topics, wanted)
     first = path.is_file() and starts_with(path, b"#ROSBAG V2.0")
-    encoding = "ros1" if first else "cdr"
-    package = optional_module(f"rosbags.rosbag{2 - first}", "Reading ROS bags", "import")
+    number, encoding = (1, "ros1") if first else (2, "cdr")
+    package = optional_module(f"rosbags.rosbag{number}", f"Reading ROS {number} bags", "import")
     if path.is_file() and not first and path.suffix != ".db3":
         raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
-    collector = Collector(str(path), Unpacking(str(path), sum(file.stat().st_size for file in files)))
     with foreign(str(path), "a bag"):
         for file in files:
             check_tables(file)
-        reader = bounded(package.Reader, collector.unpacking) if first else package.Reader
+        reader = bounded(package.Reader, unpacking) if first else package.Reader
         with reader(path) as bag:
-            return _collected(collector, bag, encoding, wanted, rows, progress)
+            topics |= {c.topic: c.msgtype for c in bag.connections}
+            collector.take(_messages(bag, encoding, unpacking), rows, progress, bag.message_count)
+    return collector.table(f"rosbag{number}", topics, wanted)
 
 
-def _collected(
-    collector: Collector, bag: Any, encoding: str, wanted: Wanted, rows: int | None, progress: Progress | None
-) -> LogTable:
-    check_count(collector.source, "topics", len(bag.connections), limits.LOG_STREAMS)
-    check_count(collector.source, "messages", bag.message_count, limits.LOG_MESSAGES)
+def _messages(bag: Any, encoding: str, unpacking: Unpacking) -> Iterator[Found]:
+    """The messages of a bag of ROS 1 or ROS 2 whose types are read."""
+    check_count(unpacking.source, "topics", len(bag.connections), limits.LOG_STREAMS)
+    check_count(unpacking.source, "messages", bag.message_count, limits.LOG_MESSAGES)
     used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
-    decoders = {c.msgtype: decoder(canonical(c.msgtype), encoding) for c in used}
-    total = sum(c.msgcount for c in used)
-    for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else []):
-        kind = canonical(connection.msgtype)
-        collector.unpacking.read(len(raw))
-        collector.unpacking.record()
-        collector.add(connection.topic, kind, stamp, raw, decoders[connection.msgtype])
-        if progress is not None and done % 1024 == 0:
-            progress(done, total)
-        if rows is not None and collector.rows >= rows:
-            break
-    topics = {c.topic: c.msgtype for c in bag.connections}
-    return collector.table("rosbag1" if encoding == "ros1" else "rosbag2", topics, wanted)
+    for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else ()):
+        unpacking.read(len(raw))
+        unpacking.record()
+        yield connection.topic, canonical(connection.msgtype), encoding, stamp, raw, done
 
 
 def _files(path: Path) -> list[Path]:
@@ -206,50 +218,22 @@ def _files(path: Path) -> list[Path]:
     return [file for file in files if file != description]
 
 
-def read_mcap(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of an MCAP file, also of one without an index."""
-    return _read_mcap(path, [path], wanted, rows, progress)
-
-
-def _read_mcap(
-    path: Path, files: Sequence[Path], wanted: Wanted, rows: int | None, progress: Progress | None
-) -> LogTable:
-    size = sum(file.stat().st_size for file in files)
-    collector, topics = Collector(str(path), Unpacking(str(path), size)), dict[str, str]()
-    with foreign(str(path), "MCAP"):
-        for file in files:
-            with file.open("rb") as opened:
-                _collect_mcap(opened, collector, topics, rows, progress)
-    return collector.table("mcap", topics, wanted)
-
-
-def _collect_mcap(
-    file: io.BufferedReader,
-    collector: Collector,
-    topics: dict[str, str],
-    rows: int | None,
-    progress: Progress | None,
-) -> None:
+def _mcap_messages(path: Path, unpacking: Unpacking, topics: dict[str, str]) -> Iterator[Found]:
+    """The messages of an MCAP file in its order; adds its topics with their types."""
     records = optional_module("mcap.records", "Reading MCAP files", "import")
-    schemas, channels, decoders = {}, {}, {}
-    for record in _mcap_records(file, collector.unpacking):
-        if isinstance(record, records.Schema):
-            schemas[record.id] = canonical(record.name)
-        elif isinstance(record, records.Channel):
-            kind = schemas[record.schema_id] if record.schema_id else record.message_encoding
-            topics[record.topic], channels[record.id] = kind, record
-            check_count(collector.source, "topics", len(channels), limits.LOG_STREAMS)
-        elif isinstance(record, records.Message):
-            channel = channels[record.channel_id]
-            kind, encoding = topics[channel.topic], channel.message_encoding
-            if kind in KINDS and encoding in ("cdr", "ros1"):
-                if (kind, encoding) not in decoders:
-                    decoders[kind, encoding] = decoder(kind, encoding)
-                collector.add(channel.topic, kind, record.log_time, record.data, decoders[kind, encoding])
-            if progress is not None and collector.unpacking.records % 1024 == 0:
-                progress(file.tell(), collector.unpacking.file)
-            if rows is not None and collector.rows >= rows:
-                return
+    schemas, channels = {}, {}
+    with path.open("rb") as file:
+        for record in _mcap_records(file, unpacking):
+            if isinstance(record, records.Schema):
+                schemas[record.id] = canonical(record.name)
+            elif isinstance(record, records.Channel):
+                kind = schemas[record.schema_id] if record.schema_id else record.message_encoding
+                topics[record.topic], channels[record.id] = kind, record
+                check_count(unpacking.source, "topics", len(channels), limits.LOG_STREAMS)
+            elif isinstance(record, records.Message):
+                channel = channels[record.channel_id]
+                kind, encoding = topics[channel.topic], channel.message_encoding
+                yield channel.topic, kind, encoding, record.log_time, record.data, file.tell()
 
 
 def _mcap_records(file: io.BufferedReader, unpacking: Unpacking) -> Iterator[Any]:
