@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,9 +10,6 @@ import typer
 from forcegp.cli import main
 from forcegp.cli.common import progress_bar, show
 from forcegp.cli.options import AsJson
-
-INTERRUPTED = 130
-"""Exit code after an interrupt."""
 
 app = typer.Typer(
     pretty_exceptions_enable=False,
@@ -69,9 +65,4 @@ def reproduce(
 
 
 if __name__ == "__main__":
-    try:
-        main(app)
-    except SystemExit as ended:
-        if ended.code == INTERRUPTED:
-            os._exit(INTERRUPTED)  # the workers are gone, and to take PyTorch down takes longer than that
-        raise
+    main(app)

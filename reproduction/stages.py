@@ -204,7 +204,7 @@ def _start(processes: int) -> Iterator[Callable[[Callable[[], float]], Future[fl
     pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_begin)
     try:
         yield pool.submit
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):
         # A worker within an operation of PyTorch would hear of the interrupt only after it.
         for worker in set(multiprocessing.active_children()) - others:
             worker.kill()

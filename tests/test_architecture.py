@@ -22,7 +22,7 @@ LAYERS = (
         "errors",
         "types",
         "temporary",
-        "exchange",
+        "guards",
         "files",
         "destination",
         "resources",

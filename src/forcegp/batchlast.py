@@ -13,6 +13,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from forcegp.errors import NumericalError
+
 _SMALL = 4096
 """Below so many elements the number of operations counts, above it the time each one takes."""
 
@@ -84,6 +86,21 @@ def take(x: Tensor, joints: Sequence[int]) -> Tensor:
     return x[..., list(joints), :]
 
 
+def mass_factor(M: Tensor) -> Tensor:
+    """Lower Cholesky factor of mass matrices `(*batch, n, n)`.
+
+    Raises:
+        NumericalError: one is not positive definite, as of a robot with negative masses.
+    """
+    try:
+        return torch.linalg.cholesky(M)
+    except torch.linalg.LinAlgError as cause:
+        hint = "check the masses and inertias of the robot, and that states are finite"
+        raise NumericalError(
+            "a mass matrix is not positive definite", got=str(cause)[:200], hint=hint
+        ) from cause
+
+
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
     """M⁻¹ rhs for symmetric positive definite `(n, n, B)` and `(n, k, B)`.
 
@@ -91,7 +108,7 @@ def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
     """
     n, B = M.shape[0], M.shape[-1]
     if M.numel() < _SMALL:
-        factor = torch.linalg.cholesky(M.movedim(-1, 0))
+        factor = mass_factor(M.movedim(-1, 0))
         return torch.cholesky_solve(rhs.movedim(-1, 0), factor).movedim(0, -1)
     rest, rows = torch.cat([M, rhs], dim=1), []
     for _ in range(n):

@@ -40,6 +40,8 @@ def check_kind(target: Path, *, folder: bool) -> None:
 
     The path is looked at once: between `exists` and `is_dir` another writer can change it.
     """
+    if "\0" in str(target):
+        raise DestinationError("a path holds a null byte", got=repr(str(target)))
     try:
         mode = os.stat(target).st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -100,8 +102,8 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
     """
     target = Path(path)
     with _temporary(target, folder=False, mode=mode) as temporary:
-        yield temporary
         with writable(target):
+            yield temporary
             _sync(temporary)
             os.replace(temporary, target)
         with suppress(OSError):  # not every system can
@@ -131,8 +133,8 @@ def written_folder(path: str | Path) -> Iterator[Path]:
     """
     target = Path(path).resolve() if Path(path).is_symlink() else Path(path)
     with _temporary(target, folder=True, mode=0o777) as temporary:
-        yield temporary
         with writable(target):
+            yield temporary
             written = sorted(temporary.iterdir(), key=lambda file: file.stat().st_mtime_ns)
             target.mkdir(exist_ok=True)
             for file in written:

@@ -30,6 +30,8 @@ SEGMENT_NUMBER = 2**53
 
 LOG_VALUES = 1 << 28
 """Numbers read from the log of another program: 2 GiB of float64."""
+FREE_ROWS = 100_000
+"""Rows that a log is resampled to, whatever its own; more are at most `TABLE_EXPANSION` for each row."""
 LOG_STREAMS = 1024
 """Topics, groups or arrays of different length in a log."""
 LOG_FILES = 20_000
@@ -40,6 +42,14 @@ LOG_NAME = 200
 """Characters of a column's name, beyond which it is cut."""
 MESSAGE_BYTES = MIB
 """A message of a bag: a joint state takes less than a kilobyte."""
+FREE_BAG_BYTES = 16 * MIB
+"""A bag unpacked, whatever the size of its file; beyond that, `TABLE_EXPANSION` times its bytes."""
+FREE_MESSAGES, MESSAGE_PACKED = 100_000, 2
+"""Messages of a bag whatever its size, and the fewest bytes of the file that one of more takes."""
+RECORD_BYTES = 256 * MIB
+"""A record of an MCAP file, packed."""
+LISTING_BYTES = MIB
+"""The description of a bag of several files."""
 LINE_BYTES = MIB
 """A line of a text table."""
 GROUP_DEPTH = 16

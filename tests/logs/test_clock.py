@@ -119,3 +119,9 @@ def test_stretches_that_are_too_short_are_dropped_and_reported() -> None:
     s.contact["table"] = (t > 0.395) & (t < 0.455)
     add_derivatives(s, DerivativesSection(), report)
     assert report.findings[0].rows == ((40, 45),) and len(s) == 94 and s.segment.max() == 1
+
+
+def test_a_clock_is_not_resampled_to_far_more_rows_than_were_read() -> None:
+    s = signals(np.arange(60) * 0.01)
+    with pytest.raises(DataError, match=r"too many rows on an even clock(?s:.*)100,000(?s:.*)590,000,000"):
+        even_clock(s, 1e-9, ImportReport("log"))

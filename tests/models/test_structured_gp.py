@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +25,7 @@ from forcegp.forces.search import negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
 from forcegp.gp.optimise import LearningOptions
+from forcegp.models.prediction import CHUNK
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
@@ -566,3 +569,43 @@ def test_contact_data_alone_tell_the_sum_of_two_forces() -> None:
     held = model.fit(closed, options=forcegp.LearningOptions(max_evaluations=2))
     assert held.force_correlation is not None
     assert held.force_correlation < -0.2
+
+
+MEMORY = """
+import resource, sys
+import torch
+import forcegp
+
+fit = forcegp.load_model(sys.argv[1])
+states = torch.linspace(-1.0, 1.0, 40_000 * 7, dtype=torch.float64).reshape(40_000, 7)
+fit.predict(states[:3000], states[:3000], states[:3000], noise=True)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+found = fit.predict(states, states, states, noise=True)
+fit.noise_variance(states, states, states)
+size = sum(x.numel() * 8 for x in (found.mean, found.covariance))
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024, size / (1 << 20))
+"""
+BESIDE = 150.0
+"""Memory of a prediction beside its result [MiB], for any number of states."""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory in KiB")
+def test_many_states_take_little_memory_beside_the_result(model: StructuredFit, tmp_path: Path) -> None:
+    model.save(tmp_path / "model")
+    command = [sys.executable, "-c", MEMORY, str(tmp_path / "model")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    peak, result = map(float, done.stdout.split()[-2:])
+    assert peak < result + BESIDE
+
+
+def test_states_of_any_batch_are_predicted_in_pieces(model: StructuredFit) -> None:
+    q, qd, tau = draw(2 * CHUNK + 30, seed=5)
+    whole = model.predict(q, qd, tau, ("qdd", "multiplier"), noise=True)
+    folded = model.predict(*(x.reshape(2, -1, 7) for x in (q, qd, tau)), ("qdd", "multiplier"), noise=True)
+    last = model.predict(q[-7:], qd[-7:], tau[-7:], ("qdd", "multiplier"), noise=True)
+    for name in ("mean", "covariance"):
+        torch.testing.assert_close(
+            getattr(folded, name).reshape(getattr(whole, name).shape), getattr(whole, name)
+        )
+        torch.testing.assert_close(getattr(whole, name)[-7:], getattr(last, name), rtol=1e-9, atol=1e-9)
+    assert list(whole.parts) == ["qdd", "multiplier"]

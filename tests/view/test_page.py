@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+import urllib.error
 import urllib.request
 from functools import cache
 from pathlib import Path
@@ -112,6 +113,11 @@ def test_the_page_is_served_until_interrupted() -> None:
         def fetch() -> None:
             with urllib.request.urlopen(address, timeout=10) as answer:
                 pages.append(answer.read().decode())
+            for url, host in ((address, "attacker.example:80"), (address.rpartition("/")[0], None)):
+                headers = {} if host is None else {"Host": host}
+                with pytest.raises(urllib.error.HTTPError, match="404"):
+                    urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10)
+                pages.append("refused")
             signal.raise_signal(signal.SIGINT)
 
         Thread(target=fetch, daemon=True).start()
@@ -122,7 +128,7 @@ def test_the_page_is_served_until_interrupted() -> None:
         serve("<p>λ</p>", 0, ask)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert pages == ["<p>λ</p>"]
+    assert pages == ["<p>λ</p>", "refused", "refused"]
 
 
 def test_paths_of_a_rollout_are_added() -> None:

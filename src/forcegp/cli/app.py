@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 import sys
+import threading
+import time
 import warnings
 
 import typer
 
+from forcegp.cli.common import printable, warn
 from forcegp.cli.evaluate import evaluate
 from forcegp.cli.fit import fit, sweep
 from forcegp.cli.logs import check, import_, select
@@ -17,6 +23,10 @@ from forcegp.errors import ForceGPError
 
 USER_ERROR = 2
 """Exit code where the input is at fault, the same as for a wrong option."""
+INTERRUPTED = 130
+"""Exit code after an interrupt (SIGINT), as of a shell."""
+GRACE = 0.6
+"""Time to end in an orderly way after an interrupt [s]."""
 
 app = typer.Typer(
     name="forcegp",
@@ -50,7 +60,11 @@ def _options(
 
 
 def main(program: typer.Typer = app) -> None:
-    """Run a command line; errors that a user can cause end in one message and exit code 2."""
+    """Run a command line; errors that a user can cause end in one message and code 2, an interrupt in 130.
+
+    Temporary files that an interrupt leaves are removed by the next run, as after a crash.
+    """
+    _end_when_interrupted()
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
@@ -60,14 +74,44 @@ def main(program: typer.Typer = app) -> None:
         except OSError as error:
             name = f"{error.filename}: " if error.filename else ""
             _fail(f"{name}{error.strerror or error}")
+        except SystemExit as ended:
+            if ended.code == INTERRUPTED:
+                os._exit(INTERRUPTED)  # to take PyTorch down would take longer than the grace
+            raise
+
+
+def _end_when_interrupted() -> None:
+    """End at an interrupt, or `GRACE` later if that is held up.
+
+    Python handles a signal between two of its own operations, so not within a long one of another library,
+    and loses the exception within a destructor. The descriptor gets the signal at once.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return  # ignored, as in a background job, or in the hands of the caller
+    wake, signals = os.pipe()
+    os.set_blocking(signals, False)
+    signal.set_wakeup_fd(signals, warn_on_full_buffer=False)
+    signal.signal(signal.SIGINT, lambda *_: sys.exit(INTERRUPTED))
+
+    def watch() -> None:
+        while os.read(wake, 1) != bytes([signal.SIGINT]):
+            pass
+        time.sleep(GRACE)
+        for worker in multiprocessing.active_children():
+            worker.kill()
+            worker.join(GRACE)
+        if sys.stderr.isatty():
+            os.write(2, b"\x1b[?25h")  # a progress bar hides the cursor
+        os._exit(INTERRUPTED)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _fail(message: str) -> None:
     typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
-    typer.echo(message, err=True)
+    typer.echo(printable(message), err=True)
     sys.exit(USER_ERROR)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    typer.secho("warning: ", fg="yellow", nl=False, err=True)
-    typer.echo(str(message), err=True)
+    warn(message)

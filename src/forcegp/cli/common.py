@@ -26,10 +26,28 @@ class Advance(Protocol):
     def __call__(self, done: int, total: int | None = None, note: str = "") -> None: ...
 
 
+def printable(text: object) -> str:
+    """Text with control characters escaped: names in files may hold commands for the terminal.
+
+    >>> printable("a\\x1b[2Jb")
+    'a\\\\x1b[2Jb'
+    """
+    return "".join(
+        c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in str(text)
+    )
+
+
+def warn(text: object) -> None:
+    """Print a warning on stderr."""
+    typer.secho("warning: ", fg="yellow", nl=False, err=True)
+    typer.echo(printable(text), err=True)
+
+
 @contextmanager
 def progress_bar(description: str, total: int) -> Iterator[Advance]:
     """A progress bar on stderr; its function takes the steps done, their total if it changed, a note."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
@@ -37,7 +55,7 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
     console = Console(stderr=True)
     # A file or a pipe gets no bar: its steps would only fill the log.
     with Progress(*columns, *times, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(description, total=total, note="")
+        task = bar.add_task(escape(printable(description)), total=total, note="")
         yield lambda done, total=None, note="": bar.update(task, completed=done, total=total, note=note)
 
 
@@ -51,7 +69,7 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
     for name, value in fields.items():
         text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
         text = f"{value:.6g}" if isinstance(value, float) else text
-        typer.echo(f"{name.replace('_', ' '):<{width}}  {text}")
+        typer.echo(printable(f"{name.replace('_', ' '):<{width}}  {text}"))
 
 
 def check_output(out: Path, *inputs: Path) -> None:
@@ -153,4 +171,4 @@ def warn_beyond(model: Predictor, data: Dataset, doubts: Iterable[str] = ()) -> 
 
     beyond = model.beyond(data.qd, data.tau) if isinstance(model, StructuredFit) else None
     for doubt in (*doubts, *(() if beyond is None else warnings_beyond(beyond, data.joint_names))):
-        typer.secho(f"warning: {doubt}", fg="yellow", err=True)
+        warn(doubt)

@@ -17,6 +17,7 @@ from forcegp.cli.common import (
     read_data,
     show,
     system_of,
+    warn,
 )
 from forcegp.cli.options import (
     AsJson,
@@ -130,7 +131,7 @@ def _warn(result: FitResult) -> None:
     """Print what is doubtful about a fit."""
     doubts = () if result.converged else (f"the fit did not converge: {result.message}",)
     for doubt in (*doubts, *result.warnings):
-        typer.secho(f"warning: {doubt}", fg="yellow", err=True)
+        warn(doubt)
 
 
 def sweep(

@@ -13,6 +13,7 @@ from forcegp.cli.common import (
     check_data_destination,
     check_output,
     check_robot_named,
+    printable,
     progress_bar,
     read_data,
     show,
@@ -201,8 +202,8 @@ def check(
         show({**report.to_dict(), "page": str(out) if out else None}, as_json)
     else:
         _print(report)
-        typer.echo(f"page: {out}" if out else "", nl=out is not None)
-        typer.secho(report.verdict, bold=True)
+        typer.echo(printable(f"page: {out}") if out else "", nl=out is not None)
+        typer.secho(printable(report.verdict), bold=True)
     if not report.usable:
         raise typer.Exit(NOT_USABLE)
 
@@ -223,12 +224,14 @@ def _print(report: Report) -> None:
             rows = re.sub("^rows? ", "", describe(finding.intervals, most=2))
             rows = "all" if finding.intervals == ((0, report.samples),) else rows
             # Joint and parameter names may hold brackets, which are no markup.
-            body = Text(f"{finding.message}\n").append(f"→ {finding.remedy}", style="dim")
+            body = Text(printable(f"{finding.message}\n")).append(
+                printable(f"→ {finding.remedy}"), style="dim"
+            )
             kinds = "\nor ".join(finding.kinds)
             table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), kinds, rows, body)
         Console().print(table)
     for name, reason in report.skipped.items():
-        typer.echo(f"not checked: {name} ({reason})")
+        typer.echo(printable(f"not checked: {name} ({reason})"))
 
 
 def select(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import progress_bar, read_data, show, trajectory_from
+from forcegp.cli.common import printable, progress_bar, read_data, show, trajectory_from
 from forcegp.cli.options import AsJson
 
 if TYPE_CHECKING:
@@ -80,7 +80,8 @@ def view(
     title = f"{target}: {log or 'at rest'}"
     if out is None:
         page = view_page(motion, shapes, title)
-        serve(page, port, say=lambda address: typer.echo(f"{title}\nopen {address}, end with Ctrl-C"))
+        typer.echo(printable(title))
+        serve(page, port, say=lambda address: typer.echo(f"open {address}, end with Ctrl-C"))
         return
     write_view(out, motion, shapes, title)
     show({"pictures": len(motion.t), "paths": len(motion.paths), "page": str(out)}, as_json)

@@ -25,6 +25,7 @@ from torch.linalg import vecdot
 from torch.nn.functional import normalize
 
 from forcegp import dynamics
+from forcegp.batchlast import mass_factor
 from forcegp.derivatives import inverse_dynamics_derivatives
 from forcegp.kinematics import LinkMotion, LinkPoses
 from forcegp.robot.model import RobotModel
@@ -147,8 +148,8 @@ class Equations:
 
     @cached_property
     def M_cholesky(self) -> JointMatrix:
-        """Lower Cholesky factor of M."""
-        return torch.linalg.cholesky(self.M)
+        """Lower Cholesky factor of M; `NumericalError` where M is not positive definite."""
+        return mass_factor(self.M)
 
     @cached_property
     def M_inv_At(self) -> ConstraintInverse:

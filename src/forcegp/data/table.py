@@ -17,6 +17,7 @@ from forcegp import limits
 from forcegp.data.fields import DataHeader
 from forcegp.errors import DataError, near_names
 from forcegp.files import atomic_file
+from forcegp.guards import allowed_bytes, damaged, foreign
 from forcegp.resources import announce_memory
 
 if TYPE_CHECKING:
@@ -55,7 +56,10 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
     schema = pa.schema({name: pa.from_numpy_dtype(values.dtype) for name, values in columns.items()})
     schema = schema.with_metadata({HEADER_KEY: header.to_json().encode()})
     rows = max(map(len, columns.values()), default=0)
-    with atomic_file(path) as temporary, pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+    with (
+        atomic_file(path) as temporary,
+        pq.ParquetWriter(temporary.absolute(), schema, compression="zstd") as writer,
+    ):
         for start in range(0, rows, GROUP_ROWS):
             group = {name: pa.array(values[start : start + GROUP_ROWS]) for name, values in columns.items()}
             writer.write_table(pa.table(group, schema=schema))
@@ -83,13 +87,14 @@ def read_table(
 def existing(path: str | Path) -> Path:
     """The path of a file that exists, else a `DataError` whose hint names the nearest one."""
     file = Path(path)
-    if file.is_file():
-        return file
-    if not file.parent.is_dir():
-        hint = f"the folder {file.parent} does not exist"
-    else:
-        near = near_names(file.name, (other.name for other in file.parent.iterdir()))
-        hint = f"did you mean {file.with_name(near[0])}?" if near else None
+    with foreign(str(path), "a path"):
+        if file.is_file():
+            return file
+        if not file.parent.is_dir():
+            hint = f"the folder {file.parent} does not exist"
+        else:
+            near = near_names(file.name, (other.name for other in file.parent.iterdir()))
+            hint = f"did you mean {file.with_name(near[0])}?" if near else None
     raise DataError(f"{file}: no such file", hint=hint)
 
 
@@ -111,7 +116,7 @@ def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], Data
 
     try:
         # pre_buffer is off: a damaged offset must not make the reader ask for the whole address space.
-        with pq.ParquetFile(file) as parquet:
+        with pq.ParquetFile(file.absolute()) as parquet:  # Arrow expands a leading ~
             shape = parquet.metadata
             _check_count(file, shape.num_columns)
             header = _header(file, parquet.schema_arrow.metadata or {})
@@ -120,16 +125,6 @@ def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], Data
             yield parquet, usable, header
     except (pa.ArrowException, OSError, MemoryError, OverflowError, UnicodeDecodeError) as cause:
         raise damaged(str(file), "Parquet", cause) from cause
-
-
-def damaged(source: str, kind: str, cause: BaseException) -> DataError:
-    """The error for a file that a parser of some kind of files fails on."""
-    lines = str(cause).splitlines()
-    return DataError(
-        f"{source}: the file is damaged, truncated or not {kind}",
-        got=lines[0][:300] if lines else type(cause).__name__,
-        hint="write it again from its source; an interrupted copy is the usual cause",
-    )
 
 
 def _check_count(file: Path, columns: int) -> None:
@@ -151,11 +146,11 @@ def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
 def _check_size(file: Path, rows: int, columns: int) -> None:
     """Check the size in memory before anything is unpacked: a small file can claim to hold more than fits."""
     size = rows * columns * 8
-    allowed = max(limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file.stat().st_size)
-    if size > min(allowed, limits.TABLE_BYTES):
+    allowed = min(allowed_bytes(file.stat().st_size), limits.TABLE_BYTES)
+    if size > allowed:
         raise DataError(
             f"{file}: the file claims to be larger than what is read at once",
-            expected=f"at most {min(allowed, limits.TABLE_BYTES) // 8:,} numbers in a file of this size",
+            expected=f"at most {allowed // 8:,} numbers in a file of this size",
             got=f"{rows:,} rows × {columns} columns",
             hint="split the log into several files",
         )
@@ -181,7 +176,7 @@ def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:
     rows = file.stat().st_size // max(len(second), 2 * columns)
     announce_memory(COPIES * 8 * rows * columns, f"reading {file}")
     try:
-        table = csv.read_csv(file, read_options=csv.ReadOptions(use_threads=False))
+        table = csv.read_csv(file.absolute(), read_options=csv.ReadOptions(use_threads=False))
         return table.select(_usable(file, table.schema)), DataHeader()
     except (pa.ArrowException, OSError, MemoryError, UnicodeDecodeError) as cause:
         raise DataError(

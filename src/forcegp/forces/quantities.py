@@ -86,6 +86,11 @@ class FlatStates(NamedTuple):
         """Some of the states."""
         return FlatStates(self.q[index], self.qd[index], self.tau[index], self.active[index], self.batch)
 
+    def with_equations(self, system: ConstrainedSystem) -> States:
+        """The states with their equations of motion."""
+        eom = system.equations(self.q, self.qd, self.active)
+        return States(self.q, self.qd, self.tau, self.active, eom)
+
 
 def flat_states(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
@@ -122,8 +127,7 @@ def states_at(
     """States `(*batch, nq)` as a list with their equations of motion, and the batch; errors as of
     `flat_states`."""
     flat = flat_states(system, q, qd, tau, active)
-    eom = system.equations(flat.q, flat.qd, flat.active)
-    return States(flat.q, flat.qd, flat.tau, flat.active, eom), flat.batch
+    return flat.with_equations(system), flat.batch
 
 
 class AffineMap(NamedTuple):

@@ -6,12 +6,15 @@ v = Σ V_i c_i, with V_i the basis functions of each component at sample i.
 Processes of `torch.distributed`, by gloo on processors or NCCL on GPUs, sum over samples of their own. The
 inducing points and hyperparameters must be those of all.
 
-    torchrun --nproc-per-node 2 script.py        # script.py starts with dist.init_process_group("gloo")
+    torchrun --standalone --nproc-per-node 2 script.py
+
+The script starts with `dist.init_process_group("gloo")`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -243,9 +246,9 @@ def reduce_sums(sums: Sums) -> Sums:
 
 def add_over_processes(x: Tensor) -> Tensor:
     """The tensors of all processes added, the same in each of them."""
-    _require_processes()
     total = x.detach().clone()
-    dist.all_reduce(total, op=dist.ReduceOp.SUM)
+    with _processes():
+        dist.all_reduce(total, op=dist.ReduceOp.SUM)
     return total
 
 
@@ -271,7 +274,6 @@ def share_basis(basis: LatentBasis) -> LatentBasis:
     Raises:
         ModelError: no group of processes has been initialised.
     """
-    _require_processes()
     dropped = [s.dropped for part in basis.parts for s in part.spectra]
     counts = iter(_broadcast(torch.tensor(dropped)).tolist())
     parts = []
@@ -290,13 +292,21 @@ def _shared(tensors: Parameters | Features) -> dict[str, Tensor]:
 
 def _broadcast(x: Tensor) -> Tensor:
     copy = x.detach().clone(memory_format=torch.contiguous_format)
-    dist.broadcast(copy, src=0)
+    with _processes():
+        dist.broadcast(copy, src=0)
     return copy
 
 
-def _require_processes() -> None:
+@contextmanager
+def _processes() -> Iterator[None]:
+    """Exchange with the other processes; `ModelError` without them, or if one is lost."""
     if not (dist.is_available() and dist.is_initialized()):
         raise ModelError(
             "no group of processes has been initialised",
             hint='start with torchrun, and call torch.distributed.init_process_group("gloo") first',
         )
+    try:
+        yield
+    except RuntimeError as cause:
+        hint = "start all of them again; a fit with a checkpoint resumes"
+        raise ModelError("another process of the fit was lost", got=str(cause)[:300], hint=hint) from cause

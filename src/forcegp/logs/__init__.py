@@ -15,6 +15,7 @@ import torch
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import DataHeader, Dataset
 from forcegp.errors import DataError
+from forcegp.guards import foreign
 from forcegp.logs.clock import even_clock, usual_step
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.gather import gather
@@ -110,13 +111,14 @@ def import_log(
     report = ImportReport(str(path))
     report.steps.append(f"read {Path(path).name} by mapping {Path(log_mapping.document.source).name}")
     try:
-        signals = gather(path, log_mapping, robot.joint_names, report, progress)
-        numbers = NUMBERS * len(signals.joint_names) * len(signals)
-        announce_memory(8 * numbers, f"importing {len(signals):,} rows")
-        even_clock(signals, log_mapping.sections.time.period, report)
-        evidence = _contacts(signals, system, log_mapping, report, displaced)
-        std = add_derivatives(signals, log_mapping.sections.derivatives, report)
-        data = _dataset(signals, std, log_mapping, system, report)
+        with foreign(str(path), "a log that can be imported"):
+            signals = gather(path, log_mapping, robot.joint_names, report, progress)
+            numbers = NUMBERS * len(signals.joint_names) * len(signals)
+            announce_memory(8 * numbers, f"importing {len(signals):,} rows")
+            even_clock(signals, log_mapping.sections.time.period, report)
+            evidence = _contacts(signals, system, log_mapping, report, displaced)
+            std = add_derivatives(signals, log_mapping.sections.derivatives, report)
+            data = _dataset(signals, std, log_mapping, system, report)
     except DataError as error:
         raise error if str(path) in error.message else DataError.at(str(path), error) from None
     return Imported(data, report, tuple(evidence))

@@ -4,10 +4,14 @@ clock, and uneven clocks made even.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from forcegp import limits
 from forcegp.errors import DataError
+from forcegp.guards import check_count
 from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.rows import describe, numbered
 
@@ -170,6 +174,9 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
         return
     step = period if period is not None else usual_step(signals.t)
     grids, nearest = [], []
+    length = sum(float(signals.t[rows.stop - 1] - signals.t[rows.start]) for rows in stretches)
+    most = max(limits.FREE_ROWS, limits.TABLE_EXPANSION * len(signals))
+    check_count(report.source, "rows on an even clock", math.ceil(min(length / step, 2.0**62)), most)
     for rows in stretches:
         t = signals.t[rows]
         count = int(np.floor((t[-1] - t[0]) / step + 1e-6)) + 1

@@ -19,6 +19,7 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data.checks import MOST_RADIANS
 from forcegp.data.derivative import cross_validated_window
 from forcegp.errors import DataError
+from forcegp.guards import foreign
 from forcegp.logs import units
 from forcegp.logs.clock import even_clock
 from forcegp.logs.contact import force_levels, level_and_spread, multiplier
@@ -52,11 +53,12 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
     """Propose a mapping for a log; `MappingError` where time, positions or torques are not recognised."""
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
-    stream = find_time(table, draft)
-    find_families(stream, system.robot, draft)
-    find_wrench(table, system.robot, draft)
-    _try(path, draft, system, _possible_units(draft, stream))
-    propose_contacts(table, draft, system, cache(lambda: _signals(path, draft, system)))
+    with foreign(str(path), "a log that can be imported"):
+        stream = find_time(table, draft)
+        find_families(stream, system.robot, draft)
+        find_wrench(table, system.robot, draft)
+        _try(path, draft, system, _possible_units(draft, stream))
+        propose_contacts(table, draft, system, cache(lambda: _signals(path, draft, system)))
     return draft
 
 

@@ -1,45 +1,18 @@
-"""What every reader returns, named columns of numbers by the clock that they share, and guards of their size:
-a small compressed file can claim to hold more than memory does. The bounds are in `forcegp.limits`."""
+"""What every reader returns: named columns of numbers by the clock that they share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
-from forcegp.data.table import damaged
-from forcegp.errors import DataError, ForceGPError, did_you_mean
+from forcegp.errors import DataError, did_you_mean
+from forcegp.guards import check_count, check_expansion
 from forcegp.resources import announce_memory
-
-
-def check_count(source: str, what: str, count: int, most: int) -> None:
-    """Raise `DataError` if a log claims more than `most` of something, named in the plural.
-
-    >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
-    """
-    if count > most:
-        raise DataError(
-            f"{source}: the log claims too many {what}",
-            expected=f"at most {most:,}",
-            got=f"{count:,}",
-            hint="split the log, or export only the columns that are needed",
-        )
-
-
-def check_expansion(source: str, size: int, file: int) -> None:
-    """Raise `DataError` if a small file, of `file` bytes, claims to hold far more, `size` bytes."""
-    allowed = max(limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
-    if size > allowed:
-        raise DataError(
-            f"{source}: the file claims to be larger than what is read at once",
-            expected=f"at most {allowed:,} bytes in a file of this size",
-            got=f"{size:,}",
-            hint="split the log into several files",
-        )
 
 
 def check_values(source: str, rows: int, columns: int) -> None:
@@ -124,22 +97,8 @@ def missing(source: str, kind: str, name: str, names: list[str]) -> DataError:
     )
 
 
-@contextmanager
-def foreign(source: str, kind: str) -> Iterator[None]:
-    """Turn whatever a third-party parser raises on a damaged file into `DataError`."""
-    try:
-        yield
-    except ForceGPError:
-        raise
-    except (FileNotFoundError, PermissionError) as cause:
-        what = "no such file" if isinstance(cause, FileNotFoundError) else "the file may not be read"
-        raise DataError(f"{source}: {what}", got=str(cause)) from cause
-    except (Exception, RecursionError, MemoryError) as cause:
-        raise damaged(source, kind, cause) from cause
-
-
 def table_of_arrays(
-    source: str, kind: str, arrays: Mapping[str, NDArray[np.generic]], remarks: Sequence[str] = ()
+    path: Path, kind: str, arrays: Mapping[str, NDArray[np.generic]], remarks: Sequence[str] = ()
 ) -> LogTable:
     """The log of the arrays of a file, a stream for each number of rows.
 
@@ -147,7 +106,8 @@ def table_of_arrays(
     most arrays share; `(d, n)` is transposed. Arrays of another length are streams of their own. After the
     `remarks` of the reader comes one for each array that was transposed or left out.
     """
-    usable, remarks = {}, list(remarks)
+    usable, remarks, source = {}, list(remarks), str(path)
+    check_expansion(source, 8 * sum(array.size for array in arrays.values()), path.stat().st_size)
     for name, array in arrays.items():
         squeezed = array.reshape(-1) if array.ndim == 2 and 1 in array.shape else array
         if squeezed.dtype.kind not in "fiub" or squeezed.ndim not in (1, 2) or squeezed.size < 2:

@@ -20,7 +20,7 @@ from forcegp.files import Record
 from forcegp.forces.quantities import FlatStates, flat_states
 from forcegp.gp.optimise import FitProgress
 from forcegp.models.fit_result import HasResult, fit_table, model_line
-from forcegp.models.prediction import CHUNK, Prediction, Predictor
+from forcegp.models.prediction import Prediction, Predictor, in_pieces
 from forcegp.storage.model_file import ModelHeader, write_model
 
 
@@ -146,18 +146,19 @@ class PointwiseFit(FittedModel):
             ModelError: a model of accelerations alone is asked for another quantity, or on another system.
             ShapeError: a state does not fit the robot.
         """
-        flat = flat_states(system or self.system, q, qd, tau, active)
-        starts = range(0, max(len(flat.q), 1), CHUNK)
-        chunks = (flat.rows(slice(first, first + CHUNK)) for first in starts)
-        values = [self.at(chunk, quantity, system or self.system, covariance) for chunk in chunks]
-        mean = torch.cat([mean for mean, *_ in values])
-        mean = mean.reshape(*flat.batch, mean.shape[-1])
-        variances, spread = [variance for _, variance, *_ in values if variance is not None], None
-        if variances:
-            spread = torch.diag_embed(torch.cat(variances).reshape(mean.shape))
-        doubts = tuple(dict.fromkeys(doubt for *_, own in values for doubt in own))
+        system, parts, doubts = system or self.system, dict[str, slice](), dict[str, None]()
+
+        def read(at: FlatStates) -> tuple[Tensor | None, ...]:
+            mean, variance, slices, own = self.at(at, quantity, system, covariance)
+            parts.update(slices)
+            doubts.update(dict.fromkeys(own))
+            return mean, variance
+
+        mean, variance = in_pieces(flat_states(system, q, qd, tau, active), read)
+        assert mean is not None
+        spread = None if variance is None else torch.diag_embed(variance)
         determined = ~mean.isnan() if doubts else None
-        return Prediction(mean, spread, values[0][2], determined=determined, doubts=doubts)
+        return Prediction(mean, spread, parts, determined=determined, doubts=tuple(doubts))
 
     @abstractmethod
     def at(

@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import UnknownNameError
+from forcegp.errors import ForceGPError, ModelError, UnknownNameError
 from forcegp.models.analytical import AnalyticalFit
 from forcegp.models.base import FittedModel
 from forcegp.models.independent_gp import IndependentFit
@@ -77,8 +77,14 @@ def _restored(
     """The model of a header and tensors."""
     if header.kind not in KINDS:
         raise UnknownNameError(f"kind of models in {source}", header.kind, KINDS)
-    model_system = unpack_system(header.system, tensors, source, system)
-    return KINDS[header.kind].restored(header, model_tensors(tensors), model_system, source)
+    try:
+        model_system = unpack_system(header.system, tensors, source, system)
+        return KINDS[header.kind].restored(header, model_tensors(tensors), model_system, source)
+    except ForceGPError:
+        raise
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as cause:
+        got = f"{type(cause).__name__}: {cause}"[:300]
+        raise ModelError(f"{source}: the parts of the model contradict each other", got=got) from cause
 
 
 def register() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from forcegp.data.fields import AXES
 from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, UnknownNameError
 from forcegp.forces.measurements import COLUMNS
 from forcegp.forces.noise import warnings_beyond
-from forcegp.forces.quantities import ForceField, ForceLinearization, linearize_field
+from forcegp.forces.quantities import FlatStates, ForceField, ForceLinearization, linearize_field
 from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import Disturbance, Torque
 from forcegp.rollout.trajectory import Rollout
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 CHUNK = 2000
 """States that are predicted at once, to bound the memory."""
+CHECKED = 1 << 16
+"""Covariances that are checked at once."""
 MOST_SAMPLES = 2000
 """Samples that are predicted and drawn: more cannot be told apart."""
 
@@ -77,14 +79,18 @@ class Prediction:
                 both = self.determined[..., None] & self.determined[..., None, :]
                 covariance = covariance.where(both, 0.0)
         for name, value in (("mean", mean), ("covariance", covariance)):
-            if value is not None and not bool(torch.isfinite(value).all()):
+            pieces = () if value is None else value.reshape(-1).split(1 << 20)
+            wrong = sum(int((~torch.isfinite(piece)).sum()) for piece in pieces)
+            if value is not None and wrong:
                 raise NumericalError(
                     f"the {name} of a prediction is not finite",
-                    got=f"{int((~torch.isfinite(value)).sum())} of {value.numel()} numbers",
+                    got=f"{wrong} of {value.numel()} numbers",
                     hint="states beyond what a robot can do overflow; check q, qd and tau",
                 )
         if covariance is not None:
-            require_semidefinite(covariance)
+            d = covariance.shape[-1]
+            for piece in covariance.reshape(-1, d, d).split(CHECKED) if d else ():
+                require_semidefinite(piece)
 
     @property
     def variance(self) -> Tensor | None:
@@ -165,6 +171,20 @@ class Prediction:
         curves = [] if true is None else [Curve(true[:, i], "measured", MEASURED, width=0.7)]
         band = None if self.std is None else self.std[:, i]
         return Panel(name, label, [*curves, Curve(self.mean[:, i], "predicted", PREDICTED, band)])
+
+
+def in_pieces(
+    at: FlatStates, read: Callable[[FlatStates], tuple[Tensor | None, ...]]
+) -> tuple[Tensor | None, ...]:
+    """What `read` gives at states, asked for `CHUNK` at a time; memory holds the result and one piece."""
+    whole, n = list[Tensor | None](), len(at.q)
+    for first in range(0, max(n, 1), CHUNK):
+        piece = read(at.rows(slice(first, first + CHUNK)))
+        whole = whole or [x if x is None or n <= CHUNK else x.new_empty(n, *x.shape[1:]) for x in piece]
+        for target, x in zip(whole, piece, strict=True):
+            if target is not None and x is not None and target is not x:
+                target[first : first + CHUNK] = x
+    return tuple(x if x is None else x.reshape(*at.batch, *x.shape[1:]) for x in whole)
 
 
 def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:
@@ -325,10 +345,9 @@ class Predictor(ABC):
         data.check_robot(self.specified.robot)
         if len(data) < 2:
             raise DataError("a score needs two samples or more", got=len(data))
-        true, chunks = measured(self.system, data, quantity), range(0, len(data), CHUNK)
-        parts = (data[first : first + CHUNK] for first in chunks)
-        means = [self._at_logged(part, quantity, covariance=False).mean for part in parts]
-        unexplained = (true - torch.cat(means)).square().sum(0)
+        true = measured(self.system, data, quantity)
+        mean = self._at_logged(data, quantity, covariance=False).mean
+        unexplained = (true - mean).square().sum(0)
         spread = (true - true.mean(0)).square().sum(0)
         if not bool((spread > 0.0).any()):
             raise DataError(f"{quantity} is constant in the data, so that a score is not defined")

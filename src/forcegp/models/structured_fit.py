@@ -37,11 +37,13 @@ from forcegp.forces.problem import (
 )
 from forcegp.forces.quantities import (
     AffineMap,
+    FlatStates,
     ForceField,
+    States,
     affine_map,
     affine_maps,
+    flat_states,
     hidden_forces,
-    states_at,
 )
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
@@ -49,7 +51,7 @@ from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
-from forcegp.models.prediction import Prediction
+from forcegp.models.prediction import Prediction, in_pieces
 from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
 from forcegp.rollout.inputs import Disturbance
@@ -139,35 +141,50 @@ class StructuredFit(FittedModel):
             ModelError: nothing but forces of contacts that were closed in no training sample.
         """
         unseen, system = (self.result.never_closed, self.system) if system is None else ((), system)
-        at, batch = states_at(system, q, qd, tau, active)
-        if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
-            # Errors of the inertia are multiplied by the predicted acceleration.
-            qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
-            at = dataclasses.replace(at, qdd=qdd)
-        z, parts = affine_maps(system, at, quantity)
-        spread = None
-        if not covariance:
-            mean = self.posterior.read_mean(system, at, z)
-        else:
-            mean, spread = self.posterior.read(system, at, z)
-            z = self.posterior.process.coupled(system, at, z)
-            unknown = unknown_variance(self.hyperparameters, at, self.problem.external_std)
-            spread = spread + _carried(z, unknown)
-            if noise:
-                spread = spread + self._noise_covariance(z, parts)
-        hidden = hidden_forces(system, at, parts, unseen)
-        if hidden is not None:
-            mean, spread = hidden.applied(mean, spread)
-        beyond = self.beyond(at.qd, at.tau)
+        slices, doubts = dict[str, slice](), dict[str, None]()
+
+        def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
+            at = flat.with_equations(system)
+            if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
+                # Errors of the inertia are multiplied by the predicted acceleration.
+                qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
+                at = dataclasses.replace(at, qdd=qdd)
+            z, parts = affine_maps(system, at, quantity)
+            slices.update(parts)
+            if covariance:
+                mean, spread = self._read(system, at, z, parts, noise)
+            else:
+                mean, spread = self.posterior.read_mean(system, at, z), None
+            determined, hidden = (
+                torch.ones_like(mean, dtype=torch.bool),
+                hidden_forces(system, at, parts, unseen),
+            )
+            if hidden is not None:
+                mean, spread = hidden.applied(mean, spread)
+                determined = ~hidden.whole
+                doubts.update(dict.fromkeys(hidden.doubts))
+            return mean, spread, self.beyond(at.qd, at.tau), determined
+
+        mean, spread, beyond, determined = in_pieces(flat_states(system, q, qd, tau, active), read)
+        assert mean is not None
         return Prediction(
-            mean.reshape(*batch, z.o.shape[-1]),
-            None if spread is None else spread.reshape(*batch, *spread.shape[-2:]),
-            parts,
-            None if beyond is None else beyond.reshape(*batch, system.robot.nq),
+            mean,
+            spread,
+            slices,
+            beyond,
             system.robot.joint_names,
-            determined=None if hidden is None else ~hidden.whole.reshape(*batch, -1),
-            doubts=() if hidden is None else hidden.doubts,
+            determined=determined if doubts else None,
+            doubts=tuple(doubts),
         )
+
+    def _read(
+        self, system: ConstrainedSystem, at: States, z: AffineMap, parts: Mapping[str, slice], noise: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and covariance of quantities, unknown forces and, if asked for, noise included."""
+        mean, spread = self.posterior.read(system, at, z)
+        z = self.posterior.process.coupled(system, at, z)
+        spread = spread + _carried(z, unknown_variance(self.hyperparameters, at, self.problem.external_std))
+        return mean, spread + self._noise_covariance(z, parts) if noise else spread
 
     def external_wrench(
         self,
@@ -418,11 +435,16 @@ class StructuredFit(FittedModel):
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
             sensor: whether the noise of the quantity's own sensor counts beside that of the torque.
         """
-        at, batch = states_at(self.system, q, qd, tau, active)
-        z, parts = affine_maps(self.system, at, quantity)
-        z = self.posterior.process.coupled(self.system, at, z)
-        noise = self._noise_covariance(z, parts if sensor else {}).diagonal(dim1=-2, dim2=-1)
-        return noise.reshape(*batch, z.o.shape[-1])
+
+        def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
+            at = flat.with_equations(self.system)
+            z, parts = affine_maps(self.system, at, quantity)
+            z = self.posterior.process.coupled(self.system, at, z)
+            return (self._noise_covariance(z, parts if sensor else {}).diagonal(dim1=-2, dim2=-1),)
+
+        [noise] = in_pieces(flat_states(self.system, q, qd, tau, active), read)
+        assert noise is not None
+        return noise
 
 
 def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:

@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from forcegp.errors import ShapeError, check_name
+from forcegp.errors import ParameterError, ShapeError, check_name
 from forcegp.notebook import html_table
 
 JointType = Literal["revolute", "prismatic"]
@@ -188,6 +188,7 @@ class RobotModel:
         Raises:
             UnknownNameError: a field does not exist.
             ShapeError: a tensor has another shape than the one it replaces.
+            ParameterError: gravity or a mass is not finite.
         """
         names = [field.name for field in dataclasses.fields(self)]
         for name, value in fields.items():
@@ -196,6 +197,8 @@ class RobotModel:
             if isinstance(old, Tensor) and isinstance(value, Tensor) and value.shape != old.shape:
                 text = f"robot field {name!r} has the wrong shape"
                 raise ShapeError(text, expected=tuple(old.shape), got=tuple(value.shape))
+            if name in ("gravity", "mass") and not bool(torch.isfinite(torch.as_tensor(value)).all()):
+                raise ParameterError(f"robot field {name!r} is not finite", got=value)
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
 
     def check_state(self, **states: Tensor) -> None:

@@ -411,8 +411,8 @@ def sliding_away(
         sticks = None if point.sticks is None else point.sticks & ~gone[:, 0]
         points[contact.name] = dataclasses.replace(point, velocity=velocity, sticks=sticks)
         free[:, rows] = gone
-    A, b = eom.A.masked_fill(free[..., None], 0.0), eom.b.masked_fill(free, 0.0)
-    return dataclasses.replace(at, eom=dataclasses.replace(eom, A=A, b=b, contact_points=points))
+    A, b, holds = eom.A.masked_fill(free[..., None], 0.0), eom.b.masked_fill(free, 0.0), eom.holds & ~free
+    return dataclasses.replace(at, eom=dataclasses.replace(eom, A=A, b=b, holds=holds, contact_points=points))
 
 
 def accelerating(system: ConstrainedSystem, at: States, multiplier: Tensor, qdd: Tensor) -> Tensor:

@@ -91,6 +91,8 @@ class ModelHeader(Header):
 def model_path(path: str | Path) -> Path:
     """The file of a model: the path, with the ending `.safetensors` if it has another or none."""
     path = Path(path)
+    if not path.name:
+        raise ModelError("the path of a model has no name", expected="a file", got=repr(str(path)))
     return path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
 
 
@@ -129,12 +131,12 @@ def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
         ModelError: no model is there, or it is damaged; names the file.
     """
     file = model_path(path)
-    if not file.is_file():
-        hint = None
-        if Path(path).is_dir():
-            hint = "models were folders before version 3: fit the model again with this release"
-        raise ModelError(f"{file} is not a saved model", expected="a file that Fit.save wrote", hint=hint)
     try:
+        if not file.is_file():
+            hint = None
+            if Path(path).is_dir():
+                hint = "models were folders before version 3: fit the model again with this release"
+            raise ModelError(f"{file} is not a saved model", expected="a file that Fit.save wrote", hint=hint)
         size = file.stat().st_size
         if size > MODEL_BYTES:
             raise ModelError(f"{file}: too large", expected=f"at most {MODEL_BYTES:,} bytes", got=f"{size:,}")

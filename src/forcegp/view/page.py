@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -131,14 +132,21 @@ def write_view(path: str | Path, motion: Motion, shapes: Sequence[Shape], title:
 
 
 def serve(page: str, port: int = PORT, say: Callable[[str], None] = print) -> None:
-    """Show a page in a browser on this computer until interrupted; `say` gets its address."""
+    """Show a page in a browser on this computer until interrupted; `say` gets its address.
+
+    Other users of the computer do not know the address, and other pages in the browser, which may reach the
+    server by a name of theirs, are refused.
+    """
+    path = f"/{secrets.token_urlsafe(16)}"
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self.send_response(200)
+            host = self.headers.get("Host", "").rpartition(":")[0]
+            known = host in (LOCAL, "localhost") and secrets.compare_digest(self.path.encode(), path.encode())
+            self.send_response(200 if known else 404)
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.end_headers()
-            self.wfile.write(page.encode())
+            self.wfile.write(page.encode() if known else b"")
 
         def log_message(self, format: str, *args: object) -> None:
             pass
@@ -148,5 +156,5 @@ def serve(page: str, port: int = PORT, say: Callable[[str], None] = print) -> No
     except OSError:
         server = ThreadingHTTPServer((LOCAL, 0), Handler)
     with server, suppress(KeyboardInterrupt):
-        say(f"http://{LOCAL}:{server.server_port}")
+        say(f"http://{LOCAL}:{server.server_port}{path}")
         server.serve_forever()

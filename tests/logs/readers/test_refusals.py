@@ -101,7 +101,7 @@ def test_a_small_parquet_file_with_a_huge_list(tmp_path: Path) -> None:
 
 
 def test_a_wide_array_is_refused_before_its_columns_are_made(tmp_path: Path) -> None:
-    np.savez_compressed(tmp_path / "run.npz", q=np.zeros((10_000, 5000), np.int8))
+    np.savez(tmp_path / "run.npz", q=np.zeros((5000, limits.COLUMNS + 1), np.int8))
     with pytest.raises(DataError, match="too many columns"):
         read(tmp_path / "run.npz")
 
@@ -148,6 +148,36 @@ def test_compressed_bags_of_unknown_size_are_refused(tmp_path: Path) -> None:
     assert "FILE" in meta.read_text()
     with pytest.raises(DataError, match="compressed"):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "inside"),
+    [
+        ("lerobot", "data/chunk-000/file-000.parquet"),
+        ("lerobot", "meta/info.json"),
+        ("lerobot", "meta"),
+        ("text folder", "pos.txt"),
+        ("rosbag 2", "run2.db3"),
+    ],
+)
+def test_links_out_of_a_folder_are_refused(kind: str, inside: str, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    path, _ = WRITERS[kind](tmp_path / "in", motion(20))
+    read(path)
+    (path / inside).rename(tmp_path / "elsewhere")
+    (path / inside).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match=r"link that leads out of (?s:.*)cp -rL"):
+        read(path)
+
+
+def test_a_ros_2_bag_of_mcap_files_is_read_like_the_files(tmp_path: Path) -> None:
+    file, _ = WRITERS["mcap"](tmp_path, motion(20))
+    alone = read(file).streams[0].columns
+    (tmp_path / "bag").mkdir()
+    file.rename(tmp_path / "bag" / "run_0.mcap")
+    (tmp_path / "bag" / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  version: 9\n")
+    together = read(tmp_path / "bag").streams[0].columns
+    assert all(np.array_equal(together[name], values) for name, values in alone.items())
 
 
 def test_a_lerobot_folder_whose_description_is_damaged(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 
 from forcegp.errors import DataError
+from forcegp.guards import foreign
 from forcegp.logs.table import LogTable, Progress, Wanted
 
 _READERS = {
@@ -17,9 +18,9 @@ _READERS = {
     "numpy": ("NumPy .npz or .npy", "arrays.read_numpy"),
     "matlab": ("MATLAB .mat", "arrays.read_matlab"),
     "hdf5": ("HDF5", "arrays.read_hdf5"),
-    "rosbag1": ("ROS 1 bag", "bags.read_rosbag"),
-    "rosbag2": ("ROS 2 bag", "bags.read_rosbag"),
-    "mcap": ("MCAP", "bags.read_mcap"),
+    "rosbag1": ("ROS 1 bag", "bags.read_bag"),
+    "rosbag2": ("ROS 2 bag", "bags.read_bag"),
+    "mcap": ("MCAP", "bags.read_bag"),
     "lerobot": ("LeRobot data set", "parquet.read_lerobot"),
 }
 FORMATS = {kind: name for kind, (name, _) in _READERS.items()}
@@ -65,7 +66,8 @@ def read(
     [1.5, 1.75]
     """
     place = Path(path)
-    module, _, name = _READERS[format_of(place)][1].partition(".")
+    with foreign(str(path), "a log"):
+        module, _, name = _READERS[format_of(place)][1].partition(".")
     reader: Callable[..., LogTable] = getattr(import_module(f"forcegp.logs.readers.{module}"), name)
     keep: Wanted = wanted if wanted is not None else lambda name: True
     return reader(place, wanted=keep, rows=rows, progress=progress)

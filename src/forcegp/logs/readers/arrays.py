@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from forcegp import limits
+from forcegp import guards, limits
 from forcegp.errors import DataError, optional_module
 from forcegp.logs import table
 from forcegp.logs.readers.matlab5 import Variable, variables
@@ -29,14 +29,14 @@ MAX_ARRAYS = 4096
 def read_numpy(path: Path, **_: object) -> LogTable:
     """Read the numeric arrays of an `.npz` archive, or the array of an `.npy` file."""
     arrays: Arrays = {}
-    with table.foreign(str(path), "a NumPy file"):
+    with guards.foreign(str(path), "a NumPy file"):
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 members = archive.infolist()
-                table.check_count(str(path), "arrays", len(members), MAX_ARRAYS)
+                guards.check_count(str(path), "arrays", len(members), MAX_ARRAYS)
                 size = sum(member.file_size for member in members)
-                table.check_count(str(path), "bytes", size, 8 * limits.LOG_VALUES)
-                table.check_expansion(str(path), size, path.stat().st_size)
+                guards.check_count(str(path), "bytes", size, 8 * limits.LOG_VALUES)
+                guards.check_expansion(str(path), size, path.stat().st_size)
                 for member in members:
                     with archive.open(member) as file:
                         name = member.filename.removesuffix(".npy")
@@ -44,7 +44,7 @@ def read_numpy(path: Path, **_: object) -> LogTable:
         else:
             with path.open("rb") as file:
                 arrays = _array(str(path), "", file, path.stat().st_size)
-    return table.table_of_arrays(str(path), "numpy", arrays)
+    return table.table_of_arrays(path, "numpy", arrays)
 
 
 def _array(source: str, name: str, file: Any, size: int) -> Arrays:
@@ -62,7 +62,7 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
             hint="save each quantity as an array of its own",
         )
     count = int(np.prod(shape, dtype=object)) if shape else 1
-    table.check_count(source, "numbers", count, limits.LOG_VALUES)
+    guards.check_count(source, "numbers", count, limits.LOG_VALUES)
     if count * dtype.itemsize > size:
         raise DataError(f"{source}: the array claims to be larger than its file", got=f"{shape} of {dtype}")
     data = file.read(count * dtype.itemsize)
@@ -75,13 +75,13 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
 def read_hdf5(path: Path, **_: object) -> LogTable:
     """Read the numeric data sets of an HDF5 file; one in a group is `group/name`."""
     remarks: list[str] = []
-    return table.table_of_arrays(str(path), "hdf5", _hdf5_arrays(path, "/", remarks), remarks)
+    return table.table_of_arrays(path, "hdf5", _hdf5_arrays(path, "/", remarks), remarks)
 
 
 def _hdf5_arrays(path: Path, separator: str, remarks: list[str]) -> Arrays:
     h5py = optional_module("h5py", "Reading HDF5 files", "import")
     arrays: Arrays = {}
-    with table.foreign(str(path), "HDF5"), h5py.File(path, "r") as file:
+    with guards.foreign(str(path), "HDF5"), h5py.File(path, "r") as file:
         _walk(h5py, file, "", separator, arrays, remarks, {h5py.h5o.get_info(file.id).addr})
     return arrays
 
@@ -104,7 +104,7 @@ def _walk(
         if mark in seen:
             continue
         seen.add(mark)
-        table.check_count(group.file.filename, "objects", len(seen), limits.COLUMNS)
+        guards.check_count(group.file.filename, "objects", len(seen), limits.COLUMNS)
         if isinstance(item, h5py.Group):
             _walk(h5py, item, f"{name}{separator}", separator, arrays, remarks, seen)
         elif isinstance(item, h5py.Dataset):
@@ -119,8 +119,9 @@ def _take(item: Any, name: str, arrays: Arrays, remarks: list[str]) -> None:
         remarks.append(f"{name!r} lies outside the file and was left out")
     else:
         source, taken = item.file.filename, sum(array.size for array in arrays.values()) + item.size
-        table.check_count(source, "numbers", taken, limits.LOG_VALUES)
-        table.check_expansion(source, 8 * taken, Path(source).stat().st_size)
+        guards.check_count(source, "numbers", taken, limits.LOG_VALUES)
+        guards.check_expansion(source, 8 * taken, size := Path(source).stat().st_size)
+        guards.check_chunks(item, size)
         arrays[name] = item[()]
 
 
@@ -140,11 +141,11 @@ def read_matlab(path: Path, **_: object) -> LogTable:
     if HDF5_MAGIC in (head[:8], head[512:520]):  # version 7.3: names as in MATLAB, and axes in its order
         arrays = {name: array.T for name, array in _hdf5_arrays(path, ".", remarks).items()}
     else:
-        with table.foreign(str(path), "a MATLAB file"):
+        with guards.foreign(str(path), "a MATLAB file"):
             for variable in _version4(path) if 0 in head[:4] else variables(path.read_bytes(), str(path)):
                 _collect(variable, arrays, remarks)
-    table.check_count(str(path), "arrays", len(arrays), limits.COLUMNS)
-    return table.table_of_arrays(str(path), "matlab", arrays, remarks)
+    guards.check_count(str(path), "arrays", len(arrays), limits.COLUMNS)
+    return table.table_of_arrays(path, "matlab", arrays, remarks)
 
 
 def _version4(path: Path) -> Iterator[Variable]:
@@ -152,9 +153,9 @@ def _version4(path: Path) -> Iterator[Variable]:
     from scipy.io import loadmat, whosmat
 
     listing = whosmat(path)
-    table.check_count(str(path), "arrays", len(listing), limits.COLUMNS)
+    guards.check_count(str(path), "arrays", len(listing), limits.COLUMNS)
     claimed = sum(math.prod(shape) for _, shape, _ in listing)
-    table.check_count(str(path), "numbers", claimed, min(limits.LOG_VALUES, path.stat().st_size))
+    guards.check_count(str(path), "numbers", claimed, min(limits.LOG_VALUES, path.stat().st_size))
     for name, value in loadmat(path).items():
         if not name.startswith("__"):
             yield Variable(name, value if isinstance(value, np.ndarray) else "is sparse")

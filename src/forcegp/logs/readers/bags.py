@@ -9,10 +9,12 @@ The layouts are those of the ROS distributions; definitions that a bag carries a
 
 from __future__ import annotations
 
+import io
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,8 @@ import numpy as np
 
 from forcegp import limits
 from forcegp.errors import DataError, optional_module
-from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted, check_count, foreign
+from forcegp.guards import Unpacking, bounded, check_count, check_tables, foreign, starts_with, within
+from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
@@ -32,6 +35,8 @@ CLOCKS = ("header", "receive")
 """Columns of time that every topic has."""
 
 Decode = Callable[[bytes], Any]
+Found = tuple[str, str, str, int, bytes, int]
+"""Topic, type, encoding, time of recording [ns] and content of a message, and how much was read by then."""
 
 
 def canonical(kind: str) -> str:
@@ -44,6 +49,7 @@ def canonical(kind: str) -> str:
     return f"{package}/msg/{name}" if "/" not in name else kind
 
 
+@cache
 def decoder(kind: str, encoding: str) -> Decode:
     """Decodes messages of a type in `KINDS`, in the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
@@ -65,8 +71,9 @@ class Messages:
     def stream(self, name: str, origin: np.ndarray, wanted: Wanted) -> Stream:
         """The columns that are wanted and hold numbers, with times from `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
-        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps.T), strict=True))
-        values = np.ascontiguousarray(np.array(self.rows, dtype=np.float64).T)
+        order = np.argsort(stamps[:, 1], kind="stable")
+        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps[order].T), strict=True))
+        values = np.ascontiguousarray(np.array(self.rows, dtype=np.float64)[order].T)
         for column, numbers in zip(self.columns, values, strict=True):
             if not np.isnan(numbers).all() and wanted(column):
                 columns[column] = numbers
@@ -78,10 +85,23 @@ class Collector:
     """Gathers the messages of a bag, one stream for each topic and set of joints."""
 
     source: str
+    unpacking: Unpacking
     _streams: dict[tuple[str, frozenset[str]], Messages] = field(default_factory=dict)
     _numbers: int = 0
 
-    def add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
+    def take(
+        self, messages: Iterable[Found], rows: int | None, progress: Progress | None, total: int
+    ) -> None:
+        """Take the messages of types that are read, until a stream has `rows` of them."""
+        for topic, kind, encoding, receive_ns, raw, done in messages:
+            if kind in KINDS and encoding in ("cdr", "ros1"):
+                self._add(topic, kind, receive_ns, raw, decoder(kind, encoding))
+            if progress is not None and self.unpacking.records % 1024 == 0:
+                progress(done, total)
+            if rows is not None and self.rows >= rows:
+                return
+
+    def _add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
         """Take one message; `DataError` if it is too large, or its arrays do not fit its joint names."""
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
@@ -146,39 +166,48 @@ def _wrench(message: Any) -> dict[str, float]:
     return {f"{part}.{axis}": getattr(vector, axis) for part, vector in parts.items() for axis in "xyz"}
 
 
-def read_rosbag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2."""
-    with (path if path.is_file() else path / "metadata.yaml").open("rb") as file:
-        first = file.read(12) == b"#ROSBAG V2.0"
+def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
+    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2, or of an MCAP file."""
+    files = _files(path) if path.is_dir() else [path]
+    unpacking = Unpacking(str(path), sum(file.stat().st_size for file in files))
+    collector, topics = Collector(str(path), unpacking), dict[str, str]()
+    if mcaps := [file for file in files if starts_with(file, b"\x89MCAP0")]:
+        with foreign(str(path), "MCAP"):
+            messages = (message for file in mcaps for message in _mcap_messages(file, unpacking, topics))
+            collector.take(messages, rows, progress, unpacking.file)
+        return collector.table("mcap", topics, wanted)
+    first = path.is_file() and starts_with(path, b"#ROSBAG V2.0")
     number, encoding = (1, "ros1") if first else (2, "cdr")
     package = optional_module(f"rosbags.rosbag{number}", f"Reading ROS {number} bags", "import")
-    if path.is_dir():
-        _check_metadata(path)
-    elif not first and path.suffix != ".db3":
+    if path.is_file() and not first and path.suffix != ".db3":
         raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
-    collector = Collector(str(path))
-    with foreign(str(path), "a bag"), package.Reader(path) as bag:
-        check_count(str(path), "topics", len(bag.connections), limits.LOG_STREAMS)
-        check_count(str(path), "messages", bag.message_count, limits.LOG_MESSAGES)
-        topics = {c.topic: c.msgtype for c in bag.connections}
-        used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
-        decoders = {c.msgtype: decoder(canonical(c.msgtype), encoding) for c in used}
-        total = sum(c.msgcount for c in used)
-        for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else []):
-            kind = canonical(connection.msgtype)
-            collector.add(connection.topic, kind, stamp, raw, decoders[connection.msgtype])
-            if progress is not None and done % 1024 == 0:
-                progress(done, total)
-            if rows is not None and collector.rows >= rows:
-                break
-        return collector.table(f"rosbag{number}", topics, wanted)
+    with foreign(str(path), "a bag"):
+        for file in files:
+            check_tables(file)
+        reader = bounded(package.Reader, unpacking) if first else package.Reader
+        with reader(path) as bag:
+            topics |= {c.topic: c.msgtype for c in bag.connections}
+            collector.take(_messages(bag, encoding, unpacking), rows, progress, bag.message_count)
+    return collector.table(f"rosbag{number}", topics, wanted)
 
 
-def _check_metadata(path: Path) -> None:
-    """Refuse a bag whose unpacked size nobody knows."""
-    file = path / "metadata.yaml"
-    check_count(str(file), "bytes", file.stat().st_size, 8 << 20)
-    text = file.read_text(encoding="utf-8", errors="replace")
+def _messages(bag: Any, encoding: str, unpacking: Unpacking) -> Iterator[Found]:
+    """The messages of a bag of ROS 1 or ROS 2 whose types are read."""
+    check_count(unpacking.source, "topics", len(bag.connections), limits.LOG_STREAMS)
+    check_count(unpacking.source, "messages", bag.message_count, limits.LOG_MESSAGES)
+    used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
+    for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else ()):
+        unpacking.read(len(raw))
+        unpacking.record()
+        yield connection.topic, canonical(connection.msgtype), encoding, stamp, raw, done
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of a folder that is a bag, but for its description; refused if they are compressed."""
+    description = path / "metadata.yaml"
+    files = within(path, sorted(file for file in path.iterdir() if file.is_file()))
+    check_count(str(description), "bytes", description.stat().st_size, limits.LISTING_BYTES)
+    text = description.read_text(encoding="utf-8", errors="replace")
     compression = re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE)
     if compression:
         raise DataError(
@@ -186,36 +215,46 @@ def _check_metadata(path: Path) -> None:
             expected="a bag without compression, or MCAP with compressed chunks",
             hint="unpack it with `ros2 bag convert`",
         )
+    return [file for file in files if file != description]
 
 
-RECORD_BYTES = 256 << 20
-"""Largest record, packed, that is loaded."""
+def _mcap_messages(path: Path, unpacking: Unpacking, topics: dict[str, str]) -> Iterator[Found]:
+    """The messages of an MCAP file in its order; adds its topics with their types."""
+    records = optional_module("mcap.records", "Reading MCAP files", "import")
+    schemas, channels = {}, {}
+    with path.open("rb") as file:
+        for record in _mcap_records(file, unpacking):
+            if isinstance(record, records.Schema):
+                schemas[record.id] = canonical(record.name)
+            elif isinstance(record, records.Channel):
+                kind = schemas[record.schema_id] if record.schema_id else record.message_encoding
+                topics[record.topic], channels[record.id] = kind, record
+                check_count(unpacking.source, "topics", len(channels), limits.LOG_STREAMS)
+            elif isinstance(record, records.Message):
+                channel = channels[record.channel_id]
+                kind, encoding = topics[channel.topic], channel.message_encoding
+                yield channel.topic, kind, encoding, record.log_time, record.data, file.tell()
 
 
-def read_mcap(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of an MCAP file, also of one that was cut off and has no index."""
-    package = optional_module("mcap.reader", "Reading MCAP files", "import")
-    collector = Collector(str(path))
-    decoders: dict[int, Decode | None] = {}
-    topics: dict[str, str] = {}
-    with foreign(str(path), "MCAP"), path.open("rb") as file:
-        reader = package.SeekingReader(file, record_size_limit=RECORD_BYTES)
-        summary = reader.get_summary()
-        statistics = summary.statistics if summary is not None else None
-        total = statistics.message_count if statistics is not None else 0
-        check_count(str(path), "messages", total, limits.LOG_MESSAGES)
-        for schema, channel, message in reader.iter_messages():
-            if channel.id not in decoders:
-                kind = canonical(schema.name) if schema is not None else ""
-                topics[channel.topic] = kind or channel.message_encoding
-                check_count(str(path), "topics", len(decoders), limits.LOG_STREAMS)
-                readable = kind in KINDS and channel.message_encoding in ("cdr", "ros1")
-                decoders[channel.id] = decoder(kind, channel.message_encoding) if readable else None
-            decode = decoders[channel.id]
-            if decode is not None:
-                collector.add(channel.topic, topics[channel.topic], message.log_time, message.data, decode)
-                if progress is not None and collector.rows % 1024 == 0:
-                    progress(collector.rows, max(total, collector.rows))
-                if rows is not None and collector.rows >= rows:
-                    break
-        return collector.table("mcap", topics, wanted)
+def _mcap_records(file: io.BufferedReader, unpacking: Unpacking) -> Iterator[Any]:
+    """The records of an MCAP file in its order; chunks are unpacked one at a time, record by record."""
+    records = optional_module("mcap.records", "Reading MCAP files", "import")
+    streams = optional_module("mcap.stream_reader", "Reading MCAP files", "import")
+    reader = streams.StreamReader(file, emit_chunks=True, record_size_limit=limits.RECORD_BYTES)
+    for record in reader.records:
+        if not isinstance(record, records.Chunk):
+            yield record
+            continue
+        content = unpacking.unpack(record.data, record.compression)
+        part = streams.ReadDataStream(io.BytesIO(content))
+        while part.count < len(content):
+            opcode, size = part.read1(), part.read8()
+            unpacking.record()
+            if opcode == streams.Opcode.MESSAGE:
+                yield records.Message.read(part, size)
+            elif opcode == streams.Opcode.SCHEMA:
+                yield records.Schema.read(part)
+            elif opcode == streams.Opcode.CHANNEL:
+                yield records.Channel.read(part)
+            else:
+                part.read(size)

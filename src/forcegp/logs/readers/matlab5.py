@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs.table import check_count
+from forcegp.guards import allowed_bytes, check_count
 
 HEADER_BYTES = 128
 MATRIX, COMPRESSED, INT8, UTF8 = 14, 15, 1, 16
@@ -25,8 +25,6 @@ DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"
 STRUCT, NUMERIC = 2, range(6, 16)
 OTHER_CLASSES = {1: "cell", 3: "object", 4: "char", 5: "sparse", 16: "function", 17: "opaque"}
 COMPLEX = 0x08
-INFLATED = limits.FREE_TABLE_BYTES
-"""Bytes that a compressed variable may have, whatever its size in the file."""
 
 
 class Variable(NamedTuple):
@@ -51,9 +49,10 @@ def variables(content: bytes, source: str) -> Iterator[Variable]:
 
 class _Reader:
     def __init__(self, source: str, order: str) -> None:
-        self.source, self.order, self.count = source, order, 0
+        self.source, self.order, self.count, self.left = source, order, 0, 0
 
     def variables(self, content: memoryview) -> Iterator[Variable]:
+        self.left = min(allowed_bytes(len(content)), limits.TABLE_BYTES)
         for element in self.elements(content[HEADER_BYTES:]):
             if element.kind == COMPRESSED:
                 element = self.next(self.elements(self.inflated(element.body)))
@@ -62,14 +61,16 @@ class _Reader:
             yield self.matrix(element.body, 0)
 
     def inflated(self, body: memoryview) -> memoryview:
-        most = min(max(INFLATED, limits.TABLE_EXPANSION * len(body)), limits.TABLE_BYTES)
         stream = zlib.decompressobj()
         try:
-            content = stream.decompress(body, most)
+            content = stream.decompress(body, max(self.left, 1))
         except zlib.error as cause:
             raise self.damaged("compressed data", str(cause)) from cause
         if stream.unconsumed_tail:
-            raise DataError(f"{self.source}: a variable inflates to more than {most:,} bytes")
+            raise DataError(
+                f"{self.source}: a variable inflates to more than the {self.left:,} bytes that are left"
+            )
+        self.left -= len(content)
         return memoryview(content)
 
     def elements(self, content: memoryview) -> Iterator[_Element]:

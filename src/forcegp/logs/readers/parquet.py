@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forcegp import limits
+from forcegp import guards, limits
 from forcegp.errors import DataError
+from forcegp.guards import within
 from forcegp.logs import table
 from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
@@ -27,7 +28,7 @@ BATCH_ROWS = 1 << 16
 def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
     """Read the columns of numbers, flags and times; a list column becomes `name[0]`, `name[1]`, …"""
     remarks: list[str] = []
-    with table.foreign(str(path), "Parquet"):
+    with guards.foreign(str(path), "Parquet"):
         columns = read_columns([path], wanted, rows, remarks, progress)
     return LogTable(str(path), "parquet", (Stream("", columns),), tuple(remarks))
 
@@ -44,13 +45,13 @@ def read_columns(
     chunks: dict[str, list[Column]] = {}
     total = 0
     for path in paths:
-        with pq.ParquetFile(path) as file:
-            total += _check(str(path), file)
+        with pq.ParquetFile(path.absolute(), pre_buffer=False) as file:
+            total += _check(path, file, set(_readable(file, wanted, [])))
             table.check_values(str(path), total, 1)
     length = sum(path.stat().st_size for path in paths)
     done = 0
     for path in paths:
-        with pq.ParquetFile(path, pre_buffer=False) as file:
+        with pq.ParquetFile(path.absolute(), pre_buffer=False) as file:
             names = _readable(file, wanted, remarks)
             for batch in file.iter_batches(BATCH_ROWS, columns=names, use_threads=False):
                 for name in names:
@@ -59,7 +60,7 @@ def read_columns(
                             chunks.setdefault(part, []).append(values)
                 done += len(batch)
                 table.check_values(str(path), done, max(len(chunks), 1))
-                table.check_expansion(str(path), 8 * done * len(chunks), length)
+                guards.check_expansion(str(path), 8 * done * len(chunks), length)
                 if progress is not None:
                     progress(done, total)
                 if rows is not None and done >= rows:
@@ -71,13 +72,17 @@ def read_columns(
     return columns
 
 
-def _check(source: str, file: object) -> int:
-    """Number of rows of a file whose claimed size is within the limits."""
+def _check(path: Path, file: object, names: set[str]) -> int:
+    """Number of rows of a file whose columns of those names claim to be within the limits."""
     shape = file.metadata  # pyright: ignore[reportAttributeAccessIssue]
-    table.check_count(source, "columns", shape.num_columns, limits.COLUMNS)
+    guards.check_count(str(path), "columns", shape.num_columns, limits.COLUMNS)
     groups = [shape.row_group(i) for i in range(shape.num_row_groups)]
-    numbers = sum(group.column(j).num_values for group in groups for j in range(group.num_columns))
-    table.check_count(source, "numbers", numbers, limits.LOG_VALUES)
+    columns = [group.column(j) for group in groups for j in range(group.num_columns)]
+    columns = [column for column in columns if column.path_in_schema.partition(".")[0] in names]
+    numbers = sum(column.num_values for column in columns)
+    guards.check_count(str(path), "numbers", numbers, limits.LOG_VALUES)
+    unpacked = max(8 * numbers, sum(column.total_uncompressed_size for column in columns))
+    guards.check_expansion(str(path), unpacked, path.stat().st_size)
     return shape.num_rows
 
 
@@ -123,7 +128,7 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
             expected=f"{width} numbers in every row",
             got=f"{lengths[row]} in row {row}",
         )
-    table.check_count(source, "columns", width, limits.COLUMNS)
+    guards.check_count(source, "columns", width, limits.COLUMNS)
     flat = pc.cast(values.flatten(), pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     numbers = flat.reshape(len(values), width)
     return {f"{name}[{i}]": np.ascontiguousarray(numbers[:, i]) for i in range(width)}
@@ -139,9 +144,11 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
     The columns are named as in `meta/info.json`: `observation.state.<motor>`, or `observation.state[i]`
     where the motors have no names. Images and videos are not read.
     """
-    features = _features(path / "meta" / "info.json")
-    files = sorted((path / "data").rglob("*.parquet"))
-    table.check_count(str(path), "files", len(files), limits.LOG_FILES)
+    description, *files = within(
+        path, [path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))]
+    )
+    features = _features(description)
+    guards.check_count(str(path), "files", len(files), limits.LOG_FILES)
     if not files:
         raise DataError(f"{path}: no episodes", expected=f"Parquet files below {path / 'data'}")
     names = {
@@ -150,14 +157,14 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
         for i, motor in enumerate(_motors(description))
     }
     remarks: list[str] = []
-    with table.foreign(str(path), "a LeRobot data set"):
+    with guards.foreign(str(path), "a LeRobot data set"):
         columns = read_columns(files, lambda n: wanted(names.get(n, n)), rows, remarks, progress)
     renamed = {names.get(name, name): values for name, values in columns.items()}
     return LogTable(str(path), "lerobot", (Stream("", renamed),), tuple(remarks))
 
 
 def _features(file: Path) -> dict[str, Any]:
-    table.check_count(str(file), "bytes", file.stat().st_size, MAX_INFO_BYTES)
+    guards.check_count(str(file), "bytes", file.stat().st_size, MAX_INFO_BYTES)
     try:
         info = json.loads(file.read_text(encoding="utf-8"))
         features = info["features"]

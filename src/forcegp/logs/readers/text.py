@@ -14,7 +14,7 @@ from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
-from forcegp import limits
+from forcegp import guards, limits
 from forcegp.errors import DataError
 from forcegp.logs import table
 from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
@@ -140,7 +140,7 @@ def _dialect(
 ) -> Dialect:
     rows = [split(line, separator) for line in lines[first : first + SAMPLE_LINES] if line.strip()]
     width = len(rows[0])
-    table.check_count(str(path), "columns", width, limits.COLUMNS)
+    guards.check_count(str(path), "columns", width, limits.COLUMNS)
     above = [split(line.lstrip("#%/ \t"), separator) for line in lines[:first] if line.strip()]
     widths = (width, width if rows[0][-1] else width - 1)
     above = [fields for fields in above if len(fields) in widths]
@@ -188,7 +188,7 @@ def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
     kinds = {name: kind for name, kind in kinds.items() if kind not in ("text", "empty")}
     chunks: dict[str, list[Column]] = {name: [] for name in kinds}
     done = 0
-    with table.foreign(str(path), "a table of text"), path.open("rb") as file:
+    with guards.foreign(str(path), "a table of text"), path.open("rb") as file:
         source = _Blocks(file, dialect, path.stat().st_size, progress)
         for batch in _batches(source, dialect, kinds) if kinds else ():
             done += len(batch)
@@ -267,7 +267,7 @@ class _Blocks(io.RawIOBase):
         # Blanks at the edges of a line are only known once the line is complete.
         end = text.rfind(b"\n") + 1 if block else len(text)
         self._rest, text = text[end:], text[:end]
-        table.check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)
+        guards.check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)
         result = _EDGES.sub(b"", _BLANKS.sub(b" ", text))
         return result if result or not block else self.read(size)
 
@@ -285,8 +285,9 @@ def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
     def in_file(file: Path, column: str) -> str:
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"
 
-    files = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
-    table.check_count(str(path), "files", len(files), limits.LOG_FILES)
+    found = (p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
+    files = guards.within(path, sorted(found))
+    guards.check_count(str(path), "files", len(files), limits.LOG_FILES)
     groups: dict[int, dict[str, Column]] = {}
     remarks: list[str] = []
     for number, file in enumerate(files):

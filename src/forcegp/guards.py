@@ -1,0 +1,216 @@
+"""Guards of readers: what a file claims is bounded before the work that it asks for, and errors are typed.
+
+A small compressed file can claim to hold more than memory does. The bounds are in `forcegp.limits`.
+"""
+
+from __future__ import annotations
+
+import bz2
+import io
+import math
+import re
+import sqlite3
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from forcegp import limits
+from forcegp.errors import DataError, ForceGPError, optional_module
+
+
+def check_count(source: str, what: str, count: int, most: int) -> None:
+    """Raise `DataError` if a log claims more than `most` of something, named in the plural.
+
+    >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
+    """
+    if count > most:
+        raise DataError(
+            f"{source}: the log claims too many {what}",
+            expected=f"at most {most:,}",
+            got=f"{count:,}",
+            hint="split the log, or export only the columns that are needed",
+        )
+
+
+def check_expansion(source: str, size: int, file: int, free: int = limits.FREE_TABLE_BYTES) -> None:
+    """Raise `DataError` if a small file, of `file` bytes, claims to hold far more, `size` bytes."""
+    allowed = allowed_bytes(file, free)
+    if size > allowed:
+        raise DataError(
+            f"{source}: the file claims to be larger than what is read at once",
+            expected=f"at most {allowed:,} bytes in a file of this size",
+            got=f"{size:,}",
+            hint="split the log into several files",
+        )
+
+
+def allowed_bytes(file: int, free: int = limits.FREE_TABLE_BYTES) -> int:
+    """How many bytes a file of `file` bytes may unpack to, `free` of them whatever its size."""
+    return max(free, limits.TABLE_EXPANSION * file)
+
+
+@dataclass
+class Unpacking:
+    """What a log with compressed parts has unpacked to so far, bounded in proportion to its file.
+
+    Attributes:
+        source: the log, for messages.
+        file: its size [bytes].
+        size, records: bytes and records unpacked so far, those that are read twice twice.
+    """
+
+    source: str
+    file: int
+    size: int = 0
+    records: int = 0
+
+    def unpack(self, packed: bytes, compression: str) -> bytes:
+        """The content of a part, of which no more is unpacked than is allowed."""
+        left = allowed_bytes(self.file, limits.FREE_BAG_BYTES) - self.size
+        content = _opened(packed, compression).read(left + 1)
+        self.read(len(content))
+        return content
+
+    def read(self, size: int) -> None:
+        """Count bytes that were read from the log, perhaps for the second time."""
+        self.size += size
+        check_expansion(self.source, self.size, self.file, limits.FREE_BAG_BYTES)
+
+    def record(self) -> None:
+        """Count a record."""
+        self.records += 1
+        most = max(limits.FREE_MESSAGES, self.file // limits.MESSAGE_PACKED)
+        check_count(self.source, "messages for a file of its size", self.records, most)
+
+
+def _opened(packed: bytes, compression: str) -> Any:
+    """A compressed part as a file that is unpacked as it is read."""
+    stream = io.BytesIO(packed)
+    if compression in ("", "none"):
+        return stream
+    if compression == "bz2":
+        return bz2.BZ2File(stream)
+    if compression == "lz4":
+        return optional_module("lz4.frame", "Unpacking LZ4", "import").LZ4FrameFile(stream)
+    if compression == "zstd":
+        zstandard = optional_module("zstandard", "Unpacking Zstandard", "import")
+        return zstandard.ZstdDecompressor().stream_reader(stream)
+    raise DataError("an unknown compression", expected="bz2, lz4 or zstd", got=compression[:40])
+
+
+def bounded(reader: Any, unpacking: Unpacking) -> Any:
+    """The reader of ROS 1 bags with bounds on what chunks unpack to and on the index."""
+
+    class Bounded(reader):
+        indexed = 0
+
+        def read_chunk(self) -> Any:
+            chunk = super().read_chunk()
+            package = chunk.decompressor.__module__.partition(".")[0]
+            name = package if package in ("bz2", "lz4") else "none"
+            return chunk._replace(decompressor=lambda packed: unpacking.unpack(packed, name))
+
+        def read_index_data(self, *args: Any) -> None:
+            start = self.bio.tell()
+            super().read_index_data(*args)
+            self.indexed += self.bio.tell() - start
+            check_count(unpacking.source, "bytes of its index", self.indexed, unpacking.file)
+
+    return Bounded
+
+
+def check_tables(file: Path) -> None:
+    """Check that a bag in SQLite computes no rows and lists no topic twice; other files pass."""
+    if not starts_with(file, b"SQLite format 3"):
+        return
+    with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as bag:
+        for kind, text in bag.execute("SELECT type, sql FROM sqlite_master WHERE sql IS NOT NULL"):
+            if kind not in ("table", "index") or re.search(r"\b(virtual|as)\b", text, re.IGNORECASE):
+                raise DataError(f"{file}: a table of the bag is computed", got=text[:200])
+        topics, numbers = bag.execute("SELECT count(*), count(DISTINCT id) FROM topics").fetchone()
+        check_count(str(file), "topics", topics, min(limits.LOG_STREAMS, numbers))
+
+
+def starts_with(file: Path, magic: bytes) -> bool:
+    """Whether a file begins with some bytes."""
+    with file.open("rb") as opened:
+        return opened.read(len(magic)) == magic
+
+
+DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
+DEFLATE_RATIO = 1032
+"""Bytes that one byte of deflated data unpacks to at most."""
+
+
+def check_chunks(dataset: Any, file: int) -> None:
+    """Check that no chunk of an HDF5 data set unpacks to more than it should, which HDF5 itself does not.
+
+    Args:
+        dataset: of h5py.
+        file: size of the file [bytes].
+
+    Raises:
+        DataError: a chunk is larger than what is read at once, or compressed in another way than is read.
+    """
+    source, properties = f"{dataset.file.filename}: {dataset.name!r}", dataset.id.get_create_plist()
+    filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+    if not filters:
+        return
+    if len(set(filters)) < len(filters) or not set(filters) <= {DEFLATE, SHUFFLE, FLETCHER32, LZF}:
+        hint = "repack it: h5repack -f GZIP=4"
+        raise DataError(f"{source} is packed by filters that are not read", got=str(filters)[:200], hint=hint)
+    chunk, stored = math.prod(dataset.chunks) * dataset.dtype.itemsize, dataset.id.get_storage_size()
+    check_expansion(source, chunk, file)
+    check_count(source, "bytes in chunks", stored, file)
+    if DEFLATE not in filters or stored * DEFLATE_RATIO <= limits.FREE_TABLE_BYTES:
+        return
+    for slices in dataset.iter_chunks():
+        start = tuple(part.start for part in slices)
+        if dataset.id.get_chunk_info_by_coord(start).size:
+            skipped, packed = dataset.id.read_direct_chunk(start)
+            if not skipped >> filters.index(DEFLATE) & 1:
+                content = zlib.decompressobj().decompress(packed, chunk + 1)
+                check_count(source, "bytes in a chunk", len(content), chunk)
+
+
+def within(folder: Path, files: Iterable[Path]) -> list[Path]:
+    """Files of a folder that is read as one log, none of which a link leads out of it.
+
+    Raises:
+        DataError: a file lies elsewhere; names it.
+    """
+    files, root = list(files), folder.resolve()
+    for file in files:
+        if not file.resolve().is_relative_to(root):
+            raise DataError(
+                f"{file}: a link that leads out of {folder} is not followed",
+                hint="copy the folder with the files that its links name: cp -rL",
+            )
+    return files
+
+
+@contextmanager
+def foreign(source: str, kind: str) -> Iterator[None]:
+    """Turn whatever a third-party parser raises on a damaged file into `DataError`."""
+    try:
+        yield
+    except ForceGPError:
+        raise
+    except (FileNotFoundError, PermissionError) as cause:
+        what = "no such file" if isinstance(cause, FileNotFoundError) else "the file may not be read"
+        raise DataError(f"{source}: {what}", got=str(cause)) from cause
+    except (Exception, RecursionError, MemoryError) as cause:
+        raise damaged(source, kind, cause) from cause
+
+
+def damaged(source: str, kind: str, cause: BaseException) -> DataError:
+    """The error for a file that a parser of some kind of files fails on."""
+    lines = str(cause).splitlines()
+    return DataError(
+        f"{source}: the file is damaged, truncated or not {kind}",
+        got=lines[0][:300] if lines else type(cause).__name__,
+        hint="write it again from its source; an interrupted copy is the usual cause",
+    )
