@@ -138,7 +138,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
             ]
             if runs:
                 spans = tuple(runs)
-                text = f"{name}.{joint} keeps one value while the joint moves, in {describe(spans)}"
+                text = f"{name}.{joint} keeps one value while the arm moves, in {describe(spans)}"
                 findings.append(Finding("channel-stuck", text, spans, (joint,)))
                 for a, b in runs:
                     bad[a:b] = True
@@ -151,11 +151,12 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
         return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
     if name == "qd":
         return float(np.ptp(np.cumsum(log.qdd[a:b, j])) * log.dt)
-    # Torque and acceleration: as far as they change over as many rows elsewhere, if the arm moves.
-    x = getattr(log, name)[:, j]
+    # Torque and acceleration: as far as they change over as many rows elsewhere, if the arm moves, for the
+    # torque, or the joint itself, for the acceleration.
+    x, moved = getattr(log, name)[:, j], log.q[a:b] if name == "tau" else log.q[a:b, j : j + 1]
     lag = b - a
     usual = float(np.median(np.abs(x[lag:] - x[:-lag])))
-    return usual if np.abs(np.diff(log.q[a:b], axis=0)).max(initial=0.0) > 0.0 else 0.0
+    return usual if np.abs(np.diff(moved, axis=0)).max(initial=0.0) > 0.0 else 0.0
 
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:

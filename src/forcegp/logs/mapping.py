@@ -20,7 +20,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data.checks import lock_hint
 from forcegp.errors import MappingError, did_you_mean
 from forcegp.logs import units
-from forcegp.logs.draft import Draft, Family, quoted
+from forcegp.logs.draft import CHECK, Draft, Family, quoted
 from forcegp.logs.readers import read
 from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
@@ -123,10 +123,12 @@ BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "
 
 @dataclass(frozen=True)
 class Mapping:
-    """A mapping file that has been read and checked: its tables, and the document for messages."""
+    """A mapping file that has been read and checked: its tables, the document for messages, and the doubts
+    that `--guess` marked CHECK and nobody has removed."""
 
     sections: MappingSections
     document: Document
+    doubts: tuple[str, ...] = ()
 
     def quantity(self, name: str) -> QuantitySection | None:
         """The table of a joint vector: `position`, `velocity`, `acceleration` or `torque`."""
@@ -218,7 +220,9 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
         MappingError: it is not valid; the message names file, line and key.
     """
     document = Document(content, source, MappingError)
-    mapping = Mapping(document.validated(MappingSections), document)
+    lines = content.decode().splitlines()
+    doubts = tuple(line[len(CHECK) :] for line in lines if line.startswith(CHECK))
+    mapping = Mapping(document.validated(MappingSections), document, doubts)
     _check(mapping)
     return mapping
 
