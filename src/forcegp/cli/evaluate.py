@@ -60,7 +60,7 @@ def evaluate(
     if out is not None:
         check_destination(out, folder=True, own_files=["*.json", "*.html", "*.svg", "*.png"])
     regression = _model(model, scene, config, train)
-    robot = regression.system.robot
+    robot = regression.specified.robot
     test = read_data(data, robot)
     training = None if train is None else read_data(train, robot)
     with progress_bar("evaluating", len(test)) as progress:
