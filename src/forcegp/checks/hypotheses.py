@@ -238,9 +238,10 @@ SMALL_GAIN = 0.2
 """Gains closer to 1 than this may as well be errors of the masses of a robot file."""
 EXPLAINED = 0.5
 """Share of the torque that a gain may leave unexplained, as any useful model may."""
-SMALL_TILT, SAME_GRAVITY, EARTH = 1.0, 0.2, 9.81
-"""Tilts that are errors of the masses [degrees]; share by which a gravity that only turned may seem larger or
-smaller, as masses are off too; and its size where the scene has none [m/s²]."""
+SMALL_TILT, EARTH = 1.0, 9.81
+"""Tilts that are errors of the masses [degrees]; size of gravity where the scene has none [m/s²]."""
+SAME_GRAVITY = 0.2, 0.5
+"""Share by which a gravity that turned may seem larger or smaller: a tilt, and more. Masses are off too."""
 
 
 DISCRETE = {
@@ -266,7 +267,8 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
         assumed = system.robot.gravity.numpy()
         angle, size = _turn(assumed, assumed + fit.theta[:3])
         # No place on earth has another size of gravity: such a fit has masses or gains that are wrong.
-        return bool(size < WEIGHTLESS) or (angle > SMALL_TILT and abs(size - 1.0) <= SAME_GRAVITY)
+        same = abs(size - 1.0) <= SAME_GRAVITY[angle > TILT]
+        return bool(size < WEIGHTLESS) or (angle > SMALL_TILT and same)
     if hypothesis.name == "payload":
         return bool(fit.theta[0] > SIGNIFICANT * fit.spread[0])
     return True

@@ -161,7 +161,7 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     """Single values far off the curve through their neighbours."""
-    bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
+    bad, hit, joints, vectors = np.zeros(len(log), bool), [], [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
     for name in vectors:
         departure, around, scale = departures[name]
@@ -180,9 +180,10 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
         # The neighbours of a spike are off as well, by less.
         peak = outlier & (np.abs(departure) >= _within_two(np.abs(departure)))
         bad |= peak.any(axis=1)
+        joints += log.named(peak.any(axis=0))
         hit += [f"{name}.{joint}" for joint in log.named(peak.any(axis=0))]
     text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}:"
-    return at_rows(bad, "spike", text, rows=bad.sum()), log.mask(bad)
+    return at_rows(bad, "spike", text, tuple(dict.fromkeys(joints)), rows=bad.sum()), log.mask(bad)
 
 
 def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:

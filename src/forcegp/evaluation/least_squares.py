@@ -124,10 +124,18 @@ def _rows(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, Tensor]:
     W = torch.cat([Y, _friction_columns(system.robot, data.qd)], dim=-1)
     y = data.tau + eom.Q_K - (eom.M @ data.qdd[..., None])[..., 0]
     if eom.A.shape[-2]:
-        # N = 1 − A⁺A removes the constraint force, which lies in the range of Aᵀ.
-        N = torch.eye(data.nq, dtype=data.dtype) - torch.linalg.pinv(eom.A) @ eom.A
+        N = free_directions(system, data)
         W, y = N @ W, (N @ y[..., None])[..., 0]
     return W, y
+
+
+def free_directions(system: ConstrainedSystem, data: Dataset) -> Tensor:
+    """N = 1 − A⁺A `(n, nq, nq)` or `(nq, nq)`, which removes the constraint force, in the range of Aᵀ."""
+    one = torch.eye(data.nq, dtype=data.dtype)
+    if not system.m:
+        return one
+    A = system.equations(data.q, data.qd, data.active(system.contact_names)).A
+    return one - torch.linalg.pinv(A) @ A
 
 
 def _start(robot: RobotModel) -> Tensor:
