@@ -192,7 +192,7 @@ def evaluate(
     residual = predicted.residual
     rest, gravity = beyond_gravity(before, data) if compare else (None, None)
     scores = () if rest is None else _predictors(model, predicted, spread, before, data, train, rest)
-    real = compare and isinstance(model, FittedModel)
+    real = model if compare and isinstance(model, FittedModel) else None
     return Evaluation(
         kind=model.kind,
         samples=len(data),
@@ -209,8 +209,8 @@ def evaluate(
         multipliers=multiplier_scores(model, data) if model.force_field() else (),
         sensed=sensed_scores(model, data),
         gravity=gravity,
-        response=torque_response(model, data) if real else None,
-        motion=open_loop(model, before, data) if real else None,
+        response=None if real is None else torque_response(real, data),
+        motion=None if real is None else open_loop(real, before, data),
     )
 
 

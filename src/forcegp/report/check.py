@@ -80,6 +80,8 @@ def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture
         paint, quantity = _rates("qd", "qdd"), "qdd"
     elif family == "kinematics" or finding.message.startswith("qd "):
         paint, quantity = _rates("q", "qd"), "qd"
+    elif finding.kind == "impact":
+        paint, quantity = _column("qd"), "qd"
     elif family == "clock":
         joints, paint, quantity = [0], _steps, "time step"
     elif family == "noise":
