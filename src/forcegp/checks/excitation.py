@@ -27,10 +27,8 @@ REVERSALS = 4
 """Changes of direction that tell Coulomb friction from an offset of the torque."""
 HYSTERESIS = 0.05
 """Share of its largest speed that a joint must reach for a change of direction to count."""
-SHORT_SECONDS = 2.0
-"""Length of a log below which little is learned [s]."""
-ROWS = 1000
-"""Rows of which the regressor is made."""
+SHORT_SECONDS, ROWS = 2.0, 1000
+"""Length of a log below which little is learned [s]; rows of which the regressor is made."""
 LOOK = 0.1
 """Time after which the torque says something new [s]."""
 LEARNED = 0.5

@@ -79,10 +79,8 @@ def projector(J: Array, scale: Array) -> Array:
     return eye
 
 
-BLOCKS = 8
-"""Contiguous parts of the log, each held out once."""
-REWEIGHTED = 10
-"""Rounds of a robust fit."""
+BLOCKS, REWEIGHTED = 8, 10
+"""Contiguous parts of the log, each held out once; rounds of a robust fit."""
 FLOOR = 0.03
 """Errors below this share of a joint's torque do not matter: robot files are no better."""
 

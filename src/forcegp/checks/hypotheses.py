@@ -33,10 +33,8 @@ TOOL_MASS = 5.0
 RISES = (0.3, 2.0, 10.0)
 """Factors by which the rise of dry friction may differ from the declared one: its law near rest is rarely
 known, and that of MuJoCo is more gentle."""
-SLOW = 0.01
-"""Sliding speed below which dry friction of a contact is smooth [m/s]."""
-GRAVITY = 10.0
-"""How far gravity may be off [m/s²]."""
+SLOW, GRAVITY = 0.01, 10.0
+"""Sliding speed below which dry friction of a contact is smooth [m/s]; how far gravity may be off [m/s²]."""
 
 
 @dataclass(frozen=True)

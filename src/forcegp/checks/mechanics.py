@@ -25,10 +25,8 @@ SPEEDS = (25.0, 95.0)
 """Percentiles of a joint's speed between which friction resists."""
 UNEXPLAINED = 0.5
 """Share of the torque, in root mean square, that a useful model may leave unexplained."""
-TRACE_ROWS = 20_000
-"""Rows at which the residual is looked at over time."""
-DISTURBANCE_SECONDS = 0.1
-"""Length over which the residual is averaged [s]."""
+TRACE_ROWS, DISTURBANCE_SECONDS = 20_000, 0.1
+"""Rows at which the residual is looked at over time; length over which the residual is averaged [s]."""
 DISTURBANCE, LOUD = 5.0, 4.0
 """A stretch of time stands out by so many robust standard deviations of the log residual, or by this factor
 over the residual of the worst tenth of the motion."""

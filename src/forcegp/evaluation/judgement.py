@@ -17,7 +17,7 @@ from torch import Tensor
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.evaluation.least_squares import free_directions
+from forcegp.evaluation.least_squares import data_chunks, free_directions
 from forcegp.identification import regressor
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import FittedModel
@@ -32,7 +32,7 @@ FAINT = 0.1
 """A joint counts if its torque beyond gravity, or its motion, is this share of that of the largest."""
 RESPONSE_SAMPLES, FEWEST_FREE = 500, 20
 """States at which a torque is added, at most and at least."""
-GRAVITY_SAMPLES, RIDGE = 4000, 1e-8
+GRAVITY_SAMPLES, RIDGE = 4000, 1e-9
 """Samples that gravity is fitted to, and the relative ridge that holds what they do not determine."""
 
 
@@ -56,29 +56,21 @@ class Motion:
 @torch.no_grad()
 def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, float]:
     """N (τ − τ_g) `(n, nq)`, and the share R² of the variance of the torques that gravity alone explains."""
-    at, still = data.q, torch.zeros_like(data.q)
-    some = torch.linspace(0, len(data) - 1, min(len(data), GRAVITY_SAMPLES)).round().long().unique()
-
-    def columns(q: Tensor, rows: Tensor | slice) -> Tensor:
-        Y = regressor(system.robot, q, still[rows], still[rows])
-        ones = torch.eye(data.nq, dtype=q.dtype).expand(len(q), data.nq, data.nq)
-        return free_directions(system, data[rows]) @ torch.cat([Y, ones], dim=-1)
-
-    def torque(rows: Tensor | slice) -> Tensor:
-        return (free_directions(system, data[rows]) @ data.tau[rows][..., None])[..., 0]
-
-    scale = data.tau.std(0).clamp(min=1e-9)
-    W, y = (
-        x / scale[..., None] if x.dim() == 3 else x / scale for x in (columns(at[some], some), torque(some))
-    )
-    W, y = W.flatten(0, 1), y.flatten()
-    gram = W.mT @ W
-    ridge = RIDGE * gram.diagonal().clamp(min=1e-12 * gram.diagonal().max()).diag()
-    theta = torch.linalg.solve(gram + ridge, W.mT @ y)
-    rest = torch.cat([torque(rows) - columns(at[rows], rows) @ theta for rows in _chunks(len(data))])
-    varies = torch.cat([torque(rows) for rows in _chunks(len(data))])
-    left, whole = (((x / scale) ** 2).sum() for x in (rest, varies - varies.mean(0)))
-    return rest, float(1.0 - left / whole.clamp(min=1e-300))
+    scale, rows = data.tau.std(0).clamp(min=1e-9), []
+    for part in data_chunks(data):
+        still = torch.zeros_like(part.q)
+        Y = regressor(system.robot, part.q, still, still)
+        ones = torch.eye(data.nq, dtype=data.dtype).expand(len(part), -1, -1)
+        every = torch.cat([Y, ones, part.tau[..., None]], dim=-1)
+        rows.append(free_directions(system, part) @ every / scale[:, None])
+    W, y = (x := torch.cat(rows))[..., :-1], x[..., -1]
+    some = torch.linspace(0, len(y) - 1, min(len(y), GRAVITY_SAMPLES)).round().long().unique()
+    A = W[some].flatten(0, 1)
+    gram, least = A.mT @ A, RIDGE * A.square().sum() / A.shape[-1]
+    theta = torch.linalg.solve(gram + least * torch.eye(len(gram), dtype=A.dtype), A.mT @ y[some].flatten())
+    rest = y - W @ theta
+    whole = (y - y.mean(0)).square().sum().clamp(min=1e-300)
+    return rest * scale, float(1.0 - rest.square().sum() / whole)
 
 
 def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
@@ -86,10 +78,6 @@ def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
     left, whole = (error**2).sum(0), (rest**2).sum(0)
     shares, seen = (1.0 - left / whole).tolist(), (whole > FAINT**2 * whole.max()).tolist()
     return tuple(share if clear else None for share, clear in zip(shares, seen, strict=True))
-
-
-def _chunks(n: int, size: int = 1000) -> list[slice]:
-    return [slice(first, min(first + size, n)) for first in range(0, n, size)]
 
 
 @torch.no_grad()

@@ -31,10 +31,8 @@ from forcegp.logs.smoothing import add_derivatives
 from forcegp.logs.table import LogTable, Progress, Stream
 from forcegp.rows import runs
 
-ROWS = 100_000
-"""Rows that are looked at."""
-TRIED_ROWS = 3000
-"""Rows on which the inverse dynamics are evaluated."""
+ROWS, TRIED_ROWS = 100_000, 3000
+"""Rows that are looked at; rows on which the inverse dynamics are evaluated."""
 MOST_RADIANS, LEAST_DEGREES = 60.0, 3.2
 """Positions beyond the first are in degrees; below the second, an arm in degrees would hardly move."""
 CLEARER = 1.5

@@ -52,7 +52,7 @@ class WindowData(Header):
     clean: list[Series] | None
     mean: list[Series]
     std: list[Series] | None
-    forces: list[ForceWindow] = []
+    forces: tuple[ForceWindow, ...] = ()
 
     @property
     def error(self) -> Tensor:
@@ -95,13 +95,13 @@ def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
     )
 
 
-def _forces(model: Predictor, data: Dataset) -> list[ForceWindow]:
+def _forces(model: Predictor, data: Dataset) -> tuple[ForceWindow, ...]:
     names = model.system.contact_names
     closed = data.active(names)
     if model.force_field() is None or not bool(closed.any()):
-        return []
+        return ()
     (mean, std), logged = predicted_forces(model, data), logged_forces(model, data)
-    return [
+    return tuple(
         ForceWindow(
             contact=name,
             closed=closed[:, i].tolist(),
@@ -110,8 +110,7 @@ def _forces(model: Predictor, data: Dataset) -> list[ForceWindow]:
             logged=series(logged[name]) if name in logged else None,
         )
         for i, name in enumerate(names)
-        if bool(closed[:, i].any())
-    ]
+    )
 
 
 def draw_forces(window: WindowData) -> Picture:
