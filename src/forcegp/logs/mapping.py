@@ -65,10 +65,20 @@ class TorqueSection(QuantitySection):
     unmeasured: tuple[str, ...] = ()
 
 
-class WrenchSection(Section):
-    """`[wrench]`: a force-torque sensor."""
+GROUND = "ground"
+"""Frame of a sensor that is fixed to the world."""
 
-    force: tuple[str, str, str]
+
+class WrenchSection(Section):
+    """`[wrench]`: a force-torque sensor, or a load cell with one column that measures along `axis`.
+
+    One that is fixed to the ground has its own `position` [m] and `rpy` [rad] in the world.
+    """
+
+    force: tuple[str, ...] = Field(min_length=1, max_length=3)
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
     torque: tuple[str, str, str] | None = None
     stream: str | None = None
     frame: str
@@ -247,6 +257,10 @@ def _check(mapping: Mapping) -> None:
             raise mapping.error(key, "key 'column' is missing", expected="column = …")
         if contact.source == "wrench" and sections.wrench is None:
             raise mapping.error(key, "the log's wrench is not mapped", "a table [wrench]")
+    wrench = sections.wrench
+    if wrench is not None and (len(wrench.force) == 2 or (len(wrench.force) == 1 and wrench.torque)):
+        got = f"{len(wrench.force)} columns{', and those of a torque' if wrench.torque else ''}"
+        raise mapping.error(("wrench", "force"), "not a force", "one column, or three, of x, y and z", got)
     time, derivatives = sections.time, sections.derivatives
     if time.start is not None and time.stop is not None and time.start >= time.stop:
         raise mapping.error(("time", "stop"), "the log would be empty", f"more than {time.start}", time.stop)
