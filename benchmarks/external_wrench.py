@@ -27,12 +27,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from classical_wrench import momentum_residual, quasi_static, wrench_of
 from numpy.typing import NDArray
 from solver_arms import STEP, Arm, Imperfections, sines
 from torch import Tensor
 
 import forcegp
-from forcegp.evaluation.classical_wrench import momentum_residual, quasi_static, wrench_of
 from forcegp.evaluation.least_squares import identify_rigid
 from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.logs import parse_mapping

@@ -40,7 +40,6 @@ column = "actual_torque_{joint}"
 unit = "Nm"
 [contact.table]
 source = "distance"
-threshold = 0.0005
 """
 SPLIT, STEP = 15.0, 16
 """End of the training data [s], and which of their samples are taken: every STEP-th."""

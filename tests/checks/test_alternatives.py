@@ -22,7 +22,7 @@ CURRENT = Finding("torque-current", "currents", ROWS, ("shoulder", "elbow"))
 
 def fit(score: np.ndarray, theta: np.ndarray | None = None) -> TorqueFit:
     none = np.zeros(0)
-    return TorqueFit(none, none if theta is None else theta, none, none, none, score)
+    return TorqueFit(none, none if theta is None else theta, none, none, none, none, score)
 
 
 @pytest.fixture

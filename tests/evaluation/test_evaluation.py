@@ -179,7 +179,7 @@ def test_a_perfect_model_is_better_than_every_trivial_predictor() -> None:
     some = data[:200]
     found = evaluate(KnownError(gaussian(0.01), 0.01), some, train=data[200:400])
     assert [v.against for v in found.verdicts] == ["mean", "robot file", "least squares"]
-    assert all(v.better for v in found.verdicts) and "but" not in found.verdict
+    assert all(v.better for v in found.verdicts) and "but" not in found.comparison
     error = gaussian(0.01)[:200] + some.qdd_clean - some.qdd
     M = forcegp.dynamics.mass_matrix(system.robot, some.q)
     torque = torch.einsum("nij,nj->ni", M, error).square().mean(0).sqrt()
@@ -192,7 +192,7 @@ def test_the_robot_file_is_not_better_than_itself() -> None:
     found = evaluate(forcegp.AnalyticalModel(system).nominal(), data[:100], train=data[100:200])
     against = {v.against: v for v in found.verdicts}
     assert against["robot file"].torque == pytest.approx(1.0) and not against["robot file"].better
-    assert "but is not better than" in found.verdict
+    assert "but is not better than" in found.comparison
 
 
 def test_without_training_data_each_half_is_predicted_from_the_other() -> None:

@@ -12,9 +12,9 @@ import torch
 from typer.testing import CliRunner
 
 import forcegp
+from benchmarks.classical_wrench import momentum_residual, quasi_static, wrench_of
 from forcegp.cli import app
 from forcegp.errors import DataError, ModelError, UnknownNameError
-from forcegp.evaluation.classical_wrench import momentum_residual, quasi_static, wrench_of
 from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.models.external_wrench import ExternalWrench, false_alarm_rate
 from forcegp.models.structured_fit import StructuredFit

@@ -33,7 +33,8 @@ def test_the_page_opens_with_the_kind_of_model_the_data_and_the_verdict(tmp_path
     assert "<h1>Analytical model “arm-2” on test.parquet</h1>" in named
     assert found.verdict in text and text.index(found.verdict) < text.index("<h2>")
     names = {path.name for path in tmp_path.iterdir() if path.is_file()}
-    assert names == {"evaluation.html", "window.json", "predictions.svg", "errors.svg"}
+    assert names == {"evaluation.html", "window.json", "predictions.svg", "errors.svg", "forces.svg"}
+    assert text.index("Contact force") < text.index("Predictions and errors")
 
 
 def test_what_is_worse_than_a_trivial_predictor_is_red(tmp_path: Path) -> None:

@@ -37,10 +37,19 @@ def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
     return [log.finding("robot-mismatch", text)], log
 
 
+def check_import(system: ConstrainedSystem, log: Log) -> Outcome:
+    """What the import of the log found, but for the contacts, which are checked themselves."""
+    doubts = [text for kind, text in log.header.imported if kind == "doubt"]
+    others = [text for kind, text in log.header.imported if kind not in ("doubt", "contact")]
+    pairs = ("import-doubt", doubts), ("import-found", others)
+    return [log.finding(kind, "; ".join(texts)) for kind, texts in pairs if texts], log
+
+
 CHECKS: tuple[tuple[str, Check], ...] = (
     ("finite values", values.check_finite),
     ("order of time", values.check_order),
     ("robot", check_robot),
+    ("import", check_import),
     ("held rows", values.check_held),
     ("gaps", values.check_gaps),
     ("jitter", values.check_jitter),

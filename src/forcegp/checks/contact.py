@@ -261,6 +261,8 @@ PULLS = 0.5
 """Share of contact rows with a pulling force from which the normal must be the wrong way round."""
 SIGNIFICANT = 4.0
 """Standard errors over blocks from which friction is there."""
+LARGEST_FRICTION = 2.0
+"""Coefficients beyond this, which hardly any two materials have, are errors of the torques."""
 SLIDING_SLOW = 0.01
 """Speed below which the direction of sliding is unknown [m/s]."""
 NARROW = 0.05
@@ -319,7 +321,8 @@ def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Findi
     if mean <= SIGNIFICANT * error:
         return []
     name = finding.keywords["contact"]
-    text = f"friction at {name!r} is {100 * mean:.2g} % of the normal force while it slides"
+    size = "not determined" if mean > LARGEST_FRICTION else f"about {100 * mean:.0f} % of the normal force"
+    text = f"friction at {name!r} while it slides is {size}"
     evidence = {"friction_coefficient": mean, "standard_error": error}
     return [finding("contact-friction", text, evidence=evidence)]
 

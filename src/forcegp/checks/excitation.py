@@ -27,10 +27,8 @@ REVERSALS = 4
 """Changes of direction that tell Coulomb friction from an offset of the torque."""
 HYSTERESIS = 0.05
 """Share of its largest speed that a joint must reach for a change of direction to count."""
-SHORT_SECONDS = 2.0
-"""Length of a log below which little is learned [s]."""
-ROWS = 1000
-"""Rows of which the regressor is made."""
+SHORT_SECONDS, ROWS = 2.0, 1000
+"""Length of a log below which little is learned [s]; rows of which the regressor is made."""
 LOOK = 0.1
 """Time after which the torque says something new [s]."""
 LEARNED = 0.5
@@ -125,21 +123,24 @@ def _missing(log: Log, joints: list[int]) -> str:
     return "; ".join(parts) or "other poses of the whole arm, fast and slow"
 
 
+LEAST_TOUCHING = 20
+"""Rows in contact from which the force of a fault is stated."""
 LARGEST = 1e3
 SIZES = np.geomspace(1e-3, LARGEST, 200)
 """Sizes that are tried."""
-MOST = {"encoder-offset": np.pi, "base-tilted": 180.0}
-"""Largest sizes that faults can have: half a turn, in rad and degrees."""
+MOST = {"encoder-offset": np.pi, "base-tilted": 180.0, "masses-mismatch": 1.0}
+"""Largest sizes that faults can have: half a turn, in rad and degrees, and masses of zero."""
 SPAN = 1
 """Rows on either side of which the rate of the torque is taken; fewer than the margin of `explain`."""
 HIDDEN = {
-    "torque-gain": (0.5, "wrong gain of {joint}", "{size:.0%}"),
-    "encoder-offset": (0.1, "encoder offset of {joint}", "{size:.2g} {unit}"),
-    "base-tilted": (6.0, "tilt of the base", "{size:.2g}°"),
-    "torque-delay": (0.04, "torque delay", "{size:.2g} s"),
-    "masses-mismatch": (0.5, "error of the masses", "{size:.0%}"),
+    "torque-delay": (0.02, 1e3, "a delay of the torque", "{:.0f} ms"),
+    "base-tilted": (3.0, 1.0, "a tilt of the base", "{:.2g}°"),
+    "masses-mismatch": (0.2, 100.0, "an error of the masses", "{:.0f} %"),
+    "torque-gain": (0.5, 100.0, "a wrong gain", "{:.0f} %"),
+    "encoder-offset": (0.1, 1.0, "an encoder offset", "{:.2g} {unit}"),
 }
-"""Size that a user expects to be seen [share, rad, degrees, s, share], what is hidden, its size in words."""
+"""Size that a user expects to be seen [s, degrees, share, share, rad], factor to the unit of its words, what
+is hidden, and its size in words; what concerns the whole arm comes first."""
 
 
 @dataclass(frozen=True)
@@ -154,25 +155,38 @@ class Fault:
 
 def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
     """A note on the faults that would stay unseen in this log."""
-    sizes = {
-        (fault.kind, fault.joint): visible_size(explanation, fault)
-        for fault in _faults(system, explanation.log, explanation.rows)
-    }
-    hidden = {key: size for key, size in sizes.items() if size > HIDDEN[key[0]][0]}
+    faults = list(_faults(system, explanation.log, explanation.rows))
+    sizes = [visible_size(explanation, fault) for fault in faults]
+    hidden = [(f, size) for f, size in zip(faults, sizes, strict=True) if size > HIDDEN[f.kind][0]]
     if not hidden:
         return []
-    robot = system.robot
-    units = {name: position_unit(robot, j) for j, name in enumerate(robot.joint_names)}
+    units = {name: position_unit(system.robot, j) for j, name in enumerate(system.robot.joint_names)}
     texts = []
-    for (kind, joint), size in hidden.items():
-        _, what, words = HIDDEN[kind]
-        text = f"any {what}" if size >= MOST.get(kind, LARGEST) else f"any {what} under {words}"
-        texts.append(text.format(joint=joint, size=size, unit=units.get(joint)))
-    more = f" and {len(texts) - 5} more" if len(texts) > 5 else ""
-    text = f"this log does not show {'; '.join(texts[:5])}{more}"
-    joints = tuple(dict.fromkeys(joint for _, joint in hidden if joint))
-    evidence = {f"{kind} {joint}".strip(): size for (kind, joint), size in sizes.items()}
+    for kind, (_, scale, what, words) in HIDDEN.items():
+        parts = []
+        for fault, size in (pair for pair in hidden if pair[0].kind == kind):
+            part = "of any size" if size >= MOST.get(kind, LARGEST) else f"under {words}"
+            part = part.format(scale * size, unit=units.get(fault.joint))
+            parts.append(f"{fault.joint} {part}".strip() + _at_contact(explanation, fault, size))
+        texts += (
+            [f"{what}{': ' if parts[0].startswith(tuple(units)) else ' '}{', '.join(parts)}"] if parts else []
+        )
+    text = f"this log does not show {'; '.join(texts)}"
+    joints = tuple(dict.fromkeys(fault.joint for fault, _ in hidden if fault.joint))
+    pairs = zip(faults, sizes, strict=True)
+    evidence = {f"{fault.kind} {fault.joint}".strip(): size for fault, size in pairs}
     return [explanation.log.finding("faults-hidden", text, joints, **evidence)]
+
+
+def _at_contact(explanation: Explanation, fault: Fault, size: float) -> str:
+    """The force at the tip that a fault of the whole arm passes for, root mean square."""
+    J = explanation.problem.J
+    touching = (J != 0.0).any(axis=(1, 2))
+    if fault.joint or size >= MOST.get(fault.kind, LARGEST) or touching.sum() < LEAST_TOUCHING:
+        return ""
+    # τ = Jᵀ F by least squares.
+    force = np.einsum("nkj,nj->nk", np.linalg.pinv(J[touching].transpose(0, 2, 1)), fault.column[touching])
+    return f" (up to {size * float(np.sqrt((force**2).sum(axis=1).mean())):.2g} N at the contact)"
 
 
 def visible_size(explanation: Explanation, fault: Fault) -> float:

@@ -122,6 +122,10 @@ def _round(model: Explanation) -> Explanation | None:
     losses = ((one, *gain_of(best.score, one[1].score)) for one in good)
     near = [one for one, loss, error in losses if loss <= max(error, SHARE * most) + 1e-9]
     chosen, fit = min(near, key=lambda pair: (pair[0].size, pair[1].score.mean()))
+    if chosen.name == "encoder-offset":
+        fit = _refined(model, chosen, fit)
+        if not hypotheses.plausible(system, chosen, fit):
+            return replace(model, taken=model.taken | {(chosen.name, chosen.joints)})
     # The errors of an arm and of its mirror image are equal but for rounding.
     alike = [
         joint
@@ -144,16 +148,20 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
         columns = np.concatenate([hypothesis.columns, model.columns], axis=-1)
         prior = np.concatenate([hypothesis.prior, model.prior])
         return replace(model, columns=columns, prior=prior, robot=(hypothesis.name, *model.robot)).weighed()
-    if hypothesis.name == "encoder-offset":
-        theta = theta[:1]
-        for _ in range(2):  # Gauss-Newton steps, as the effect of an offset on the torque is not linear
-            moved = corrected(model.log, hypothesis, theta)
-            refined = hypotheses.encoder_hypothesis(model.system, moved, model.rows, hypothesis.joints[0])
-            theta = theta + cross_validate(model.on(moved), refined.columns).theta
     repair = partial(corrected, hypothesis=hypothesis, theta=theta)
     log = repair(model.log)
     problem = hypotheses.problem_of(model.system, log, model.rows)
     return replace(model, log=log, problem=problem, repairs=(*model.repairs, repair)).weighed()
+
+
+def _refined(model: Explanation, hypothesis: Hypothesis, fit: TorqueFit) -> TorqueFit:
+    """The fit of an encoder offset after Gauss-Newton steps, as its effect on the torque is not linear."""
+    theta = fit.theta[:1]
+    for _ in range(2):
+        moved = corrected(model.log, hypothesis, theta)
+        refined = hypotheses.encoder_hypothesis(model.system, moved, model.rows, hypothesis.joints[0])
+        theta = theta + cross_validate(model.on(moved), refined.columns).theta
+    return replace(fit, theta=np.concatenate([theta, fit.theta[1:]]))
 
 
 def _fits(model: Explanation) -> Iterator[Tried]:

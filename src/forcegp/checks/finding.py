@@ -64,6 +64,7 @@ _TABLE: dict[str, tuple[tuple[str, Severity, str, str], ...]] = {
         ("velocity-sign", "error", "wrong velocity sign", "change the sign of the named velocities"),
         ("velocity-order", "error", "velocity columns are permuted", "match columns by joint name"),
         ("acceleration-mismatch", "error", "qdd is not the derivative of qd", "recompute qdd"),
+        ("filter-wide", "warning", "the filter of a derivative is too wide", "import with a narrower window"),
         ("joint-order", "error", "joints are permuted", "match columns to joints by name"),
         ("joint-sign", "error", "joint turns the other way", "change the sign of all its columns"),
         ("encoder-offset", "warning", "encoder offset", "add the stated offset to q"),
@@ -77,6 +78,15 @@ _TABLE: dict[str, tuple[tuple[str, Severity, str, str], ...]] = {
         ("torque-unexplained", "error", "the model explains too little", "check robot file and scene"),
         ("disturbance", "warning", "unmodelled torque for a while", "label the contact, or mask it"),
         ("robot-mismatch", "warning", "logged on another robot", "use the scene of that robot"),
+    ),
+    "import": (
+        (
+            "import-doubt",
+            "warning",
+            "the mapping was not checked",
+            "correct or delete its lines marked CHECK",
+        ),
+        ("import-found", "note", "found at import", "see the import's report"),
     ),
     "contact": (
         ("contact-unlabelled", "error", "contact state is not logged", "add a contact column"),

@@ -79,10 +79,8 @@ def projector(J: Array, scale: Array) -> Array:
     return eye
 
 
-BLOCKS = 8
-"""Contiguous parts of the log, each held out once."""
-REWEIGHTED = 10
-"""Rounds of a robust fit."""
+BLOCKS, REWEIGHTED = 8, 10
+"""Contiguous parts of the log, each held out once; rounds of a robust fit."""
 FLOOR = 0.03
 """Errors below this share of a joint's torque do not matter: robot files are no better."""
 
@@ -116,7 +114,7 @@ class TorqueFit:
     Attributes:
         error, shares: `(blocks, nq)` root mean square of the held-out residual, over `scale` and over `size`.
         theta, spread: `(p,)` parameters of the hypothesis, and their deviation by the jackknife over blocks.
-        nuisance: parameters of the nuisance columns.
+        nuisance, nuisance_spread: the same of the nuisance columns.
         score: `(blocks,)` Σ_j log of the shares, with a floor where errors do not matter.
     """
 
@@ -124,6 +122,7 @@ class TorqueFit:
     theta: Array
     spread: Array
     nuisance: Array
+    nuisance_spread: Array
     shares: Array
     score: Array
 
@@ -154,13 +153,13 @@ def cross_validate(
     block = blocks_of(len(y))
     error = np.stack([np.sqrt((rest[block == k] ** 2).mean(axis=0)) for k in range(BLOCKS)])
     # Jackknife: (K − 1)/K Σ (θ_k − mean)².
-    spread = np.sqrt(BLOCKS - 1.0) * np.std(thetas, axis=0)
+    spread = np.sqrt(BLOCKS - 1.0) * np.std(thetas, axis=0) / unit
     theta = (whole / unit)[:p]
     # An error counts in relation to the torque: a gain of zero explains a noisy torque, and nothing.
     factor = np.ones(len(problem.size))
     factor[list(gains)] += theta[: len(gains)]
     shares = error * problem.scale / (problem.size * np.abs(factor) + 1e-12)
-    return TorqueFit(error, theta, (spread / unit)[:p], (whole / unit)[p:], shares, score_of(shares))
+    return TorqueFit(error, theta, spread[:p], (whole / unit)[p:], spread[p:], shares, score_of(shares))
 
 
 def _equations(

@@ -30,12 +30,11 @@ LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
 """Delays between torque and motion that are tried, in samples either way."""
 TOOL_MASS = 5.0
 """How heavy a tool may be that the robot file lacks [kg]."""
-SHARPER = (2.0, 10.0)
-"""Factors by which dry friction may rise more sharply than declared: its law near rest is rarely known."""
-SLOW = 0.01
-"""Sliding speed below which dry friction of a contact is smooth [m/s]."""
-GRAVITY = 10.0
-"""How far gravity may be off [m/s²]."""
+RISES = (0.3, 2.0, 10.0)
+"""Factors by which the rise of dry friction may differ from the declared one: its law near rest is rarely
+known, and that of MuJoCo is more gentle."""
+SLOW, GRAVITY = 0.01, 10.0
+"""Sliding speed below which dry friction of a contact is smooth [m/s]; how far gravity may be off [m/s²]."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +78,10 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
     return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
 
 
-def sharper_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Declared Coulomb friction at parts of its smoothing velocity, less that at all of it `(n, nq, p)`."""
+def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
+    """Declared Coulomb friction with another smoothing velocity, less that at all of it `(n, nq, p)`."""
     x, declared = log.qd[rows] / system.robot.friction_velocity.numpy(), system.robot.friction.numpy() > 0.0
-    columns = [_diagonal(np.tanh(k * x) - np.tanh(x))[..., np.flatnonzero(declared)] for k in SHARPER]
+    columns = [_diagonal(np.tanh(k * x) - np.tanh(x))[..., np.flatnonzero(declared)] for k in RISES]
     return np.concatenate(columns, axis=-1)
 
 
@@ -230,14 +229,17 @@ WEIGHTLESS = 0.3
 """Share of gravity below which the torque holds none of it."""
 SIGNIFICANT = 3.0
 """Standard errors from which a parameter of a tool counts."""
-SMALL_ANGLE = np.radians(0.5)
-"""Encoder offsets below this are within calibration, or an error of a centre of mass [rad]."""
+SMALL_ANGLE, LARGEST_ANGLE = np.radians(0.5), 1.0
+"""Encoder offsets below the first are within calibration, or an error of a centre of mass; one beyond the
+second is none that a slope of the torque determines [rad, m]."""
 SMALL_GAIN = 0.2
 """Gains closer to 1 than this may as well be errors of the masses of a robot file."""
 EXPLAINED = 0.5
 """Share of the torque that a gain may leave unexplained, as any useful model may."""
-SMALL_TILT, SMALL_GRAVITY = 1.0, 0.05
-"""Tilts [degrees] and changes of the size of gravity, as a share, that are errors of the masses."""
+SMALL_TILT, EARTH = 1.0, 9.81
+"""Tilts that are errors of the masses [degrees]; size of gravity where the scene has none [m/s²]."""
+SAME_GRAVITY = 0.2, 0.5
+"""Share by which a gravity that turned may seem larger or smaller: a tilt, and more. Masses are off too."""
 
 
 DISCRETE = {
@@ -251,16 +253,20 @@ DISCRETE = {
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
     """Whether the parameters are what a hypothesis says: a tool has a mass, an offset is not a trifle."""
     if hypothesis.name == "encoder-offset":
-        return bool(abs(fit.theta[0]) > max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0]))
+        least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
+        return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
     if hypothesis.name == "gains":
         joints = list(hypothesis.joints)
         # A gain that only makes the torque larger than its error explains nothing.
         explained = float(np.median(np.median(fit.shares[:, joints], axis=0))) < EXPLAINED
-        return explained and bool((np.abs(fit.theta[: len(joints)]) > SMALL_GAIN).any())
+        size, spread = (np.abs(x[: len(joints)]) for x in (fit.theta, fit.spread))
+        return explained and bool((size > np.maximum(SMALL_GAIN, spread)).any())
     if hypothesis.name == "gravity":
         assumed = system.robot.gravity.numpy()
         angle, size = _turn(assumed, assumed + fit.theta[:3])
-        return angle > SMALL_TILT or abs(size - 1.0) > SMALL_GRAVITY
+        # No place on earth has another size of gravity: such a fit has masses or gains that are wrong.
+        same = abs(size - 1.0) <= SAME_GRAVITY[angle > TILT]
+        return bool(size < WEIGHTLESS) or (angle > SMALL_TILT and same)
     if hypothesis.name == "payload":
         return bool(fit.theta[0] > SIGNIFICANT * fit.spread[0])
     return True
@@ -349,7 +355,7 @@ def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
 
 
 def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:
-    """Angle between two vectors in degrees, and the length of the second over that of the first."""
+    """Angle between two vectors in degrees, and the length of the second over that of the first, if any."""
     lengths = float(np.linalg.norm(assumed)), float(np.linalg.norm(fitted))
     cosine = fitted @ assumed / max(lengths[0] * lengths[1], 1e-12)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), lengths[1] / max(lengths[0], 1e-12)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), lengths[1] / (lengths[0] or EARTH)

@@ -162,6 +162,8 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
     wrong = level.moving & (~level.right() | (np.abs(level.correlation) < RELATED)) & ~_coarse(log, level)
     if not wrong.any():
         return [], log
+    if "qd" in log.header.derived:
+        return [_mismatch("filter-wide", log, level, wrong, "qd", "q")], log
     permutation = _permutation(level)
     if permutation is not None:
         names = log.named(permutation != np.arange(log.nq))
@@ -200,7 +202,8 @@ def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, v
     joints, j = log.named(wrong), int(np.flatnonzero(wrong)[0])
     slope, correlation = level.low[j], level.correlation[j]
     shown = f"slope {slope:.3g}, correlation {correlation:.3g}"
-    text = f"{rate} of {', '.join(joints)} is not the rate of change of {value}: {shown}"
+    is_not = "was computed by a filter and has not" if kind == "filter-wide" else "is not"
+    text = f"{rate} of {', '.join(joints)} {is_not} the rate of change of {value}: {shown}"
     return log.finding(kind, text, joints, slope=slope, correlation=correlation)
 
 
@@ -268,6 +271,8 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))
     if not wrong.any():
         return [], log
+    if "qdd" in log.header.derived:
+        return [_mismatch("filter-wide", log, level, wrong, "qdd", "qd")], log
     finding = _mismatch("acceleration-mismatch", log, level, wrong, "qdd", "qd")
     qdd = log.qdd.copy()
     for s in log.stretches:

@@ -21,8 +21,10 @@ OFTENER = 5.0
 """Factor by which a clipped value occurs more often than its neighbours; at the peaks of a sine, 2.4."""
 BAND = 0.03
 """Part of the range of a torque that noise of a clipped one stays within."""
-PLATEAUS = 3
-"""Plateaus at least that a noisy clipped torque reaches while its joint moves."""
+PLATEAUS, FLAT_ROWS, FLAT = 3, 10, 0.35
+"""Least plateaus of a noisy clipped torque while its joint moves, rows of each, and variance of steps over
+twice that of the values in their middle halves: 1 for white noise about a limit, 0.43 for the current of a
+real drive, 0.05 to 0.3 at smooth peaks."""
 MOVES = 0.02
 """Part of its largest speed from which a joint moves; the torque of one that rests is constant."""
 OFTEN = 0.05
@@ -133,5 +135,9 @@ def _plateaus(log: Log, j: int, extreme: float) -> Intervals:
     # With noise, a band of values, beside the next one of the same width.
     band = (np.abs(tau - extreme) <= width) & log.usable & moves
     beside = (np.abs(tau - extreme) > width) & (np.abs(tau - extreme) <= 2.0 * width) & log.usable & moves
-    runs = tuple((a, b) for a, b in intervals(band) if b - a >= CLIPPED_RUN)
-    return runs if len(runs) >= PLATEAUS and band.sum() > OFTENER * max(beside.sum(), 1) else ()
+    runs = tuple((a, b) for a, b in intervals(band) if b - a >= FLAT_ROWS)
+    if len(runs) < PLATEAUS or band.sum() <= OFTENER * max(beside.sum(), 1):
+        return ()
+    middles = [tau[(3 * a + b) // 4 : (a + 3 * b + 3) // 4] for a, b in runs]
+    steps = sum(float((np.diff(x) ** 2).sum()) for x in middles)
+    return runs if steps > 2.0 * FLAT * sum(len(x) * float(x.var()) for x in middles) else ()

@@ -25,10 +25,8 @@ SPEEDS = (25.0, 95.0)
 """Percentiles of a joint's speed between which friction resists."""
 UNEXPLAINED = 0.5
 """Share of the torque, in root mean square, that a useful model may leave unexplained."""
-TRACE_ROWS = 20_000
-"""Rows at which the residual is looked at over time."""
-DISTURBANCE_SECONDS = 0.1
-"""Length over which the residual is averaged [s]."""
+TRACE_ROWS, DISTURBANCE_SECONDS = 20_000, 0.1
+"""Rows at which the residual is looked at over time; length over which the residual is averaged [s]."""
 DISTURBANCE, LOUD = 5.0, 4.0
 """A stretch of time stands out by so many robust standard deviations of the log residual, or by this factor
 over the residual of the worst tenth of the motion."""
@@ -58,16 +56,22 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     if disturbed and _enough(smooth.mask(rows)):
         # What happened in these rows must pass neither for friction nor for a mass.
         explanation = explain(system, smooth.mask(rows))
+    losses = _determined(system.robot, explanation)
     findings = [
         *passive,
         *_confounded(explanation),
-        *_friction(system.robot, _with_other_friction(system, explanation)),
-        *_offsets(system.robot, explanation),
+        *_friction(system.robot, _determined(system.robot, _with_other_friction(system, explanation))),
+        *_offsets(system.robot, losses),
         *_unexplained(explanation),
         *check_visibility(system, explanation),
     ]
     for repair in explanation.repairs:
         log = repair(log)
+    if log.contact and log.nq > 3:
+        # Friction and offsets of the joints must not pass for a force at the tip.
+        viscous, dry, offset = losses.fit.nuisance.reshape(3, log.nq)
+        smooth = np.tanh(log.qd / system.robot.friction_velocity.numpy())
+        log = log.replace(tau=log.tau + viscous * log.qd + dry * smooth + offset)
     return [*findings, *disturbed], log
 
 
@@ -103,10 +107,28 @@ def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
 
 def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) -> Explanation:
     """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
-    functions = (hypotheses.contact_friction_columns, hypotheses.sharper_friction_columns)
+    functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
     columns = [columns(system, explanation.log, explanation.rows) for columns in functions]
     nuisance = np.concatenate([explanation.problem.nuisance, *columns], axis=-1)
     return replace(explanation, problem=replace(explanation.problem, nuisance=nuisance))
+
+
+def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
+    """The explanation without friction that the log does not determine: it would drive, or is below its σ.
+
+    What is left out has the parameter and the spread 0.
+    """
+    declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
+    for _ in range(robot.nq):
+        fit = explanation.fit
+        change, spread = -fit.nuisance[: len(declared)], fit.nuisance_spread[: len(declared)]
+        wrong = (change != 0.0) & ((change + declared < -spread) | (np.abs(change) <= spread))
+        if not wrong.any():
+            break
+        nuisance = explanation.problem.nuisance.copy()
+        nuisance[..., np.flatnonzero(wrong)] = 0.0
+        explanation = replace(explanation, problem=replace(explanation.problem, nuisance=nuisance))
+    return explanation
 
 
 def _confounded(explanation: Explanation) -> list[Finding]:
@@ -130,21 +152,26 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     speeds = np.percentile(np.abs(rows), SPEEDS, axis=0)
     damping, declared = robot.damping.numpy(), robot.friction.numpy()
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
+    spread = explanation.fit.nuisance_spread
     significant = np.array([_matters(explanation, j, [j, nq + j]) for j in range(nq)])
     significant &= resists & ~still_joints(log)
     findings = []
     for hit, word in ((significant & (power > 0.0), "more"), (significant & (power <= 0.0), "less")):
         if not hit.any():
             continue
-        joints, units = log.named(hit), [force_unit(robot, j) for j in range(nq)]
-        listed = ", ".join(
-            f"{log.joint_names[j]} {viscous[j]:.3g} {units[j]} s/{position_unit(robot, j)}, "
-            f"{coulomb[j]:.3g} {units[j]}"
-            for j in np.flatnonzero(hit)
-        )
+        joints, parts = log.named(hit), []
+        for j in np.flatnonzero(hit):
+            units = f"{force_unit(robot, j)} s/{position_unit(robot, j)}", force_unit(robot, j)
+            pairs = zip((viscous[j], coulomb[j]), (spread[j], spread[nq + j]), units, strict=True)
+            sizes = (f"{x:.3g} ± {s:.1g} {unit}" if s else "not determined" for x, s, unit in pairs)
+            parts.append(f"{log.joint_names[j]} {', '.join(sizes)}")
+        listed = "; ".join(parts)
         text = f"joints show {word} friction than the robot file declares (viscous, Coulomb): {listed}"
-        evidence = dict(zip((f"viscous {joint}" for joint in joints), viscous[hit], strict=True))
-        evidence |= dict(zip((f"coulomb {joint}" for joint in joints), coulomb[hit], strict=True))
+        evidence = {
+            f"{word} {log.joint_names[j]}": value[j]
+            for word, value in (("viscous", viscous), ("coulomb", coulomb))
+            for j in np.flatnonzero(hit & (value != 0.0))
+        }
         findings.append(log.finding("friction-undeclared", text, joints, **evidence))
     return findings
 
@@ -152,7 +179,8 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
 def _offsets(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     log, nq = explanation.log, explanation.log.nq
     offset = -explanation.fit.nuisance[2 * nq : 3 * nq]
-    off = {j: log.joint_names[j] for j in range(nq) if _matters(explanation, j, [2 * nq + j])}
+    known = np.abs(offset) > explanation.fit.nuisance_spread[2 * nq : 3 * nq]
+    off = {j: log.joint_names[j] for j in range(nq) if known[j] and _matters(explanation, j, [2 * nq + j])}
     if not off:
         return []
     joints = tuple(off.values())

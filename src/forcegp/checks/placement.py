@@ -14,7 +14,7 @@ import numpy as np
 from forcegp.checks.contact import FAR, OFFSET, SLIDING_SLOW, fit_surface, tip_path, touching
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import labelled_contacts
-from forcegp.checks.hypotheses import Hypothesis, changed, corrected, discrete, unchanged
+from forcegp.checks.hypotheses import LARGEST_ANGLE, Hypothesis, changed, corrected, discrete, unchanged
 from forcegp.checks.log import Log, Outcome, displacement, evenly
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.logs.contact import LEVEL, TOUCHING, exchanged_joints
@@ -25,8 +25,8 @@ ROWS = 2000
 """Contact rows that are looked at."""
 BETTER = 0.25
 """Share of what a displaced surface leaves that changed angles may leave."""
-LARGEST, STEPS = 1.0, 6
-"""Largest encoder offset that is looked for [rad], and the Gauss-Newton steps that find it."""
+STEPS = 6
+"""Gauss-Newton steps that find an encoder offset."""
 
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -98,7 +98,7 @@ def _offsets(
             ahead = tip_path(system, contact, corrected(log, hypothesis, offset + 1e-5), rows).c
             slope = (ahead - c) / 1e-5
             offset = offset - (slope @ c) / max(slope @ slope, 1e-12)
-        if abs(offset[0]) <= LARGEST:
+        if abs(offset[0]) <= LARGEST_ANGLE:
             yield replace(hypothesis, columns=offset), corrected(log, hypothesis, offset)
 
 

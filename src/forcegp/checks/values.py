@@ -138,7 +138,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
             ]
             if runs:
                 spans = tuple(runs)
-                text = f"{name}.{joint} keeps one value while the joint moves, in {describe(spans)}"
+                text = f"{name}.{joint} keeps one value while the arm moves, in {describe(spans)}"
                 findings.append(Finding("channel-stuck", text, spans, (joint,)))
                 for a, b in runs:
                     bad[a:b] = True
@@ -151,16 +151,17 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
         return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
     if name == "qd":
         return float(np.ptp(np.cumsum(log.qdd[a:b, j])) * log.dt)
-    # Torque and acceleration: as far as they change over as many rows elsewhere, if the arm moves.
-    x = getattr(log, name)[:, j]
+    # Torque and acceleration: as far as they change over as many rows elsewhere, if the arm moves, for the
+    # torque, or the joint itself, for the acceleration.
+    x, moved = getattr(log, name)[:, j], log.q[a:b] if name == "tau" else log.q[a:b, j : j + 1]
     lag = b - a
     usual = float(np.median(np.abs(x[lag:] - x[:-lag])))
-    return usual if np.abs(np.diff(log.q[a:b], axis=0)).max(initial=0.0) > 0.0 else 0.0
+    return usual if np.abs(np.diff(moved, axis=0)).max(initial=0.0) > 0.0 else 0.0
 
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     """Single values far off the curve through their neighbours."""
-    bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
+    bad, hit, joints, vectors = np.zeros(len(log), bool), [], [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
     for name in vectors:
         departure, around, scale = departures[name]
@@ -179,9 +180,10 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
         # The neighbours of a spike are off as well, by less.
         peak = outlier & (np.abs(departure) >= _within_two(np.abs(departure)))
         bad |= peak.any(axis=1)
+        joints += log.named(peak.any(axis=0))
         hit += [f"{name}.{joint}" for joint in log.named(peak.any(axis=0))]
     text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}:"
-    return at_rows(bad, "spike", text, rows=bad.sum()), log.mask(bad)
+    return at_rows(bad, "spike", text, tuple(dict.fromkeys(joints)), rows=bad.sum()), log.mask(bad)
 
 
 def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:

@@ -41,9 +41,10 @@ def evaluate(
     """Compare a model's predictions with a data set and with trivial predictors.
 
     The trivial predictors are the mean, the robot file alone, and least squares of inertial parameters,
-    viscous and Coulomb friction and offsets. The verdict says whether the model is better than each, in
-    torque and in acceleration. Errors are in rad/s² (m/s² for sliding joints); coverage is the share of
-    samples within two standard deviations.
+    viscous and Coulomb friction and offsets. The verdict says how much of the torque beyond gravity the model
+    explains, how far off its motion is in open loop, and its force in contact, if one is logged; the next
+    line whether it is better than each predictor in torque and in acceleration. Errors are in rad/s² (m/s²
+    for sliding joints); coverage is the share of samples within two standard deviations.
 
     With --out, prints the path of a page with the verdict, the errors by joint, the calibration and the
     predictions over the first seconds, and writes all scores to evaluation.json.
@@ -60,13 +61,18 @@ def evaluate(
     if out is not None:
         check_destination(out, folder=True, own_files=["*.json", "*.html", "*.svg", "*.png"])
     regression = _model(model, scene, config, train)
-    robot = regression.system.robot
+    robot = regression.specified.robot
     test = read_data(data, robot)
     training = None if train is None else read_data(train, robot)
     with progress_bar("evaluating", len(test)) as progress:
         evaluation = run(regression, test, train=training, progress=progress)
     warn_beyond(regression, test)
-    result: dict[str, object] = {"verdict": evaluation.verdict or "too few samples", **evaluation.summary()}
+    result: dict[str, object] = {"verdict": evaluation.verdict or "too few samples"}
+    result |= {
+        "doubts": evaluation.doubts,
+        "comparison": evaluation.comparison or None,
+        **evaluation.summary(),
+    }
     if out is not None:
         names = str(model or config or scene), str(data), str(train) if train else None
         result |= _written(out, evaluation, regression, test, names)

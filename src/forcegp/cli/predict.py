@@ -83,7 +83,7 @@ def predict(
 
     check_data_destination(out, data)
     regression = load_model(model)
-    test = read_data(data, regression.system.robot)
+    test = read_data(data, regression.specified.robot)
     if quantity == WRENCH:
         test, result = _with_wrench(regression, test, frame, reference, momentum)
         write_or_keep(test.with_step(f"predicted {quantity} by the model in {model}").write, out)

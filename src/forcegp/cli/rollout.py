@@ -61,7 +61,7 @@ def rollout(
 
     check_destination(out, folder=True, own_files=["rollout*", "*.svg", "*.png"])
     regression = load_model(model)
-    log = _stretch(read_data(data, regression.system.robot), start, duration)
+    log = _stretch(read_data(data, regression.specified.robot), start, duration)
     _say_contact(log, unilateral)
     dt = sampling_period(log)
     options = RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")

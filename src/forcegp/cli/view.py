@@ -71,7 +71,7 @@ def view(
     log = data or rollout
     motion = at_rest(system)
     if log is not None:
-        stretch = _stretch(log, system, start, seconds)
+        stretch = _stretch(log, system if model is None else model.specified, start, seconds)
         motion = of_log(system, stretch, model)
         if model is not None and data is not None:
             with progress_bar("rolling out", 1) as advance:

@@ -278,6 +278,8 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
     steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))
     agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
+    for name in ("derived", "imported"):
+        agreed[name] = tuple(dict.fromkeys(value for header in headers for value in getattr(header, name)))
     agreed["ordered"] = all(header.ordered for header in headers)
     agreed["filtered"] = any(header.filtered for header in headers)
     agreed["filter_span"] = max((h.filter_span for h in headers if h.filter_span is not None), default=None)

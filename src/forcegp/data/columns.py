@@ -166,8 +166,9 @@ def _fill_in(
         if "qdd" in absent:
             fields["qdd"], fields["extras"]["qdd_std"] = derive(of, order)
     step = f"computed {' and '.join(sorted(absent))} from the log by {method}"
+    header = header.with_step(step, derived=tuple(sorted({*header.derived, *absent})))
     if "qdd" not in absent:
-        return header.with_step(step)
+        return header
     noise = float(np.sqrt(np.mean(fields["extras"]["qdd_std"] ** 2)))
     span = method.window * float(np.median(np.diff(fields["t"])))
-    return header.with_step(step, noise_std=noise, filtered=True, filter_span=span)
+    return header.model_copy(update={"noise_std": noise, "filtered": True, "filter_span": span})

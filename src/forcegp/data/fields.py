@@ -25,6 +25,8 @@ class DataHeader(Header):
         seed: seed of the random numbers that went into the data.
         ordered: rows follow time within each segment (not so for points in order of selection).
         provenance: what was done to the data, oldest first, one line per step.
+        derived: joint vectors that a filter computed from others of the log.
+        imported: kind and sentence of what an import found in the log, doubts about its mapping among them.
         unmeasured_torques: joints whose motor torque was not measured; theirs is 0 in the columns.
         joint_names, contact_names: in the order of the columns; empty where a log does not say.
     """
@@ -41,6 +43,8 @@ class DataHeader(Header):
     seed: int | None = None
     ordered: bool = True
     provenance: tuple[str, ...] = ()
+    derived: tuple[str, ...] = ()
+    imported: tuple[tuple[str, str], ...] = ()
     unmeasured_torques: tuple[str, ...] = ()
     joint_names: tuple[str, ...] = ()
     contact_names: tuple[str, ...] = ()

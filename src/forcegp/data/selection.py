@@ -259,6 +259,7 @@ def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset
     clean = data.extras.get("qdd_clean", data.qdd)
     noise = torch.randn(clean.shape, dtype=clean.dtype, device=generator.device, generator=generator)
     step = f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}"
-    header = data.header.with_step(step, noise_std=std, filtered=False, filter_span=None)
+    derived = tuple(name for name in data.header.derived if name != "qdd")
+    header = data.header.with_step(step, noise_std=std, filtered=False, filter_span=None, derived=derived)
     qdd, extras = clean + std * noise.to(clean.device), {**data.extras, "qdd_clean": clean}
     return data.replace(qdd=qdd, extras=extras, header=header)

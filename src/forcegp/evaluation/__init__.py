@@ -11,7 +11,8 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError
-from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines
+from forcegp.evaluation.judgement import Motion, beyond_gravity, explained, open_loop, torque_response
+from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines, free_directions
 from forcegp.evaluation.predicted import (
     MultiplierScore,
     Predicted,
@@ -31,9 +32,12 @@ from forcegp.evaluation.scores import (
     sentence,
     verdicts,
 )
-from forcegp.models.base import Predictor
+from forcegp.models.base import FittedModel, Predictor
 
 __all__ = ["Evaluation", "evaluate"]
+
+GRAVITY_ALONE, LEAST_RESPONSE = 0.99, 0.5
+"""Gravity's share of the torque from which data test little more; least share of an added torque to act."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,10 @@ class Evaluation:
         verdicts: the model against each trivial predictor; empty if there are too few samples.
         multipliers: λ against the logged one, for models of forces and logs that contain it.
         sensed: the same with the log's force sensor as a measurement at each state, for models fitted to it.
+        gravity: share R² of the torque that gravity alone explains; close to 1, a log hardly tests a model.
+        response: share by joint of a torque nobody chose that acts: 1 of a rigid robot, 0 of a model that has
+            learned the controller; `None` without free motion.
+        motion: in open loop, for models of forces and data in the order of time.
     """
 
     kind: str
@@ -71,16 +79,62 @@ class Evaluation:
     verdicts: tuple[Verdict, ...] = ()
     multipliers: tuple[MultiplierScore, ...] = ()
     sensed: tuple[MultiplierScore, ...] = ()
+    gravity: float | None = None
+    response: tuple[float, ...] | None = None
+    motion: Motion | None = None
 
     @property
     def verdict(self) -> str:
-        """Whether the model is better than the trivial predictors, in one sentence."""
+        """Torque explained beyond gravity, motion in open loop and force in contact, in one sentence."""
+        parts, shares = [], {p.name: p.beyond_gravity for p in self.predictors}
+        if (share := shares.pop("model", None)) is not None:
+            others = [
+                f"{name} {_percent(x)}" for name, x in shares.items() if x is not None and name != "mean"
+            ]
+            parts.append(
+                f"the model explains {_percent(share)} of the torque beyond gravity ({', '.join(others)})"
+            )
+        if self.motion is not None:
+            at = min(1, len(self.motion.horizons) - 1)
+            off, file = (
+                "more than it moves" if x is None or x > 1.0 else f"{_percent(x)} of its motion"
+                for x in (self.motion.model[at], self.motion.robot_file[at])
+            )
+            after = f"{self.motion.horizons[at]:g} s in open loop"
+            parts.append(
+                f"after {after} the arm is off by {off} (robot file {file.removesuffix(' of its motion')})"
+            )
+        parts += [score.text() for score in self.multipliers]
+        text = "; ".join(parts)
+        return f"{text[:1].upper()}{text[1:]}." if parts else ""
+
+    @property
+    def comparison(self) -> str:
+        """Whether the model is better than the trivial predictors in torque and in acceleration."""
         return sentence(self.verdicts)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Reasons not to trust the numbers."""
+        found = []
+        if self.gravity is not None and self.gravity > GRAVITY_ALONE:
+            share = f"{100.0 * self.gravity:.1f} %"
+            found.append(f"Gravity alone explains {share} of the torque: the data hardly test anything else.")
+        if self.response is not None and min(self.response) < LEAST_RESPONSE:
+            weak = [
+                f"{j} {x:.2f}"
+                for j, x in zip(self.joint_names, self.response, strict=True)
+                if x < LEAST_RESPONSE
+            ]
+            text = f"A torque that nobody chose acts by less than it should: {', '.join(weak)} of 1."
+            found.append(f"{text} The model has learned the controller, not the arm.")
+        return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in JSON types."""
         texts = [verdict.text() for verdict in self.verdicts]
-        return asdict(self) | {"verdict": self.verdict, "verdict_texts": texts}
+        said = {"verdict": self.verdict, "comparison": self.comparison, "doubts": self.doubts}
+        return asdict(self) | said | {"verdict_texts": texts}
 
     def summary(self) -> dict[str, float | int | str | None]:
         """The scores over all joints, by name."""
@@ -136,7 +190,9 @@ def evaluate(
     if predicted.variance is not None and noise_std is not None:
         spread = Uncertainty.of(predicted.mean, predicted.variance, noise_std, data.qdd, clean)
     residual = predicted.residual
-    scores = _predictors(predicted, spread, before, data, train) if compare else ()
+    rest, gravity = beyond_gravity(before, data) if compare else (None, None)
+    scores = () if rest is None else _predictors(model, predicted, spread, before, data, train, rest)
+    real = model if compare and isinstance(model, FittedModel) else None
     return Evaluation(
         kind=model.kind,
         samples=len(data),
@@ -152,25 +208,37 @@ def evaluate(
         verdicts=verdicts(scores, data.joint_names) if scores else (),
         multipliers=multiplier_scores(model, data) if model.force_field() else (),
         sensed=sensed_scores(model, data),
+        gravity=gravity,
+        response=None if real is None else torque_response(real, data),
+        motion=None if real is None else open_loop(real, before, data),
     )
 
 
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %" if share >= 0.0 else "nothing"
+
+
 def _predictors(
+    model: Predictor,
     predicted: Predicted,
     spread: Uncertainty | None,
     system: ConstrainedSystem,
     data: Dataset,
     train: Dataset | None,
+    rest: Tensor,
 ) -> tuple[PredictorScores, ...]:
     """Errors by joint of the model and of the trivial predictors, in torque and in acceleration."""
     moving = moving_joints(data.qd)
+    N = free_directions(system, data)
 
     def score(name: str, error: Tensor, torque: Tensor, density: float | None) -> PredictorScores:
         by_joint = JointErrors.of(torque, data.tau, moving), JointErrors.of(error, data.qdd, moving)
-        return PredictorScores(name, *by_joint, density)
+        of_forces = name != "mean" and (name != "model" or model.force_field() is not None)
+        shares = explained((N @ torque[..., None])[..., 0], rest) if of_forces else ()
+        return PredictorScores(name, *by_joint, density, shares)
 
     error = predicted.mean - data.qdd
-    torque = as_torque(system, data.q, error)
+    torque = as_torque(model.system, data.q, error)
     scores = [score("model", error, torque, None if spread is None else spread.nlpd)]
     for name, (error, torque, std) in _trivial(system, data, train).items():
         certain = bool((std == 0.0).any())

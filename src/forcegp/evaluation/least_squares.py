@@ -25,7 +25,7 @@ from forcegp.robot.inertia import pseudo_inertia as pseudo_inertia_of
 from forcegp.robot.model import RobotModel
 
 CHUNK_STATES = 1000
-"""States handled at a time, which bounds the memory."""
+"""States handled at a time."""
 MOST = 4000
 """Samples used at most, evenly spaced: some hundred times the number of unknowns in equations."""
 WIDE = 10.0
@@ -50,7 +50,7 @@ class LeastSquares:
     def predict(self, data: Dataset) -> Tensor:
         """Accelerations `(n, nq)` under the logged torques, on the constraint."""
         if len(data) > CHUNK_STATES:
-            return torch.cat([self.predict(part) for part in _chunks(data)])
+            return torch.cat([self.predict(part) for part in data_chunks(data)])
         eom = self.system.equations(data.q, data.qd, data.active(self.system.contact_names))
         return eom.acceleration(eom.Q_K + data.tau - self.losses(data.qd))
 
@@ -59,7 +59,8 @@ class LeastSquares:
         return (_friction_columns(self.system.robot, qd) @ self.friction[:, None])[..., 0]
 
 
-def _chunks(data: Dataset) -> Iterator[Dataset]:
+def data_chunks(data: Dataset) -> Iterator[Dataset]:
+    """Parts of a data set of `CHUNK_STATES`, which bound the memory."""
     return (data[i : i + CHUNK_STATES] for i in range(0, len(data), CHUNK_STATES))
 
 
@@ -108,7 +109,7 @@ def _normal_equations(
     """WᵀW `(nq, p, p)`, Wᵀy `(nq, p)` and yᵀy `(nq,)` by joint, with unknowns scaled by the prior."""
     p, nq = len(prior), train.nq
     G, g, y2 = prior.new_zeros(nq, p, p), prior.new_zeros(nq, p), prior.new_zeros(nq)
-    for part in _chunks(train):
+    for part in data_chunks(train):
         W, y = _rows(system, part)
         W = (W * prior).transpose(0, 1)
         G += W.mT @ W
@@ -124,10 +125,18 @@ def _rows(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, Tensor]:
     W = torch.cat([Y, _friction_columns(system.robot, data.qd)], dim=-1)
     y = data.tau + eom.Q_K - (eom.M @ data.qdd[..., None])[..., 0]
     if eom.A.shape[-2]:
-        # N = 1 − A⁺A removes the constraint force, which lies in the range of Aᵀ.
-        N = torch.eye(data.nq, dtype=data.dtype) - torch.linalg.pinv(eom.A) @ eom.A
+        N = free_directions(system, data)
         W, y = N @ W, (N @ y[..., None])[..., 0]
     return W, y
+
+
+def free_directions(system: ConstrainedSystem, data: Dataset) -> Tensor:
+    """N = 1 − A⁺A `(n, nq, nq)` or `(nq, nq)`, which removes the constraint force, in the range of Aᵀ."""
+    one = torch.eye(data.nq, dtype=data.dtype)
+    if not system.m:
+        return one
+    A = system.equations(data.q, data.qd, data.active(system.contact_names)).A
+    return one - torch.linalg.pinv(A) @ A
 
 
 def _start(robot: RobotModel) -> Tensor:

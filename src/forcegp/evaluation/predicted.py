@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from forcegp.constraints.unilateral import normal_rows
 from forcegp.data import Dataset
 from forcegp.evaluation.scores import share
 from forcegp.models.base import Predictor
-from forcegp.models.sensed import force_from_sensor, has_sensor
+from forcegp.models.sensed import force_from_sensor, has_sensor, sensed_force
 from forcegp.models.structured_fit import StructuredFit
 
 CHUNK_STATES = 2000
@@ -102,7 +103,7 @@ class MultiplierScore:
     Attributes:
         contact: name.
         samples: in contact.
-        bias, spread: mean and standard deviation of predicted less logged λ [N].
+        bias, spread, level: mean and standard deviation of predicted less logged λ, and mean logged λ [N].
         correlation: of predicted and logged λ, `None` if either is constant.
         coverage: share of logged values within ±2σ, noise of the torque included; `None` without a
             covariance.
@@ -114,25 +115,48 @@ class MultiplierScore:
     spread: float
     correlation: float | None
     coverage: float | None
+    level: float
+
+    def text(self) -> str:
+        """The comparison in words."""
+        held = "" if self.coverage is None else f", ±2σ holds {100.0 * self.coverage:.0f} %"
+        error = math.hypot(self.bias, self.spread)
+        return f"the force at {self.contact!r} is off by {error:.2g} N of {self.level:.3g} N{held}"
 
 
 @torch.no_grad()
 def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Compare λ with what a simulator or another sensor logged as `multiplier`, each normal force.
+    """Compare λ with what a simulator or a sensor logged (`logged_forces`), each normal force.
 
-    There is one score per contact with a logged multiplier and at least two samples in contact.
+    There is one score per contact with a logged force and at least two samples in contact.
     """
+    if not logged_forces(model, data):
+        return ()
+    return _scores(model, data, *in_chunks(lambda part: predicted_forces(model, part), data))
 
-    def predict(part: Dataset) -> Moments:
-        states, active = (part.q, part.qd, part.tau), part.active(model.system.contact_names)
-        predicted = model.predict(*states, "multiplier", active=active)
-        mean, variance = predicted.mean, predicted.variance
-        if variance is not None and isinstance(model, StructuredFit):
-            variance = variance + model.noise_variance(*states, "multiplier", active, sensor=False)
-        mean = normal_rows(model.system, mean)
-        return mean, None if variance is None else normal_rows(model.system, variance).clamp(min=0.0).sqrt()
 
-    return _scores(model, data, *in_chunks(predict, data)) if _comparable(model, data) else ()
+@torch.no_grad()
+def predicted_forces(model: Predictor, data: Dataset) -> Moments:
+    """Normal force of each contact `(n, contacts)`, and its deviation with the noise of the torque."""
+    states, active = (data.q, data.qd, data.tau), data.active(model.system.contact_names)
+    predicted = model.predict(*states, "multiplier", active=active)
+    mean, variance = predicted.mean, predicted.variance
+    if variance is not None and isinstance(model, StructuredFit):
+        variance = variance + model.noise_variance(*states, "multiplier", active, sensor=False)
+    mean = normal_rows(model.system, mean)
+    return mean, None if variance is None else normal_rows(model.system, variance).clamp(min=0.0).sqrt()
+
+
+def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
+    """Normal force `(n,)` of contacts that were closed in training, by name: `multiplier`, or the sensor's if
+    there is one contact."""
+    never = model.result.never_closed if isinstance(model, StructuredFit) else ()
+    names = [name for name in model.system.contact_names if name not in never]
+    logged = data.contact_extras.get("multiplier", {})
+    found = {name: logged[name] for name in names if name in logged}
+    if not found and len(names) == 1 and has_sensor(data, model.system):
+        return {names[0]: sensed_force(data, model.system)}
+    return found
 
 
 @torch.no_grad()
@@ -140,7 +164,7 @@ def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...
     """The same with the log's force sensor as a measurement at each state; empty without a sensor."""
     if not isinstance(model, StructuredFit) or "multiplier" not in model.noise:
         return ()
-    if not _comparable(model, data) or not has_sensor(data, model.system):
+    if not has_sensor(data, model.system) or "multiplier" not in data.contact_extras:
         return ()
 
     def predict(part: Dataset) -> Moments:
@@ -150,17 +174,10 @@ def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...
     return _scores(model, data, *in_chunks(predict, data))
 
 
-def _comparable(model: Predictor, data: Dataset) -> bool:
-    """Whether the normal force was logged for one of the contacts that the model was trained on."""
-    logged = data.contact_extras.get("multiplier", {})
-    never = model.result.never_closed if isinstance(model, StructuredFit) else ()
-    return any(name in logged and name not in never for name in model.system.contact_names)
-
-
 def _scores(model: Predictor, data: Dataset, mean: Tensor, std: Tensor | None) -> tuple[MultiplierScore, ...]:
     """Scores of λ `(n, contacts)` over the samples in which each contact is closed."""
     names = model.system.contact_names
-    scores, logged, active = [], data.contact_extras["multiplier"], data.active(names)
+    scores, logged, active = [], logged_forces(model, data), data.active(names)
     for i, (name, rows) in enumerate(zip(names, active.T, strict=True)):
         if name not in logged or int(rows.sum()) < 2 or bool(mean[rows, i].isnan().any()):
             continue
@@ -169,5 +186,6 @@ def _scores(model: Predictor, data: Dataset, mean: Tensor, std: Tensor | None) -
         correlation = float(torch.corrcoef(both)[0, 1]) if varies else None
         coverage = None if std is None else share(error.abs() <= 2.0 * std[rows, i])
         bias, spread = float(error.mean()), float(error.std())
-        scores.append(MultiplierScore(name, len(error), bias, spread, correlation, coverage))
+        level = float(logged[name][rows].mean())
+        scores.append(MultiplierScore(name, len(error), bias, spread, correlation, coverage, level))
     return tuple(scores)

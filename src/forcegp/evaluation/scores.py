@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
+from statistics import NormalDist, median
 
 import torch
 from torch import Tensor
@@ -152,16 +152,24 @@ class PredictorScores:
 
     Attributes:
         name: `model`, `mean`, `robot file` or `least squares`.
-        torque: error M(q)(predicted − measured q̈) [N m, N].
+        torque: error M(q)(predicted − measured q̈) with the mass matrix of the predictor's robot [N m, N].
         acceleration: error of q̈ [rad/s², m/s²].
         nlpd: mean negative log predictive density of a measured joint acceleration [nats]; a trivial
             predictor has the constant uncertainty of its training error.
+        explained: R², share by joint of the torque beyond gravity that is explained.
     """
 
     name: str
     torque: JointErrors
     acceleration: JointErrors
     nlpd: float | None
+    explained: ByJoint = ()
+
+    @property
+    def beyond_gravity(self) -> float | None:
+        """Median over the joints of the share that is explained."""
+        known = [share for share in self.explained if share is not None]
+        return median(known) if known else None
 
 
 @dataclass(frozen=True)

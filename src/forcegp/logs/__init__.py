@@ -110,6 +110,8 @@ def import_log(
         log_mapping = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
     report = ImportReport(str(path))
     report.steps.append(f"read {Path(path).name} by mapping {Path(log_mapping.document.source).name}")
+    for doubt in log_mapping.doubts:
+        report.find("doubt", doubt)
     try:
         with foreign(str(path), "a log that can be imported"):
             signals = gather(path, log_mapping, robot.joint_names, report, progress)
@@ -174,6 +176,12 @@ def _dataset(
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,
         provenance=tuple(report.steps),
+        derived=tuple(
+            name
+            for name, logged in (("qd", mapping.sections.velocity), ("qdd", mapping.sections.acceleration))
+            if logged is None
+        ),
+        imported=tuple((found.kind, found.message) for found in report.findings),
         unmeasured_torques=mapping.sections.torque.unmeasured,
         joint_names=robot.joint_names,
         contact_names=tuple(signals.contact),

@@ -19,11 +19,12 @@ from itertools import combinations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
-from forcegp.logs.mapping import ContactStateSection, Mapping
+from forcegp.logs.mapping import GROUND, ContactStateSection, Mapping
 from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.robot import RobotModel
 from forcegp.robust import level_of, robust_std
@@ -56,10 +57,14 @@ def _wrench(
     """
     section = mapping.sections.wrench
     assert section is not None
-    if section.frame not in robot.frame_names:
-        listing = ", ".join(robot.frame_names)
+    if section.frame == GROUND:
+        rotation = torch.from_numpy(Rotation.from_euler("xyz", section.rpy).as_matrix())
+        position = torch.tensor(section.position, dtype=q.dtype).expand(len(q), 3)
+    elif section.frame in robot.frame_names:
+        rotation, position = kinematics.frame_pose(robot, q, section.frame)
+    else:
+        listing = ", ".join((*robot.frame_names, GROUND))
         raise mapping.error(("wrench", "frame"), "no such frame of the robot", listing, repr(section.frame))
-    rotation, position = kinematics.frame_pose(robot, q, section.frame)
     sign = 1.0 if section.acts_on == "robot" else -1.0
     force, moment = sign * reading[:, :3], sign * reading[:, 3:]
     if section.axes == "frame":
@@ -70,8 +75,15 @@ def _wrench(
 
 
 def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
-    """The sensor's force and moment at each contact with a surface: `F_sensor` and `M_sensor`."""
+    """The sensor's force and moment at each contact with a surface: `F_sensor` and `M_sensor`.
+
+    A load cell has the normal force alone, which is the `multiplier`.
+    """
     touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
+    section = mapping.sections.wrench
+    if section is not None and len(section.force) == 1:
+        forces = (_evidence(signals, system, mapping, contact, "wrench") for contact in touching)
+        return {"multiplier": dict(zip((contact.name for contact in touching), forces, strict=True))}
 
     def sensed(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
         F, moment, sensor = _wrench(system.robot, mapping, q, reading)
@@ -116,9 +128,9 @@ def _evidence(
     return multiplier(signals, system, contact)
 
 
-SEPARATION, RELEASE_STD = 6.0, 4.0
+SEPARATION, RELEASE_STD, RELEASE = 6.0, 4.0, 0.01
 """Least distance between the two levels of force, in standard deviations of the open one; a contact counts as
-closed from where the force leaves the open level by so many of them."""
+closed from where the force leaves the open level by so many of them, and by this share of the distance."""
 TOUCHING, DISTANCE_STD, SMALLEST_DISTANCE = 1e-3, 6.0, 1e-6
 """A contact is closed up to so many deviations of the distances of the closed contact above their median, at
 least for rounding and at most [m], unless the mapping says otherwise."""
@@ -327,7 +339,8 @@ def force_levels(values: Array, name: str, section: ContactStateSection) -> tupl
             got=f"{open_level:.3g} ± {open_spread:.2g} N and {closed_level:.3g} N",
             hint=f"set threshold under [contact.{name}], or source to always, never or distance",
         )
-    low = section.release if section.release is not None else open_level + RELEASE_STD * open_spread
+    away = max(RELEASE_STD * open_spread, RELEASE * (closed_level - open_level))
+    low = section.release if section.release is not None else open_level + away
     return high, min(low, high)
 
 

@@ -6,6 +6,8 @@ import json
 from dataclasses import dataclass, field
 from typing import Any
 
+CHECK = "# CHECK: "
+"""Start of a comment on what the user must check."""
 CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
 """What a current needs beside its unit."""
 
@@ -50,7 +52,7 @@ class Draft:
 
     def say(self, table: str, sentence: str, doubt: bool = False) -> None:
         """Comment on a table; a doubt is also listed at the top."""
-        self.comments.setdefault(table, []).append(("CHECK: " if doubt else "") + sentence)
+        self.comments.setdefault(table, []).append((CHECK[2:] if doubt else "") + sentence)
         if doubt:
             self.doubts.append(sentence)
 

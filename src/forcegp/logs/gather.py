@@ -115,12 +115,19 @@ class _Gathering:
         return stream, result
 
     def _wrench(self) -> tuple[Stream, Array]:
-        """Force and moment as the sensor gives them, in SI units, offsets taken off; no moment is zero."""
+        """Force and moment as the sensor gives them, in SI units, offsets taken off; no moment is zero.
+
+        The one column of a load cell is a force along its axis.
+        """
         section = self.mapping.sections.wrench
         assert section is not None
         stream = self.table.stream_of(section.force[0], section.stream)
         result = np.zeros((len(stream), 6))
         force, moment = units.FORCE[section.force_unit], units.TORQUE[section.torque_unit]
+        if len(section.force) == 1:
+            cell = (self._take(stream, section.force[0]) - section.offset[0]) * force
+            result[:, :3] = cell[:, None] * np.array(section.axis)
+            return stream, result
         for i, column in enumerate((*section.force, *(section.torque or ()))):
             result[:, i] = (self._take(stream, column) - section.offset[i]) * (force if i < 3 else moment)
         return stream, result

@@ -33,10 +33,8 @@ from forcegp.logs.smoothing import add_derivatives
 from forcegp.logs.table import LogTable, Progress, Stream
 from forcegp.rows import runs
 
-ROWS = 100_000
-"""Rows that are looked at."""
-TRIED_ROWS = 3000
-"""Rows on which the inverse dynamics are evaluated."""
+ROWS, TRIED_ROWS = 100_000, 3000
+"""Rows that are looked at; rows on which the inverse dynamics are evaluated."""
 LEAST_DEGREES = 3.2
 """Largest position [°] below which an arm in degrees would hardly move."""
 CLEARER = 1.5

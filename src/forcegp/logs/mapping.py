@@ -20,7 +20,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data.checks import lock_hint
 from forcegp.errors import MappingError, did_you_mean
 from forcegp.logs import units
-from forcegp.logs.draft import Draft, Family, quoted
+from forcegp.logs.draft import CHECK, Draft, Family, quoted
 from forcegp.logs.readers import read
 from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
@@ -65,10 +65,20 @@ class TorqueSection(QuantitySection):
     unmeasured: tuple[str, ...] = ()
 
 
-class WrenchSection(Section):
-    """`[wrench]`: a force-torque sensor."""
+GROUND = "ground"
+"""Frame of a sensor that is fixed to the world."""
 
-    force: tuple[str, str, str]
+
+class WrenchSection(Section):
+    """`[wrench]`: a force-torque sensor, or a load cell with one column that measures along `axis`.
+
+    One that is fixed to the ground has its own `position` [m] and `rpy` [rad] in the world.
+    """
+
+    force: tuple[str, ...] = Field(min_length=1, max_length=3)
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
     torque: tuple[str, str, str] | None = None
     stream: str | None = None
     frame: str
@@ -123,10 +133,12 @@ BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "
 
 @dataclass(frozen=True)
 class Mapping:
-    """A mapping file that has been read and checked: its tables, and the document for messages."""
+    """A mapping file that has been read and checked: its tables, the document for messages, and the doubts
+    that `--guess` marked CHECK and nobody has removed."""
 
     sections: MappingSections
     document: Document
+    doubts: tuple[str, ...] = ()
 
     def quantity(self, name: str) -> QuantitySection | None:
         """The table of a joint vector: `position`, `velocity`, `acceleration` or `torque`."""
@@ -218,7 +230,9 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
         MappingError: it is not valid; the message names file, line and key.
     """
     document = Document(content, source, MappingError)
-    mapping = Mapping(document.validated(MappingSections), document)
+    lines = content.decode().splitlines()
+    doubts = tuple(line[len(CHECK) :] for line in lines if line.startswith(CHECK))
+    mapping = Mapping(document.validated(MappingSections), document, doubts)
     _check(mapping)
     return mapping
 
@@ -243,6 +257,10 @@ def _check(mapping: Mapping) -> None:
             raise mapping.error(key, "key 'column' is missing", expected="column = …")
         if contact.source == "wrench" and sections.wrench is None:
             raise mapping.error(key, "the log's wrench is not mapped", "a table [wrench]")
+    wrench = sections.wrench
+    if wrench is not None and (len(wrench.force) == 2 or (len(wrench.force) == 1 and wrench.torque)):
+        got = f"{len(wrench.force)} columns{', and those of a torque' if wrench.torque else ''}"
+        raise mapping.error(("wrench", "force"), "not a force", "one column, or three, of x, y and z", got)
     time, derivatives = sections.time, sections.derivatives
     if time.start is not None and time.stop is not None and time.start >= time.stop:
         raise mapping.error(("time", "stop"), "the log would be empty", f"more than {time.start}", time.stop)

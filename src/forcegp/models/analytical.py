@@ -138,6 +138,11 @@ class AnalyticalFit(PointwiseFit):
 
     kind = KIND
 
+    @property
+    def specified(self) -> ConstrainedSystem:
+        """The system with the robot that learning started from."""
+        return self.system.with_robot(self.parameters.start)
+
     def described(self) -> list[tuple[str, object]]:
         return [(name, getattr(self.system.robot, name)) for name in ("mass", "damping")]
 

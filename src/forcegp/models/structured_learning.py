@@ -165,8 +165,8 @@ def _unchecked_masses(training: Training) -> tuple[str, ...]:
         return ()
     return (
         f"{training.free_motions} samples in free motion are too few to check the masses of the robot file "
-        f"(expected: {LEAST} or more), and any error of the masses biases the multiplier: add a few seconds "
-        "of free motion to the log, or measure the contact force",
+        f"(expected: {LEAST} or more), and any error of the masses biases the multiplier: train on "
+        "more samples if the log has free motion, else add a few seconds of it, or measure the contact force",
     )
 
 

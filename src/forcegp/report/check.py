@@ -16,6 +16,7 @@ from forcegp.checks.contact import tip_path
 from forcegp.checks.log import Array, of_robot
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.files import write_text
+from forcegp.plots import unit
 from forcegp.report.html import render
 from forcegp.report.style import INK, OTHER, Picture, draw
 from forcegp.rows import describe
@@ -26,51 +27,68 @@ POINTS = 1500
 CONTEXT = 3.0
 """Rows shown, in lengths of the interval."""
 LEAST_ROWS = 200
-JOINTS = 3
-"""Joints shown of a finding on many."""
-SIZE = (6.2, 1.35)
+JOINTS, FEW = 7, 3
+"""Joints shown of a finding that names them, and of one that names none."""
+SIZE = (12.0, 1.35)
 """Width of a picture and height of a panel [inch]."""
 
 Paint = Callable[[Axes, Log, slice, int], None]
 
 
-def draw_overview(report: Report) -> Picture:
-    """A lane per finding, with the rows that it concerns."""
+def _axis(log: Log) -> tuple[Array, str]:
+    """Time from the first row [s] where it runs forward, else row numbers, and the label of the axis."""
+    runs = bool(log.header.ordered and np.isfinite(log.t).all() and (np.diff(log.t) >= 0.0).all())
+    return (log.t - log.t[0], "time [s]") if runs and len(log) else (np.arange(float(len(log))), "row")
+
+
+def draw_overview(report: Report, log: Log) -> Picture:
+    """A lane per finding, with the time that it concerns."""
+    x, name = _axis(log)
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         for lane, finding in enumerate(reversed(report.findings)):
-            least = report.samples / 300.0
-            spans = [(a, max(b - a, least)) for a, b in finding.intervals]
+            least = (x[-1] - x[0]) / 300.0
+            spans = [(x[a], max(x[b - 1] - x[a], least)) for a, b in finding.intervals]
             axes.broken_barh(spans, (lane - 0.35, 0.7), color=COLOURS[finding.severity], linewidth=0)
         lanes = [" or ".join(finding.kinds) for finding in reversed(report.findings)]
         axes.set_yticks(range(len(lanes)), lanes)
-        axes.set_xlim(0, report.samples)
-        axes.set_xlabel("row")
+        axes.set_xlim(x[0], x[-1])
+        axes.set_xlabel(name)
 
     kinds = ", ".join(" or ".join(finding.kinds) for finding in report.findings)
-    return draw(paint, (6.2, 0.7 + 0.22 * len(report.findings)), f"Rows concerned by each finding: {kinds}")
+    size = (SIZE[0], 0.7 + 0.22 * len(report.findings))
+    return draw(paint, size, f"Time concerned by each finding: {kinds}")
 
 
-def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture:
-    """What a finding looks like, by its family."""
-    rows = _window(finding, log)
-    family = KINDS[finding.kind].family
-    index = [log.joint_names.index(name) for name in finding.joints][:JOINTS] or _largest(log)
+def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture | None:
+    """What a finding looks like, by its family; nothing for what an import found."""
+    rows, family = _window(finding, log), KINDS[finding.kind].family
+    if family == "import":
+        return None
     if family == "contact" and finding.contact is not None:
         return _contact(finding, system, log, rows)
-    if family in ("torque", "mechanics"):
-        return _panels(finding, log, rows, index, _torque(system, log, rows), "torque [N m]")
+    joints = [log.joint_names.index(name) for name in finding.joints][:JOINTS] or _largest(log)
     column = next((name for name in ("tau", "qdd", "qd", "q") if f"{name}." in finding.message), None)
-    if family == "values" and (column or finding.kind in ("torque-saturated", "torque-limit")):
-        return _panels(finding, log, rows, index, _column(column or "tau"), column or "tau")
-    if family == "kinematics" or finding.message.startswith("qd "):
-        return _panels(finding, log, rows, index, _rates, "qd")
-    if family == "clock":
-        return _panels(finding, log, rows, [0], _steps, "time step [s]")
-    if family == "noise":
-        return _panels(finding, log, rows, index, _acceleration, "qdd")
-    return _panels(finding, log, rows, index, _column("q"), "q")
+    whole = rows.stop - rows.start > 0.9 * len(log)
+    paint, quantity = _column(column or "q"), column or "q"
+    if family in ("torque", "mechanics"):
+        paint, quantity = _torque(system, log, rows), "tau"
+    elif finding.kind in ("torque-saturated", "torque-limit"):
+        paint, quantity = _column("tau"), "tau"
+    elif finding.kind == "acceleration-mismatch" or finding.message.startswith("qdd "):
+        paint, quantity = _rates("qd", "qdd"), "qdd"
+    elif family == "kinematics" or finding.message.startswith("qd "):
+        paint, quantity = _rates("q", "qd"), "qd"
+    elif finding.kind == "impact":
+        paint, quantity = _column("qd"), "qd"
+    elif family == "clock":
+        joints, paint, quantity = [0], _steps, "time step"
+    elif family == "noise":
+        paint, quantity = _acceleration, "qdd"
+    if whole and paint.__name__ == "rates":  # a whole log would hide how two curves differ
+        rows = slice(rows.start, rows.start + max(LEAST_ROWS, len(log) // 20))
+    return _panels(finding, system, log, rows, joints, paint, quantity)
 
 
 def _window(finding: Finding, log: Log) -> slice:
@@ -83,38 +101,50 @@ def _window(finding: Finding, log: Log) -> slice:
 def _largest(log: Log) -> list[int]:
     """The joints with the largest torques."""
     size = np.nan_to_num(np.nanmean(log.tau**2, axis=0))
-    return sorted(np.argsort(-size)[:JOINTS].tolist())
+    return sorted(np.argsort(-size)[:FEW].tolist())
 
 
-def _panels(finding: Finding, log: Log, rows: slice, joints: list[int], paint: Paint, label: str) -> Picture:
+def _panels(
+    finding: Finding,
+    system: ConstrainedSystem,
+    log: Log,
+    rows: slice,
+    joints: list[int],
+    paint: Paint,
+    quantity: str,
+) -> Picture:
     """One panel per joint, with the rows of the finding shaded."""
 
     def fill(figure: Figure) -> None:
         panels = figure.subplots(len(joints), 1, sharex=True, squeeze=False)[:, 0]
         for axes, j in zip(panels, joints, strict=True):
-            _shade(axes, finding, rows, len(log))
+            _shade(axes, finding, rows, log)
             paint(axes, log, rows, j)
-            axes.set_ylabel(label)
-            if label != "time step [s]":
+            kind = [system.robot.joint_types[j]]
+            axes.set_ylabel(f"{quantity} [{unit(quantity, kind) or 's'}]")
+            axes.margins(x=0.0)
+            if quantity != "time step":
                 axes.set_title(log.joint_names[j], loc="left")
-        panels[-1].set_xlabel("row")
+        panels[-1].set_xlabel(_axis(log)[1])
 
     names = ", ".join(log.joint_names[j] for j in joints)
-    alt = f"{label} of {names} in rows {rows.start} to {rows.stop - 1}: {finding.message}"
+    alt = f"{quantity} of {names} in rows {rows.start} to {rows.stop - 1}: {finding.message}"
     return draw(fill, (SIZE[0], 0.5 + SIZE[1] * len(joints)), alt)
 
 
-def _shade(axes: Axes, finding: Finding, rows: slice, n: int) -> None:
-    if finding.intervals == ((0, n),):
+def _shade(axes: Axes, finding: Finding, rows: slice, log: Log) -> None:
+    if finding.intervals == log.all_rows:
         return
+    x = _axis(log)[0]
     for a, b in finding.intervals:
         if a < rows.stop and b > rows.start:
-            axes.axvspan(a - 0.5, b - 0.5, color=COLOURS[finding.severity], alpha=0.18, linewidth=0)
+            ends = x[max(a, rows.start)], x[min(b, rows.stop) - 1]
+            axes.axvspan(*ends, color=COLOURS[finding.severity], alpha=0.18, linewidth=1.0)
 
 
-def _line(axes: Axes, rows: slice, y: Array, colour: str = INK, name: str | None = None) -> None:
-    """A curve over row numbers, thinned to what can be seen by the extremes of each bin."""
-    x = np.arange(rows.start, rows.start + len(y))
+def _line(axes: Axes, log: Log, rows: slice, y: Array, colour: str = INK, name: str | None = None) -> None:
+    """A curve over time, thinned to what can be seen by the extremes of each bin."""
+    x = _axis(log)[0][rows]
     if len(y) > POINTS:
         width = -(-len(y) // (POINTS // 2))
         whole = len(y) // width * width
@@ -125,25 +155,30 @@ def _line(axes: Axes, rows: slice, y: Array, colour: str = INK, name: str | None
 
 
 def _column(name: str) -> Paint:
-    return lambda axes, log, rows, j: _line(axes, rows, getattr(log, name)[rows, j])
+    return lambda axes, log, rows, j: _line(axes, log, rows, getattr(log, name)[rows, j])
 
 
 def _steps(axes: Axes, log: Log, rows: slice, j: int) -> None:
-    _line(axes, rows, np.diff(log.t[rows], prepend=np.nan))
+    _line(axes, log, rows, np.diff(log.t[rows], prepend=np.nan))
 
 
 def _acceleration(axes: Axes, log: Log, rows: slice, j: int) -> None:
     middle = (rows.start + rows.stop) // 2
     few = slice(max(rows.start, middle - LEAST_ROWS // 2), min(rows.stop, middle + LEAST_ROWS // 2))
-    _line(axes, few, log.qdd[few, j])
+    _line(axes, log, few, log.qdd[few, j])
 
 
-def _rates(axes: Axes, log: Log, rows: slice, j: int) -> None:
-    with np.errstate(all="ignore"):
-        rate = np.gradient(log.q[rows, j]) / np.gradient(log.t[rows])
-    _line(axes, rows, rate, OTHER, "rate of change of q")
-    _line(axes, rows, log.qd[rows, j], COLOURS["error"], "qd")
-    axes.legend(loc="upper right", ncols=2)
+def _rates(value: str, rate: str) -> Paint:
+    """A logged rate beside the rate of change of its value."""
+
+    def rates(axes: Axes, log: Log, rows: slice, j: int) -> None:
+        with np.errstate(all="ignore"):
+            change = np.gradient(getattr(log, value)[rows, j]) / np.gradient(log.t[rows])
+        _line(axes, log, rows, change, OTHER, f"rate of change of {value}")
+        _line(axes, log, rows, getattr(log, rate)[rows, j], COLOURS["error"], rate)
+        axes.legend(loc="upper right", ncols=2)
+
+    return rates
 
 
 def _torque(system: ConstrainedSystem, log: Log, rows: slice) -> Paint:
@@ -154,8 +189,8 @@ def _torque(system: ConstrainedSystem, log: Log, rows: slice) -> Paint:
         needed = (dynamics.inverse_dynamics(robot, q, qd, qdd) - dynamics.damping_force(robot, qd)).numpy()
 
     def paint(axes: Axes, log: Log, rows: slice, j: int) -> None:
-        _line(axes, rows, needed[:, j], OTHER, "robot file")
-        _line(axes, rows, log.tau[rows, j], COLOURS["error"], "logged")
+        _line(axes, log, rows, needed[:, j], OTHER, "robot file")
+        _line(axes, log, rows, log.tau[rows, j], COLOURS["error"], "logged")
         axes.legend(loc="upper right", ncols=2)
 
     return paint
@@ -168,14 +203,14 @@ def _contact(finding: Finding, system: ConstrainedSystem, log: Log, rows: slice)
 
     def fill(figure: Figure) -> None:
         axes = figure.subplots()
-        _shade(axes, finding, rows, len(log))
-        _line(axes, rows, 1e3 * c[rows], INK, "distance")
+        _shade(axes, finding, rows, log)
+        _line(axes, log, rows, 1e3 * c[rows], INK, "distance")
         if contact.name in log.contact:
             closed = np.where(log.contact[contact.name][rows], 1e3 * c[rows], np.nan)
-            _line(axes, rows, closed, COLOURS["warning"], "labelled closed")
+            _line(axes, log, rows, closed, COLOURS["warning"], "labelled closed")
         axes.axhline(0.0, color=OTHER, linewidth=0.6)
         axes.set_ylabel("distance [mm]")
-        axes.set_xlabel("row")
+        axes.set_xlabel(_axis(log)[1])
         axes.legend(loc="upper right", ncols=2)
 
     return draw(fill, (SIZE[0], 2.4), f"Distance of the tip from {contact.name}: {finding.message}")
@@ -193,7 +228,7 @@ def write_check(path: Path, title: str, report: Report, system: ConstrainedSyste
         }
         for finding in report.findings
     ]
-    overview = draw_overview(report) if report.findings else None
+    overview = draw_overview(report, log) if report.findings else None
     page = render("check.html.j2", title=title, report=report, sections=sections, overview=overview)
     write_text(path, page)
     return path

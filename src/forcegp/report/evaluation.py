@@ -14,7 +14,7 @@ from forcegp.files import write_text
 from forcegp.models.fit_result import Compared
 from forcegp.report.html import PictureBlock, Table, cell, render
 from forcegp.report.style import INK, Picture, colour, draw, label
-from forcegp.report.window import WindowData, draw_errors, draw_predictions
+from forcegp.report.window import WindowData, draw_errors, draw_forces, draw_predictions
 
 PAGE, WINDOW = "evaluation.html", "window.json"
 PLOTS = ("predictions.svg", "errors.svg", "calibration.svg")
@@ -56,7 +56,9 @@ def write_evaluation(
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
     pictures += [draw_calibration(scores)] if scores.uncertainty else []
-    for name, picture in zip(PLOTS, pictures, strict=False):
+    force = draw_forces(window) if window.forces else None
+    named = [*zip(PLOTS, pictures, strict=False), *([("forces.svg", force)] if force else [])]
+    for name, picture in named:
         write_text(folder / name, picture.svg)
     write_text(folder / WINDOW, window.to_json())
     # A folder that is called `model` adds nothing.
@@ -74,14 +76,16 @@ def write_evaluation(
             score_table(scores),
             *comparison_tables(comparison),
         ),
-        blocks=_blocks(window, pictures),
+        blocks=_blocks(window, pictures, force),
     )
     write_text(folder / PAGE, page)
     return folder / PAGE
 
 
-def _blocks(window: WindowData, pictures: list[Picture]) -> list[PictureBlock]:
-    blocks = [
+def _blocks(window: WindowData, pictures: list[Picture], force: Picture | None) -> list[PictureBlock]:
+    caption = "The normal force λ while the contact is closed, over the same seconds as below, with ±2σ."
+    blocks = [PictureBlock("Contact force", caption, (force,), WINDOW, wide=True)] if force else []
+    blocks += [
         PictureBlock(
             "Predictions and errors",
             f"The first {window.seconds:.2g} s. Predictions: accelerations by joint, measured in black, "

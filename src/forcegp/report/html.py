@@ -60,12 +60,13 @@ def cell(value: object, digits: int = 4) -> str:
 
 @dataclass(frozen=True)
 class PictureBlock:
-    """Pictures under one heading and caption; `source` is the file with their data."""
+    """Pictures under one heading and caption, as wide as the page if `wide`; `source` has their data."""
 
     heading: str
     caption: str
     pictures: tuple[Picture, ...]
     source: str
+    wide: bool = False
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:

@@ -21,7 +21,7 @@ def _animation(data: RolloutData) -> Markup:
     """The logged arm and the predicted ones in motion."""
     films = [
         {
-            "label": "simulated" if film.label == "logged" else label(film.label),
+            "label": film.label if film.label == "logged" else label(film.label),
             "colour": INK if film.label == "logged" else colour(film.label),
             "dash": [3.0 * length for length in DASHES.get(film.label, ())],
             "points": film.points,
@@ -29,7 +29,7 @@ def _animation(data: RolloutData) -> Markup:
         for film in data.films
     ]
     content = {"times": data.frame_times, "bodies": data.bodies, "films": films}
-    return animation(content, "The arm moving: simulated in black, predicted in colour")
+    return animation(content, "The arm moving: logged in black, predicted in colour")
 
 
 WIDTH = 4.6
@@ -43,7 +43,7 @@ def draw_tip(data: RolloutData) -> Picture:
         for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
             for path in data.models:
                 _curve(axes, data, path, path.tip[axis], path.tip_bands[axis] if path.tip_bands else None)
-            axes.plot(data.t, data.tip[axis], color=INK, linestyle=(0, (4, 1.5)), label="simulated")
+            axes.plot(data.t, data.tip[axis], color=INK, linestyle=(0, (4, 1.5)), label="logged")
             span = max(data.tip[axis]) - min(data.tip[axis])
             middle = 0.5 * (max(data.tip[axis]) + min(data.tip[axis]))
             axes.set_ylim(middle - max(span, 0.02), middle + max(span, 0.02))
@@ -52,7 +52,7 @@ def draw_tip(data: RolloutData) -> Picture:
         figure.axes[-1].set_xlabel("time [s]")
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
-    alt = f"Tip position over {data.band_seconds:.3g} s by axis, simulated, and predicted by each model."
+    alt = f"Tip position over {data.band_seconds:.3g} s by axis, logged, and predicted by each model."
     return draw(paint, (WIDTH, 5.0), alt, "Position of the tip")
 
 
@@ -98,7 +98,7 @@ def draw_contact_force(data: RolloutData) -> Picture:
         for path in paths:
             _curve(panels[0], data, path, path.multiplier, path.multiplier_band)
         if data.multiplier:
-            panels[0].plot(data.t, data.multiplier, color=INK, linestyle=(0, (4, 1.5)), label="simulated")
+            panels[0].plot(data.t, data.multiplier, color=INK, linestyle=(0, (4, 1.5)), label="logged")
             top = max(data.multiplier)
             panels[0].set_ylim(min(0.0, min(data.multiplier)) - 0.2 * top, 1.6 * top)
         panels[0].set_ylabel("multiplier λ [N]")
@@ -110,7 +110,7 @@ def draw_contact_force(data: RolloutData) -> Picture:
         panels[-1].set_xlim(0.0, data.band_seconds)
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
-    alt = "Multiplier along the predicted trajectories, with bands over samples, beside the simulated one."
+    alt = "Multiplier along the predicted trajectories, with bands over samples, beside the logged one."
     return draw(paint, (WIDTH, 3.8 if losing else 2.8), alt, "Contact force along the way")
 
 
@@ -146,7 +146,7 @@ def rollout_table(data: RolloutData) -> Table:
     caption = f"Tip error in open loop (median over {data.starts} starts)"
     if any(path.coverage is not None for path in data.models):
         caption += (
-            f"; share of simulated tip positions inside the {data.level:.0%} bands over function samples "
+            f"; share of logged tip positions inside the {data.level:.0%} bands over function samples "
             f"({data.band_starts} starts, {data.band_seconds:.3g} s), and inside the bands widened by the "
             "factor calibrated on held-out stretches of the training run"
         )
@@ -167,11 +167,14 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
     """The section on trajectories; `source` is the file with the data, beside the page."""
     band = f" with the band that holds {data.level:.0%} of the function samples"
     sampled = any(path.tip_bands for path in data.models)
+    why = (
+        " The curve follows the mean force. It may leave the band, as the motion is not linear in the force."
+    )
     caption = (
-        f"Open loop from a logged state under the logged torques, {data.t[-1]:.3g} s ahead: simulated in "
+        f"Open loop from a logged state under the logged torques, {data.t[-1]:.3g} s ahead: logged in "
         f"black, predicted in colour{band if sampled else ''}. Position and contact force are shown for the "
         f"first {data.band_seconds:.3g} s. Errors are medians over {data.starts} starts. A curve ends where "
-        "its prediction diverged."
+        f"its prediction diverged.{why if sampled else ''}"
     )
     block = PictureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
     return RolloutSection(block, rollout_table(data), _animation(data), animation_source())

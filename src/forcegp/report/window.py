@@ -5,25 +5,40 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.files import Header
+from forcegp.evaluation.predicted import logged_forces, predicted_forces
+from forcegp.files import Header, Record
 from forcegp.models.base import Predictor
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.report.html import Series, as_tensor, columns, series
 from forcegp.report.style import INK, Picture, colour, draw, label
 
-WIDTH, ROW, MARGIN = 4.1, 0.92, 0.75
-"""Size of a plot with one row per joint [inch]."""
+WIDTH, WIDE, ROW, MARGIN = 4.1, 12.0, 0.92, 0.75
+"""Widths of a plot by joint and of one across the page, height of a row and of the rest [inch]."""
+OUTSIDE, ROOM = 0.005, 0.25
+"""Share of the values on either side that axes may cut off, and room around the others as a share of them."""
 GREY = "#9a9a9a"
+
+
+class ForceWindow(Record):
+    """Normal force of a contact over the window [N]; `logged` and `std` may be unknown."""
+
+    contact: str
+    closed: list[bool]
+    mean: Series
+    std: Series | None
+    logged: Series | None
 
 
 class WindowData(Header):
     """Predictions of one model over a window of time, by joint [rad/s²]; `clean` and `std` may be unknown.
 
-    `noise_std` is that of the measured accelerations [rad/s²]; `t` is the time from the first sample [s].
+    `forces` has the contacts that are closed, of models of forces; `noise_std` is that of the measured
+    accelerations [rad/s²]; `t` is the time from the first sample [s].
     """
 
     FORMAT: ClassVar[str] = "forcegp-window"
@@ -37,6 +52,7 @@ class WindowData(Header):
     clean: list[Series] | None
     mean: list[Series]
     std: list[Series] | None
+    forces: tuple[ForceWindow, ...] = ()
 
     @property
     def error(self) -> Tensor:
@@ -75,7 +91,61 @@ def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
         clean=None if clean is None else columns(clean),
         mean=columns(predicted.mean),
         std=None if variance is None else columns(variance.sqrt()),
+        forces=_forces(model, data),
     )
+
+
+def _forces(model: Predictor, data: Dataset) -> tuple[ForceWindow, ...]:
+    names = model.system.contact_names
+    closed = data.active(names)
+    if model.force_field() is None or not bool(closed.any()):
+        return ()
+    (mean, std), logged = predicted_forces(model, data), logged_forces(model, data)
+    return tuple(
+        ForceWindow(
+            contact=name,
+            closed=closed[:, i].tolist(),
+            mean=series(mean[:, i]),
+            std=None if std is None else series(std[:, i]),
+            logged=series(logged[name]) if name in logged else None,
+        )
+        for i, name in enumerate(names)
+    )
+
+
+def draw_forces(window: WindowData) -> Picture:
+    """Predicted normal force of each contact while it is closed, with ±2σ, and the logged one."""
+
+    def paint(figure: Figure) -> None:
+        panels = figure.subplots(len(window.forces), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, force in zip(panels, window.forces, strict=True):
+            open_ = ~torch.tensor(force.closed)
+            mean = as_tensor(force.mean).masked_fill(open_, torch.nan)
+            if force.std is not None:
+                spread, style = 2.0 * as_tensor(force.std), {"color": colour(window.model), "alpha": 0.3}
+                axes.fill_between(window.t, mean - spread, mean + spread, linewidth=0, label="±2σ", **style)
+            axes.plot(window.t, mean, color=colour(window.model), label="predicted")
+            if force.logged is not None:
+                logged = as_tensor(force.logged)
+                axes.plot(window.t, logged, color=INK, linewidth=0.8, label="logged")
+                _robust_limits(axes, torch.stack([mean, logged]))
+            axes.set_ylabel(f"{force.contact} [N]")
+            axes.margins(x=0.0)
+        panels[-1].set_xlabel("time from the first sample [s]")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+
+    names = ", ".join(force.contact for force in window.forces)
+    alt = f"Normal force at {names} over {window.seconds:.3g} s: predicted with ±2σ, and logged where known."
+    return draw(paint, (WIDE, MARGIN + 1.6 * len(window.forces)), alt, "Contact force")
+
+
+def _robust_limits(axes: Axes, values: Tensor) -> None:
+    """Limits that hold all but the outermost `OUTSIDE` of the values, with some room around them."""
+    values = values[values.isfinite()]
+    if len(values):
+        low, high = values.quantile(torch.tensor([OUTSIDE, 1.0 - OUTSIDE], dtype=values.dtype)).tolist()
+        room = ROOM * (high - low) + 1e-9
+        axes.set_ylim(low - room, high + room)
 
 
 def draw_predictions(window: WindowData) -> Picture:
@@ -124,14 +194,15 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
         if relative and window.clean is not None:
             clean = as_tensor(window.clean[i]) - centre[i]
             axes.plot(window.t, clean, color=INK, linewidth=0.9, label="noise-free", zorder=5)
-        axes.set_ylabel(f"joint {i + 1}")
+        axes.set_title(window.joint_names[i], loc="right", fontsize="small", pad=2.0)
         axes.margins(x=0.0)
         axes.locator_params(axis="y", nbins=4)
         if limit is not None:
             axes.set_ylim(-limit, limit)
+        else:
+            _robust_limits(axes, torch.stack([measured[i], mean[i]]))
     rows[0].set_title(f"acceleration{' less prediction' if relative else ''} [rad/s²]", loc="left")
     rows[-1].set_xlabel("time from the first sample [s]")
-    figure.align_ylabels()
     handles, names = rows[0].get_legend_handles_labels()
     legend = figure.legend(handles, names, loc="outside upper center", ncols=len(names))
     for shown_line in legend.get_lines():

@@ -5,7 +5,7 @@
   force/motion control*, ICRA 2005): the residual ρ̇ = K (ṗ − u − ρ) with p = M q̇ is a low-pass filter of the
   external joint force, ρ → Jᵀ w, from which `wrench_of` gives w. Here u = Q − Q_C + ½ ∂(q̇ᵀM q̇)/∂q of the
   robot file, or of a robot and its friction that least squares has identified
-  (`evaluation/least_squares.py`).
+  (`forcegp.evaluation.least_squares`).
 """
 
 from __future__ import annotations

@@ -1,0 +1,144 @@
+"""What a user wants of a model: torque explained beyond gravity, motion in open loop, response to a torque.
+
+A torque error is that of the inverse dynamics, M(q)(predicted − measured q̈) with the mass matrix of the
+predictor's robot: the torque that it lacks for the measured acceleration. Of the torque beyond gravity, a
+predictor of forces explains R² = 1 − Σ (N M Δq̈)² / Σ (N (τ − τ_g))². Gravity and constant τ_g are those that
+fit the torques best, and N = 1 − A⁺A takes the constraint force out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp import dynamics
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
+from forcegp.evaluation.least_squares import data_chunks, free_directions
+from forcegp.identification import regressor
+from forcegp.models.analytical import AnalyticalModel
+from forcegp.models.base import FittedModel
+from forcegp.rollout.comparison import Comparison, compare
+from forcegp.rollout.forward import RolloutOptions
+
+HORIZONS = (0.1, 0.3, 1.0)
+"""Times at which motions in open loop are compared [s]."""
+STARTS, FEWEST_STARTS = 12, 3
+"""Starts of these motions, spread evenly over the data, at most and at least."""
+FAINT = 0.1
+"""A joint counts if its torque beyond gravity, or its motion, is this share of that of the largest."""
+RESPONSE_SAMPLES, FEWEST_FREE = 500, 20
+"""States at which a torque is added, at most and at least."""
+GRAVITY_SAMPLES, RIDGE = 4000, 1e-9
+"""Samples that gravity is fitted to, and the relative ridge that holds what they do not determine."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion in open loop from logged states under the logged torques.
+
+    Attributes:
+        horizons: times after the start [s].
+        starts: number of starts.
+        model, robot_file: root mean square error of the joint positions over that of their change since the
+            start, median over the joints that move; `None` once a motion diverged.
+    """
+
+    horizons: tuple[float, ...]
+    starts: int
+    model: tuple[float | None, ...]
+    robot_file: tuple[float | None, ...]
+
+
+@torch.no_grad()
+def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, float]:
+    """N (τ − τ_g) `(n, nq)`, and the share R² of the variance of the torques that gravity alone explains."""
+    scale, rows = data.tau.std(0).clamp(min=1e-9), []
+    for part in data_chunks(data):
+        still = torch.zeros_like(part.q)
+        Y = regressor(system.robot, part.q, still, still)
+        ones = torch.eye(data.nq, dtype=data.dtype).expand(len(part), -1, -1)
+        every = torch.cat([Y, ones, part.tau[..., None]], dim=-1)
+        rows.append(free_directions(system, part) @ every / scale[:, None])
+    W, y = (x := torch.cat(rows))[..., :-1], x[..., -1]
+    some = torch.linspace(0, len(y) - 1, min(len(y), GRAVITY_SAMPLES)).round().long().unique()
+    A = W[some].flatten(0, 1)
+    gram, least = A.mT @ A, RIDGE * A.square().sum() / A.shape[-1]
+    theta = torch.linalg.solve(gram + least * torch.eye(len(gram), dtype=A.dtype), A.mT @ y[some].flatten())
+    rest = y - W @ theta
+    whole = (y - y.mean(0)).square().sum().clamp(min=1e-300)
+    return rest * scale, float(1.0 - rest.square().sum() / whole)
+
+
+def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
+    """R² by joint of torque errors, given what gravity leaves, `(n, nq)` each; `None` if that is `FAINT`."""
+    left, whole = (error**2).sum(0), (rest**2).sum(0)
+    shares, seen = (1.0 - left / whole).tolist(), (whole > FAINT**2 * whole.max()).tolist()
+    return tuple(share if clear else None for share, clear in zip(shares, seen, strict=True))
+
+
+@torch.no_grad()
+def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | None:
+    """Share of an added torque that acts, by joint: 1 of a rigid robot, 0 of a model that cancels the torque.
+
+    Random torques of a tenth of the spread of those logged, which no controller chose, are added in free
+    motion; what acts is M(q) times the change of the predicted acceleration. `None` without free motion.
+    """
+    closed = data.active(model.system.contact_names)
+    free = (~closed.any(-1)).nonzero()[:, 0]
+    if len(free) < FEWEST_FREE:
+        return None
+    rows = free[torch.linspace(0, len(free) - 1, min(len(free), RESPONSE_SAMPLES)).round().long().unique()]
+    data, generator = data[rows], torch.Generator().manual_seed(0)
+    added = torch.randn(data.tau.shape, generator=generator, dtype=data.dtype) * (0.1 * data.tau.std(0))
+    before, after = (
+        model.predict(data.q, data.qd, tau, active=closed[rows], covariance=False).mean
+        for tau in (data.tau, data.tau + added)
+    )
+    M = dynamics.mass_matrix(model.system.robot, data.q)
+    acts = (M @ (after - before)[..., None])[..., 0]
+    return tuple(((acts * added).sum(0) / added.square().sum(0).clamp(min=1e-300)).tolist())
+
+
+@torch.no_grad()
+def open_loop(model: FittedModel, system: ConstrainedSystem, data: Dataset) -> Motion | None:
+    """The motion of a model of forces and that of the robot file; `None` where the data are too short."""
+    if model.force_field() is None or not data.header.ordered or len(data) < 2:
+        return None
+    dt = data.header.dt or float((data.t[1:] - data.t[:-1]).median())
+    closed = data.active(system.contact_names)
+    switches = torch.cat([torch.zeros(1), (closed[1:] != closed[:-1]).any(-1).double()]).cumsum(0)
+    for count in range(len(HORIZONS), 0, -1):
+        steps = round(HORIZONS[count - 1] / dt)
+        first = torch.arange(max(len(data) - steps, 0))
+        last = first + steps
+        even = ((data.t[last] - data.t[first]) - steps * dt).abs() < 0.5 * dt
+        even &= (data.segment[last] == data.segment[first]) & (switches[last] == switches[first])
+        first = first[even]
+        if steps > 0 and len(first) >= FEWEST_STARTS:
+            starts = first[torch.linspace(0, len(first) - 1, min(STARTS, len(first))).round().long().unique()]
+            models = {"model": model, "robot file": AnalyticalModel(system).nominal()}
+            options = RolloutOptions(on_divergence="keep")
+            found = compare(models, data, steps * dt, starts, system=system, options=options)
+            shares = (_shares(found, name, HORIZONS[:count]) for name in models)
+            return Motion(HORIZONS[:count], len(starts), *shares)
+    return None
+
+
+def _shares(found: Comparison, name: str, horizons: tuple[float, ...]) -> tuple[float | None, ...]:
+    """Error over change of the joint positions at each horizon."""
+    shares: list[float | None] = []
+    for horizon in horizons:
+        step = int((found.t - horizon).abs().argmin())
+        q = found.predicted[name].q
+        moved = (found.q[:, step] - found.q[:, 0]).square().mean(0).sqrt()
+        if q.shape[1] <= step or not bool(moved.max() > 0.0):
+            shares.append(None)
+            continue
+        error = (q[:, step] - found.q[:, step]).square().mean(0).sqrt()
+        share = float((error / moved)[moved > FAINT * moved.max()].median())
+        shares.append(share if math.isfinite(share) else None)
+    return tuple(shares)

@@ -1,0 +1,160 @@
+"""Estimates that a log does not determine are not given, and a log that is in order is not stopped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import forcegp
+from forcegp import dynamics
+from forcegp.checks import Log, Report, check, log_of
+from forcegp.checks.fit import TorqueFit
+from forcegp.checks.hypotheses import Hypothesis, plausible, unchanged
+from forcegp.checks.limits import check_saturation
+from forcegp.checks.values import check_stuck
+from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset, SavitzkyGolay
+from forcegp.logs import import_log, parse_mapping
+from forcegp.scene import load_scene
+from forcegp.simulate import simulate
+from logs import random_log
+from planted_faults import Case, free_log
+
+PENDULUM = ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+
+
+@pytest.fixture(scope="module")
+def wiping() -> Report:
+    """The report on a log of MuJoCo's solver whose joints have friction that the robot file lacks."""
+    scene = load_scene("ur5_wiping")
+    config = replace(scene.simulation, duration=20.0, dt=0.004, seed=0, lift_probability=0.2)
+    data = simulate(scene.system(), config).data
+    return check(scene.system(), data)
+
+
+def of_kind(report: Report, kind: str) -> list:
+    return [finding for finding in report.findings if finding.kind == kind]
+
+
+@pytest.mark.slow
+def test_friction_of_a_contact_is_not_that_of_the_joints(wiping: Report) -> None:
+    """It was 70 % where it is 30, as the friction of the joints passed for a force at the tip."""
+    (finding,) = of_kind(wiping, "contact-friction")
+    assert 0.25 < float(finding.evidence["friction_coefficient"]) < 0.35
+
+
+@pytest.mark.slow
+def test_friction_that_would_drive_a_joint_is_not_determined(wiping: Report) -> None:
+    """It was −12 N m s/rad at the shoulder, where 3 is right."""
+    (finding,) = of_kind(wiping, "friction-undeclared")
+    sizes = {name: float(x) for name, x in finding.evidence.items()}
+    assert "shoulder_lift_joint" in finding.joints and "not determined" in finding.message
+    assert "viscous shoulder_lift_joint" not in sizes and min(sizes.values()) > 0.0
+    assert 3.0 < sizes["coulomb shoulder_lift_joint"] < 6.0
+
+
+def torque_fit(theta: list[float], spread: list[float]) -> TorqueFit:
+    none = np.zeros((8, 2))
+    return TorqueFit(none, np.array(theta), np.array(spread), none, none, none, none)
+
+
+@pytest.mark.parametrize(
+    ("name", "theta", "spread", "possible"),
+    [
+        ("encoder-offset", [0.1], [0.01], True),
+        ("encoder-offset", [2.11], [0.40], False),  # 121° ± 23°
+        ("encoder-offset", [0.1], [0.2], False),
+        ("gravity", [0.0, 0.0, -33.1], [0.1, 0.1, 0.1], False),  # 42.9 m/s²
+        ("gravity", [0.0, 0.0, -1.5], [0.1, 0.1, 0.1], False),
+        ("gravity", [1.02, 0.0, 0.05], [0.1, 0.1, 0.1], True),  # a base tilted by 6°
+        ("gravity", [0.0, 0.0, 9.7], [0.1, 0.1, 0.1], True),  # a torque without gravity
+        ("gravity", [9.81, 0.0, 9.81], [0.1, 0.1, 0.1], True),
+        ("gains", [0.5], [0.7], False),
+        ("gains", [0.5], [0.1], True),
+    ],
+)
+def test_an_estimate_outside_physics_or_below_its_error_is_none(
+    name: str, theta: list[float], spread: list[float], possible: bool
+) -> None:
+    hypothesis = Hypothesis(name, len(theta), unchanged, joints=(0,))
+    assert plausible(PENDULUM, hypothesis, torque_fit(theta, spread)) is possible
+
+
+def test_a_joint_that_stands_has_no_stuck_acceleration(free: Case) -> None:
+    """The acceleration of a joint at rest is one value, however the rest of the arm moves."""
+    system, log = free
+    columns = {name: getattr(log, name).copy() for name in ("q", "qd", "qdd")}
+    rest = slice(len(log) // 3, 2 * len(log) // 3)
+    columns["q"][rest, 2] = columns["q"][rest.start, 2]
+    columns["qd"][rest, 2] = columns["qdd"][rest, 2] = 0.0
+    findings, _ = check_stuck(system, log.replace(**columns))
+    assert [f.message for f in findings if "qdd" in f.message] == []
+    columns["q"], columns["qd"] = log.q, log.qd  # the joint moves, and its acceleration does not
+    findings, _ = check_stuck(system, log.replace(**columns))
+    assert [f.kind for f in findings] == ["channel-stuck"]
+
+
+def test_broad_peaks_of_a_torque_are_no_limit() -> None:
+    """One long pose with an extreme torque, and short visits near it, are no drive that saturates."""
+    t = 1e-3 * np.arange(3000)
+    peaks = ((0.6, 0.3, 1.0), (1.6, 0.006, 0.985), (2.4, 0.006, 0.99))
+    bumps = sum(h * np.exp(-(((t - at) / width) ** 6)) for at, width, h in peaks)
+    tau = np.where(
+        bumps > 0.5, 4.0 * bumps, np.sin(40.0 * t) + np.sin(23.0 * t)
+    ) + 0.01 * np.random.default_rng(0).standard_normal(len(t))
+    qd = np.sin(7.0 * t + 0.3)
+    log = log_of(random_log(len(t), joints=PENDULUM.robot.joint_names))
+    log = log.replace(t=t, tau=np.column_stack([tau, 2.0 * np.sin(t)]), qd=np.column_stack([qd, qd]))
+    assert check_saturation(PENDULUM, log)[0] == []
+
+
+def fast_log(path: Path, window: int, order: int) -> Log:
+    """A fast motion whose accelerations a filter computed, read back from its file."""
+    robot = PENDULUM.robot
+    t = 0.004 * torch.arange(3000, dtype=torch.float64)
+    rate = torch.tensor([9.0, 11.0], dtype=torch.float64)
+    q, qd = torch.sin(t[:, None] * rate), rate * torch.cos(t[:, None] * rate)
+    tau = dynamics.inverse_dynamics(robot, q, qd, -(rate**2) * q)
+    table = {
+        f"{n}.{j}": x[:, i]
+        for n, x in (("q", q), ("qd", qd), ("tau", tau))
+        for i, j in enumerate(robot.joint_names)
+    }
+    lines = [",".join(["t", *table])]
+    lines += [",".join(f"{float(x):.9g}" for x in row) for row in zip(t, *table.values(), strict=True)]
+    path.write_text("\n".join(lines))
+    return log_of(Dataset.read(path, differentiate=SavitzkyGolay(window, order)))
+
+
+def test_an_acceleration_that_was_computed_here_is_no_reason_to_stop(tmp_path: Path) -> None:
+    report = check(PENDULUM, fast_log(tmp_path / "log.csv", 121, 2))
+    assert report.usable and [f.remedy for f in of_kind(report, "filter-wide")] == [
+        "import with a narrower window"
+    ]
+    report = check(PENDULUM, fast_log(tmp_path / "log.csv", 11, 3))
+    assert not of_kind(report, "filter-wide") and report.usable
+
+
+def test_what_an_import_doubted_is_not_forgotten(tmp_path: Path) -> None:
+    """CHECK lines that the user left in the mapping, and what the import found, travel with the log."""
+    log = free_log(PENDULUM.robot, seconds=4.0)
+    names = [f"{name}.{joint}" for name in ("q", "qd", "tau") for joint in log.joint_names]
+    table = np.column_stack([log.t, log.q, log.qd, log.tau])
+    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header=",".join(["t", *names]), comments="")
+    shoulder, elbow = log.joint_names
+    mapping = f"""
+time = {{ column = "t" }}
+position = {{ columns = {{ {shoulder} = "q.{shoulder}", {elbow} = "q.{elbow}" }}, unit = "rad" }}
+# CHECK: a current: give the gear ratio
+torque = {{ columns = {{ {shoulder} = "tau.{shoulder}", {elbow} = "tau.{elbow}" }}, unit = "Nm" }}
+"""
+    imported = import_log(tmp_path / "run.csv", PENDULUM, parse_mapping(mapping.encode(), "mapping"))
+    imported.data.write(tmp_path / "log.parquet")
+    data = Dataset.read(tmp_path / "log.parquet")
+    assert data.header.derived == ("qd", "qdd")
+    (finding,) = of_kind(check(PENDULUM, data), "import-doubt")
+    assert finding.message == "a current: give the gear ratio" and finding.severity == "warning"

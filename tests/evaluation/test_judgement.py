@@ -1,0 +1,101 @@
+"""The verdict: torque beyond gravity, motion in open loop, force in contact; reasons to doubt the numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import forcegp
+from forcegp import dynamics, evaluate, kinematics
+from forcegp.data import DataHeader, Dataset
+from forcegp.evaluation.judgement import beyond_gravity, explained, torque_response
+from forcegp.evaluation.predicted import logged_forces
+from random_data import random_data, table_system
+
+ROBOT = forcegp.load_robot("double_pendulum")
+FREE = forcegp.ConstrainedSystem(ROBOT)
+
+
+def swinging(robot: forcegp.RobotModel = ROBOT, rate: float = 3.0, seconds: float = 8.0) -> Dataset:
+    """Free motion of the double pendulum with the torque that a robot needs for it."""
+    t = 0.005 * torch.arange(round(seconds / 0.005), dtype=torch.float64)
+    w = rate * torch.tensor([1.0, 1.4], dtype=torch.float64)
+    q = torch.sin(t[:, None] * w) + 0.3 * torch.sin(2.3 * t[:, None] * w)
+    qd = w * torch.cos(t[:, None] * w) + 0.69 * w * torch.cos(2.3 * t[:, None] * w)
+    qdd = -(w**2) * (torch.sin(t[:, None] * w) + 0.3 * 2.3**2 * torch.sin(2.3 * t[:, None] * w))
+    tau = dynamics.inverse_dynamics(robot, q, qd, qdd) - dynamics.damping_force(robot, qd)
+    header = DataHeader(dt=0.005, joint_names=robot.joint_names)
+    return Dataset(
+        t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names, contact={}, header=header
+    )
+
+
+def heavy(factor: float) -> forcegp.RobotModel:
+    return ROBOT.replace(mass=factor * ROBOT.mass, inertia=factor * ROBOT.inertia)
+
+
+def test_the_right_robot_explains_all_the_torque_and_the_motion() -> None:
+    found = evaluate(forcegp.AnalyticalModel(FREE).nominal(), swinging())
+    assert found.verdict.startswith("The model explains 100 % of the torque beyond gravity")
+    assert found.motion is not None and max(x or 0.0 for x in found.motion.model) < 0.05
+    assert found.response == pytest.approx((1.0, 1.0), abs=1e-9) and found.doubts == ()
+
+
+def test_a_robot_that_is_too_heavy_is_measured_by_its_own_mass_matrix() -> None:
+    """The torque that it lacks is that of its own inverse dynamics, whatever robot the others have."""
+    data, system = swinging(), forcegp.ConstrainedSystem(heavy(2.0))
+    found = evaluate(forcegp.AnalyticalModel(system).nominal(), data, system=FREE)
+    needed = dynamics.inverse_dynamics(system.robot, data.q, data.qd, data.qdd)
+    lacks = needed - dynamics.damping_force(system.robot, data.qd) - data.tau
+    model = found.predictors[0]
+    assert model.torque.all == pytest.approx(lacks.square().mean(0).sqrt().tolist(), rel=1e-6)
+    rest, _ = beyond_gravity(FREE, data)
+    assert model.explained == pytest.approx(explained(lacks, rest), rel=1e-6)
+
+
+def test_a_log_whose_torque_is_gravity_is_named() -> None:
+    assert evaluate(forcegp.AnalyticalModel(FREE).nominal(), swinging(rate=3.0)).gravity < 0.95  # type: ignore[operator]
+    slow = evaluate(forcegp.AnalyticalModel(FREE).nominal(), swinging(rate=0.1, seconds=40.0))
+    assert slow.gravity is not None and slow.gravity > 0.99
+    (doubt,) = slow.doubts
+    assert "Gravity alone explains" in doubt and "hardly test anything else" in doubt
+
+
+def test_a_model_that_has_learned_the_controller_is_named() -> None:
+    """A network that has seen one motion answers no torque that the controller did not choose."""
+    data = swinging()
+    fit = forcegp.NeuralNetwork(FREE).fit(data[::8])
+    found = evaluate(fit, data)
+    assert found.response == torque_response(fit, data) and found.response is not None
+    weak = min(found.response) < 0.5
+    assert weak == any("learned the controller" in doubt for doubt in found.doubts)
+    assert found.predictors[0].explained == () and "explains" not in found.verdict
+    cancelled = replace(found, response=(0.02, 0.97))
+    assert "shoulder 0.02 of 1" in cancelled.doubts[-1] and "elbow" not in cancelled.doubts[-1]
+
+
+def test_a_joint_that_bears_next_to_nothing_does_not_count() -> None:
+    rest = torch.tensor([[10.0, 0.1]] * 4, dtype=torch.float64)
+    assert explained(torch.ones_like(rest), rest) == pytest.approx((0.99, None))
+
+
+def test_the_force_in_contact_is_in_the_verdict() -> None:
+    """Against a logged multiplier, and against the normal force of a sensor where there is none."""
+    system = table_system()
+    data, contact = random_data(system, 200), system.contacts[0]
+    assert isinstance(contact, forcegp.SurfaceContact)
+    model = forcegp.AnalyticalModel(system).nominal()
+    force = model.predict(data.q, data.qd, data.tau, "multiplier", active=data.active(["table"])).mean[:, 0]
+    logged = data.replace(contact_extras={"multiplier": {"table": force + 1.0}})
+    (score,) = evaluate(model, logged).multipliers
+    assert score.bias == pytest.approx(-1.0)
+    assert evaluate(model, logged).verdict.endswith(
+        f"the force at 'table' is off by 1 N of {score.level:.3g} N."
+    )
+    point = kinematics.point_position(system.robot, data.q, contact.frame, tuple(contact.point))
+    F = (force + 2.0)[:, None] * contact.surface.gradient(point)
+    sensed = data.replace(contact_extras={"F_sensor": {"table": F}})
+    torch.testing.assert_close(logged_forces(model, sensed)["table"], force + 2.0)
+    assert evaluate(model, sensed).multipliers[0].bias == pytest.approx(-2.0)
