@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -48,7 +49,8 @@ class CompiledFit(Predictor):
         self._many = self.library.forcegp_predict_many
         self._many.argtypes = [ctypes.c_long, *[ctypes.c_void_p] * 4, ctypes.c_uint, ctypes.c_int]
         self._many.argtypes += [ctypes.c_void_p] * 3
-        self._sizes = [self.library.forcegp_size(1 << bit) for bit in range(len(READ))]
+        self._sizes = {name: self.library.forcegp_size(1 << bit) for bit, name in enumerate(READ)}
+        self._known: dict[str | tuple[str, ...], _Rows] = {}
 
     def save(self, path: str | Path) -> None:
         """A compiled fit has no file of its own.
@@ -95,42 +97,65 @@ class CompiledFit(Predictor):
         """
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use the predict of the fit")
-        names = [quantity] if isinstance(quantity, str) else list(quantity)
+        read = self._read(quantity if isinstance(quantity, str) else tuple(quantity))
+        arrays, batch, nq = self._states(q, qd, tau, active), q.shape[:-1], self.system.robot.nq
+        if arrays is None:
+            flat = flat_states(self.system, q, qd, tau, active)
+            arrays, batch = [x.contiguous() for x in (flat.q, flat.qd, flat.tau, flat.active)], flat.batch
+        mean, beyond = q.new_empty((*batch, read.size)), q.new_empty((*batch, nq))
+        spread = q.new_empty((*batch, read.size, read.size)) if covariance else None
+        pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
+        status = self._many(batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
+        if status:
+            flat_states(self.system, q, qd, tau, active)  # says which state is not finite
+            raise (ModelError if status == JAMMED else NumericalError)(MESSAGES[status])
+        if read.order is not None:
+            mean = mean[..., read.order]
+            spread = None if spread is None else spread[..., read.order, :][..., read.order]
+        joints = self.system.robot.joint_names
+        return Prediction(mean, spread, read.parts, beyond if LOW in self.model.tensors else None, joints)
+
+    def _states(self, *states: Tensor | None) -> list[Tensor | None] | None:
+        """States of one shape as they are, or `None` where they are to be broadcast or checked one by one."""
+        *given, active = states
+        fits = (
+            active is None
+            and all(
+                isinstance(x, Tensor)
+                and x.dtype == torch.float64
+                and x.device.type == "cpu"
+                and x.shape == given[0].shape  # pyright: ignore[reportOptionalMemberAccess]
+                and x.shape[-1:] == (self.system.robot.nq,)
+                and x.is_contiguous()
+                for x in given
+            )
+        )
+        return [*given, None] if fits else None
+
+    def _read(self, quantity: str | tuple[str, ...]) -> _Rows:
+        """The rows of quantities as they are asked for, and where the C code puts them."""
+        if quantity in self._known:
+            return self._known[quantity]
+        names = [quantity] if isinstance(quantity, str) else list(dict.fromkeys(quantity))
         if not names:
             raise ModelError("no quantity is named", expected="one of " + ", ".join(READ))
         for name in names:
             check_name("quantity", name, READ)
-        flat = flat_states(self.system, q, qd, tau, active)
-        bits = sorted({READ.index(name) for name in names})
-        n, d, nq = len(flat.q), sum(self._sizes[bit] for bit in bits), self.system.robot.nq
-        mean, beyond = torch.empty(n, d, dtype=torch.float64), torch.empty(n, nq, dtype=torch.float64)
-        spread = torch.empty(n, d, d, dtype=torch.float64) if covariance else None
-        arrays = [x.detach().contiguous() for x in (flat.q, flat.qd, flat.tau, flat.active)]
-        pointers = [x.data_ptr() for x in arrays]
-        out = (mean.data_ptr(), None if spread is None else spread.data_ptr(), beyond.data_ptr())
-        status = self._many(n, *pointers, sum(1 << bit for bit in bits), int(noise), *out)
-        if status:
-            raise (ModelError if status == JAMMED else NumericalError)(MESSAGES[status])
-        parts, order = self._parts(names, bits)
-        if order != list(range(d)):
-            mean = mean[:, order]
-            spread = None if spread is None else spread[:, order][:, :, order]
-        return Prediction(
-            mean.reshape(*flat.batch, d),
-            None if spread is None else spread.reshape(*flat.batch, d, d),
-            parts,
-            beyond.reshape(*flat.batch, nq) if LOW in self.model.tensors else None,
-            self.system.robot.joint_names,
-        )
+        parts, starts, order = {}, {}, []
+        for name in sorted(names, key=READ.index):
+            starts[name] = sum(self._sizes[other] for other in starts)
+        for name in names:
+            parts[name] = slice(len(order), len(order) + self._sizes[name])
+            order += range(starts[name], starts[name] + self._sizes[name])
+        bits, as_is = sum(1 << READ.index(name) for name in names), order == list(range(len(order)))
+        self._known[quantity] = _Rows(bits, len(order), parts, None if as_is else order)
+        return self._known[quantity]
 
-    def _parts(self, names: Sequence[str], bits: Sequence[int]) -> tuple[dict[str, slice], list[int]]:
-        """The rows of each quantity as they are asked for, and where the C code puts them."""
-        starts, first = {}, 0
-        for bit in bits:
-            starts[READ[bit]], first = first, first + self._sizes[bit]
-        parts, order = {}, []
-        for name in dict.fromkeys(names):
-            size = self._sizes[READ.index(name)]
-            parts[name] = slice(len(order), len(order) + size)
-            order += range(starts[name], starts[name] + size)
-        return parts, order
+
+class _Rows(NamedTuple):
+    """Bits and number of components of quantities, the slice of each, and their order if C has another."""
+
+    bits: int
+    size: int
+    parts: dict[str, slice]
+    order: list[int] | None

@@ -119,6 +119,8 @@ class ExportedModel:
         Raises:
             ModelError: a prior, kernel, contact or mean has none, or the posterior is too large; names it.
         """
+        if self.system.robot.device.type != "cpu":
+            raise ModelError("a fit on a GPU is not exported", hint="save it, and load it on the CPU")
         for contact in self.system.contacts:
             if not isinstance(contact, SurfaceContact) or contact.stick_speed is not None:
                 raise _no_c("contact", contact.name, contact, "a SurfaceContact that always slides")
