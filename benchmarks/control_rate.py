@@ -34,7 +34,7 @@ from forcegp.models.prediction import Predictor
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import SimulationConfig, simulate
 
-POINTS, STATES, ROUNDS = 66, 256, 15
+POINTS, STATES, ROUNDS = 78, 256, 15
 LEVELS = {"-O3": ["-O3", "-march=native", "-ffp-contract=fast"], "-O2": ["-O2"]}
 BOUNDS = {  # µs, at -O3
     "friction mean": 8.0,

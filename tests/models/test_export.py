@@ -230,6 +230,12 @@ def test_batches_and_single_states() -> None:
         *(x.reshape(4, 6, 7) for x in state), ["multiplier", "qdd"], active=active.reshape(4, 6, 2)
     )
     assert torch.equal(grid.mean.flatten(0, 1), flat.mean) and grid.covariance is not None
+    turned = fast.predict(*(x.mT.contiguous().mT for x in state), ["multiplier", "qdd"], active=active)
+    assert torch.equal(turned.mean, flat.mean)
+    rest = fast.predict(state[0], 0.0 * state[1][0], state[2], active=active)
+    torch.testing.assert_close(rest.mean, fit.predict(state[0], 0.0 * state[1], state[2], active=active).mean)
+    closed = fast.predict(*state).mean
+    assert torch.equal(closed, fast.predict(*state, active=torch.ones(2, dtype=torch.bool)).mean)
     one = fast.predict(*(x[3] for x in state), ["multiplier", "qdd"], active=active[3])
     assert torch.equal(one.mean, flat.mean[3]) and one.mean.shape == (9,)
     assert fast.predict(*(x[:0] for x in state)).mean.shape == (0, 7)
@@ -372,6 +378,18 @@ def test_a_prior_without_a_c_form_is_named(priors: list, named: str, tmp_path: P
     assert not (tmp_path / "c").exists()
 
 
+def test_two_priors_on_the_inertia_are_refused() -> None:
+    robot = forcegp.load_robot("kuka_iiwa")
+    model = forcegp.StructuredGP(
+        forcegp.ConstrainedSystem(robot),
+        "analytical",
+        [InertialPrior(), InertialPrior(name="second")],
+        noise=0.1,
+    )
+    with pytest.raises(ModelError, match="two priors on the inertia"):
+        model.fit(free_log(robot, 12), learn=[]).compiled()
+
+
 @pytest.mark.parametrize("kind", ["implicit", "sticking", "connection"])
 def test_a_contact_without_a_c_form_is_named(kind: str) -> None:
     robot, tool = forcegp.load_robot("kuka_iiwa"), ("tool", "lbr_iiwa_link_7", (0, 0, 0.1))
@@ -405,6 +423,10 @@ def test_what_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     (q, qd, tau), _ = states(fit)
     with pytest.raises(ShapeError, match="qd holds values that are not finite"):
         fast.predict(q, qd * float("nan"), tau)
+    with pytest.raises(ShapeError, match="qd holds values that are not finite"):
+        fast.predict(q, qd * float("nan"), tau, active=mixed_contacts(len(q))[:, :1])
+    with pytest.raises(ShapeError, match="q is not in the precision"):
+        fast.predict(q.float(), qd.float(), tau.float())
     with pytest.raises(UnknownNameError, match="unknown quantity 'force'"):
         fast.predict(q, qd, tau, "force")
     with pytest.raises(ModelError, match="its own system"):

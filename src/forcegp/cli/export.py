@@ -24,12 +24,9 @@ def export(
 ) -> None:
     """Write a structured Gaussian process as C99 that needs libm alone, for a control loop.
 
-    One .h and one .c file: state and closed contacts to accelerations, multipliers and forces, each with
-    mean and covariance. Beside them a test program with reference values, CMakeLists.txt and a README.
+    Beside one .h and one .c file: a test program with reference values, CMakeLists.txt and a README.
 
-    [bold]Examples[/bold]
-
-    forcegp export --model model --to c --out controller/
+    [bold]Example[/bold]
 
     forcegp export -m model --functions 100 --name arm -o controller/
     """

@@ -195,23 +195,15 @@ class StructuredFit(FittedModel):
         return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
 
     def _exported(self, functions: int | None) -> ExportedModel:
-        return ExportedModel(
-            self.system,
-            self.posterior,
-            self.hyperparameters,
-            self.noise,
-            self.torque_std,
-            self.problem.external_std,
-            functions,
-        )
+        parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
+        return ExportedModel(*parts, self.problem.external_std, functions)
 
     def export(
         self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None
     ) -> Export:
         """Write the fit as C99 that needs libm alone, with a test program, `CMakeLists.txt` and a README.
 
-        The code maps (q, q̇, τ, which contacts are closed) to the mean of every quantity, its covariance and
-        how far the state is from the training data. It does not allocate, and has no state of its own.
+        The code maps (q, q̇, τ, closed contacts) to mean and covariance of every quantity.
 
         Args:
             path: folder, which is made.
@@ -226,20 +218,14 @@ class StructuredFit(FittedModel):
             ModelError: a prior, kernel or contact has no C form, or the posterior is too large; names it.
             UnknownNameError, ParameterError: no such language, or a name that is no C identifier.
             DestinationError: the folder cannot be written, or holds other files.
-
-        Example:
-            `fit.export("controller/")`
         """
         return write_export(self._exported(functions), self, self.training, path, language, name)
 
     def compiled(self, *, functions: int | None = None) -> CompiledFit:
-        """The fit as a predictor of microseconds, by C code that the machine's compiler builds once.
+        """The fit as a fast predictor, by C code that the machine's compiler builds once.
 
         Args:
             functions: number r that the covariance is reduced to, which only widens it; `None` for all.
-
-        Returns:
-            A predictor with the numbers of `predict`; `fit.compiled().predict(q, qd, tau)`.
 
         Raises:
             ModelError: a prior, kernel or contact has no C form, or the posterior is too large.

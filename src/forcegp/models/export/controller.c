@@ -39,7 +39,7 @@ typedef struct {
   double M_inv[NQ][NQ], H[NQ][NQ];             /* H = M^-1 - L A M^-1, from force to acceleration */
   double L[NQ][SOME(ROWS)];                    /* L = M^-1 A^T (A M^-1 A^T)^+ */
   double S[SOME(ROWS)][SOME(ROWS)];            /* (A M^-1 A^T)^+ */
-  double free[NQ], qdd[NQ], load[SOME(ROWS)];  /* of the analytical forces: M^-1 Q, qdd and lambda */
+  double qdd[NQ], load[SOME(ROWS)];            /* qdd and lambda of the analytical forces */
   int closed[SOME(CONTACTS)];
   touching contact[SOME(CONTACTS)];
 } equations;
@@ -472,7 +472,7 @@ static void squares(const double *restrict x, const double *restrict Z, int widt
 }
 
 /* exp(-r^2/2) */
-static void squared_exponential(double *restrict u, int m) {
+static void squaredexponential(double *restrict u, int m) {
   for (int j = 0; j < m; ++j) u[j] = exp(-0.5 * fmin(u[j], 600.0));
 }
 

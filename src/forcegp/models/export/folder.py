@@ -57,10 +57,8 @@ def write_export(
     check_destination(path, folder=True, own_files=own)
     header, source = c_source(model, name)
     result = Export(Path(path), model.parts()[0].rank, *loss_of(model, fit, training))
-    loss = (
-        "It is reduced; at training states σ of q̈ and λ is wider by a fraction\n"
-        f"of {result.widest:.2g} at most, {result.wider:.2g} in the median. The mean loses nothing."
-    )
+    loss = "It is reduced: at training states σ of q̈ and λ is wider by a fraction\n"
+    loss += f"of {result.widest:.2g} at most, {result.wider:.2g} in the median. The mean loses nothing."
     fields = {
         "name": name,
         "NAME": name.upper(),

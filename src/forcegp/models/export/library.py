@@ -58,9 +58,7 @@ class CompiledFit(Predictor):
         Raises:
             ModelError: always.
         """
-        raise ModelError(
-            "a compiled fit cannot be saved", hint="save the fit, or export it: fit.export(path)"
-        )
+        raise ModelError("a compiled fit cannot be saved", hint="save the fit, or call fit.export(path)")
 
     def force_field(self) -> ForceField:
         """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states, in PyTorch."""
@@ -80,28 +78,21 @@ class CompiledFit(Predictor):
     ) -> Prediction:
         """Posterior mean and covariance of a quantity, as `StructuredFit.predict` gives them.
 
-        Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: a name of `QUANTITIES`, or several for their joint distribution; or `"joint_friction"`,
-                the friction of the joints, that of the robot file included [N m, N].
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            covariance: whether to compute the covariance.
-            system: the system of the fit; the code has no other.
-            noise: whether the covariance is that of a measurement, noise of torque and sensor included.
+        Arguments and errors are those of that method. `quantity` may also be `"joint_friction"`, the friction
+        of the joints, that of the robot file included [N m, N].
 
         Raises:
-            UnknownNameError: no such quantity.
-            ShapeError: a state or `active` does not fit the system, or is not finite.
-            ModelError: another system, or friction with which a contact jams.
-            NumericalError: a variance is rounding.
+            ModelError: another `system` than that of the fit, or friction with which a contact jams.
         """
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use the predict of the fit")
         read = self._read(quantity if isinstance(quantity, str) else tuple(quantity))
-        arrays, batch, nq = self._states(q, qd, tau, active), q.shape[:-1], self.system.robot.nq
-        if arrays is None:
-            flat = flat_states(self.system, q, qd, tau, active)
-            arrays, batch = [x.contiguous() for x in (flat.q, flat.qd, flat.tau, flat.active)], flat.batch
+        nq = self.system.robot.nq
+        if active is None and self._plain(q, qd, tau):
+            arrays, batch = (q, qd, tau, None), q.shape[:-1]
+        else:
+            *given, batch = flat_states(self.system, q, qd, tau, active)
+            arrays = tuple(x.contiguous() for x in given)
         mean, beyond = q.new_empty((*batch, read.size)), q.new_empty((*batch, nq))
         spread = q.new_empty((*batch, read.size, read.size)) if covariance else None
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
@@ -115,22 +106,15 @@ class CompiledFit(Predictor):
         joints = self.system.robot.joint_names
         return Prediction(mean, spread, read.parts, beyond if LOW in self.model.tensors else None, joints)
 
-    def _states(self, *states: Tensor | None) -> list[Tensor | None] | None:
-        """States of one shape as they are, or `None` where they are to be broadcast or checked one by one."""
-        *given, active = states
-        fits = (
-            active is None
-            and all(
-                isinstance(x, Tensor)
-                and x.dtype == torch.float64
-                and x.device.type == "cpu"
-                and x.shape == given[0].shape  # pyright: ignore[reportOptionalMemberAccess]
-                and x.shape[-1:] == (self.system.robot.nq,)
-                and x.is_contiguous()
-                for x in given
-            )
+    def _plain(self, *states: Tensor) -> bool:
+        """Whether states can be read where they are."""
+        q, known = states[0], all(isinstance(x, Tensor) for x in states)
+        kinds = {(x.shape, x.dtype, x.device.type, x.is_contiguous()) for x in states if known}
+        return (
+            known
+            and kinds == {(q.shape, torch.float64, "cpu", True)}
+            and q.shape[-1:] == (self.system.robot.nq,)
         )
-        return [*given, None] if fits else None
 
     def _read(self, quantity: str | tuple[str, ...]) -> _Rows:
         """The rows of quantities as they are asked for, and where the C code puts them."""

@@ -20,34 +20,17 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.errors import ModelError
 from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors import contact, joint
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import (
-    ContactForcePrior,
-    CoulombErrorPrior,
-    NormalForcePrior,
-    SlidingFrictionPrior,
-)
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import (
-    AnalyticalMean,
-    JointForcePrior,
-    JointFrictionPrior,
-)
 from forcegp.gp.basis import KernelPart, split
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Features, points
 from forcegp.gp.kernels import Constant, Kernel, Linear, Matern32, Matern52, SquaredExponential, Sum, sub
 from forcegp.gp.sparse import SparsePosterior
 
-PRIORS = (
-    JointForcePrior,
-    JointFrictionPrior,
-    NormalForcePrior,
-    SlidingFrictionPrior,
-    ContactForcePrior,
-    CoulombErrorPrior,
-    InertialPrior,
-)
+PRIORS = (joint.JointForcePrior, joint.JointFrictionPrior, InertialPrior, contact.NormalForcePrior)
+PRIORS += (contact.SlidingFrictionPrior, contact.ContactForcePrior, contact.CoulombErrorPrior)
 KERNELS = (Linear, Constant, SquaredExponential, Matern32, Matern52)
 LARGEST = 1700
 """Functions of a posterior that is not reduced; some 30 MB of text, which takes a compiler half a minute."""
@@ -121,17 +104,19 @@ class ExportedModel:
         """
         if self.system.robot.device.type != "cpu":
             raise ModelError("a fit on a GPU is not exported", hint="save it, and load it on the CPU")
-        for contact in self.system.contacts:
-            if not isinstance(contact, SurfaceContact) or contact.stick_speed is not None:
-                raise _no_c("contact", contact.name, contact, "a SurfaceContact that always slides")
-            if type(contact.surface) not in (Plane, Sphere, Cylinder):
-                raise _no_c("surface of contact", contact.name, contact.surface, "plane, sphere or cylinder")
-        if not isinstance(self.posterior.process.mean, AnalyticalMean):
+        for each in self.system.contacts:
+            if not isinstance(each, SurfaceContact) or each.stick_speed is not None:
+                raise _no_c("contact", each.name, each, "a SurfaceContact that always slides")
+            if type(each.surface) not in (Plane, Sphere, Cylinder):
+                raise _no_c("surface of contact", each.name, each.surface, "plane, sphere or cylinder")
+        if not isinstance(self.posterior.process.mean, joint.AnalyticalMean):
             raise _no_c("mean", "Q", self.posterior.process.mean, "an AnalyticalMean")
         for prior in self.posterior.priors:
             if type(prior) not in PRIORS:
                 raise _no_c("force prior", prior.name, prior, ", ".join(x.__name__ for x in PRIORS))
             _check_kernel(prior.name, prior.kernel)
+        if sum(isinstance(prior, InertialPrior) for prior in self.posterior.priors) > 1:
+            raise ModelError("a fit with two priors on the inertia is not exported", expected="one at most")
         if self.functions is not None and self.functions < 1:
             raise ModelError(
                 "a posterior has one function at least", expected="1 or more", got=self.functions

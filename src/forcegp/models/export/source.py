@@ -22,37 +22,17 @@ from forcegp.constraints.gauss import rank_tolerance
 from forcegp.forces.noise import GROWTH, HIGH, LOW, SPREAD, STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, ForcePrior
-from forcegp.forces.priors.contact import (
-    ContactForcePrior,
-    CoulombErrorPrior,
-    NormalForcePrior,
-    SlidingFrictionPrior,
-)
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import TERMS, JointForcePrior, JointFrictionPrior
 from forcegp.forces.quantities import QUANTITIES
+from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.features import SMALLEST_FRACTION, stacked
-from forcegp.gp.kernels import (
-    Constant,
-    Linear,
-    Matern32,
-    Matern52,
-    Product,
-    SquaredExponential,
-    Stationary,
-    Sum,
-)
 from forcegp.models.export.model import ExportedModel, Functions
 
 READ = (*QUANTITIES, "joint_friction")
 """The quantities of the C code, in the order of its bits; the last one is not in `QUANTITIES`."""
 TARGETS, SURFACES = (JOINT, CONTACT, CONSTRAINT), ("plane", "sphere", "cylinder")
-PROFILES: dict[type, str] = {
-    SquaredExponential: "squared_exponential",
-    Matern32: "matern32",
-    Matern52: "matern52",
-}
 ALONG = {
     "position": [f"dot3(at->tangent[{i}], at->position)" for i in range(2)],
     "velocity": [f"dot3(at->tangent[{i}], at->velocity)" for i in range(2)],
@@ -146,9 +126,8 @@ class Writer:
         name = name or f"TABLE_{len(self.lines)}"
         rows = x.detach().double().reshape(-1, x.shape[-1] if x.ndim else 1).tolist() or [[0.0]]
         texts = [", ".join(repr(v) if kind == "double" else str(int(v)) for v in row) for row in rows]
-        body = (
-            texts[0].replace(", ", ",\n  ") if x.ndim < 2 else ",\n  ".join(f"{{{text}}}" for text in texts)
-        )
+        rows = [f"{{{text}}}" for text in texts] if x.ndim > 1 else texts[0].split(", ")
+        body = ",\n  ".join(rows)
         shape = "".join(f"[{n}]" for n in x.shape) if x.numel() else "[1]"
         self.lines.append(f"static const {kind} {name}{shape} = {{\n  {body}}};")
         return name
@@ -174,9 +153,7 @@ class Writer:
             "RANK_TOLERANCE": repr(rank_tolerance(robot.dtype)),
         }
         self.lines += [f"#define {name} {value}" for name, value in defined.items()]
-        self.lines.append(
-            "enum { JOINT, CONTACT, CONSTRAINT, JOINT_FRICTION };\nenum { PLANE, SPHERE, CYLINDER };"
-        )
+        self.lines.append("enum { JOINT, CONTACT, CONSTRAINT, JOINT_FRICTION, PLANE = 0, SPHERE, CYLINDER };")
         self.array(sizes, "SIZES", "int")
         owners = [part.prior for part in self.parts for _ in range(part.components)]
         self.array([TARGETS.index(prior.target) for prior in owners], "TARGET", "int")
@@ -192,9 +169,8 @@ class Writer:
         if contacts:
             self._surfaces(contacts)
         if process.coulomb:
-            self.array(
-                [system.contact_names.index(x.contact) for x in process.coulomb], "COULOMB_CONTACT", "int"
-            )
+            where = [system.contact_names.index(x.contact) for x in process.coulomb]
+            self.array(where, "COULOMB_CONTACT", "int")
             self.array([float(x.coefficient) for x in process.coulomb], "COULOMB_COEFFICIENT")
             self.array([float(x.smoothing) for x in process.coulomb], "COULOMB_SMOOTHING")
 
@@ -244,17 +220,19 @@ class Writer:
         prior, E = part.prior, f"f->E + {start}"
         if isinstance(prior, InertialPrior):
             return []
-        if isinstance(prior, NormalForcePrior):
+        if isinstance(prior, contact.NormalForcePrior):
             return [f"  along_constraint(e, {E});"]
-        if not isinstance(prior, ContactForcePrior | SlidingFrictionPrior | CoulombErrorPrior):
+        if not isinstance(
+            prior, contact.ContactForcePrior | contact.SlidingFrictionPrior | contact.CoulombErrorPrior
+        ):
             return [f"  identity({part.components}, {E});"]
         c = self.model.system.contact_names.index(prior.contact)
-        if isinstance(prior, CoulombErrorPrior):
+        if isinstance(prior, contact.CoulombErrorPrior):
             law = next(x for x in prior.friction if x.contact == prior.contact)
             numbers = f"{float(law.coefficient)!r}, {float(law.smoothing)!r}"
             return [f"  friction_error(e, tau, gain, {c}, {numbers}, {E});"]
         at = f"  const touching *const at = &e->contact[{c}];"
-        if isinstance(prior, ContactForcePrior):
+        if not isinstance(prior, contact.SlidingFrictionPrior):
             return [at, f"  tangential(e, {c}, {E});"]
         terms = self.array([contact.TERMS.index(term) for term in prior.terms], kind="int")
         numbers = (prior.smoothing, prior.friction_coefficient, prior.stribeck_speed, prior.torsion_smoothing)
@@ -264,11 +242,12 @@ class Writer:
     def _functions(self, p: int, part: Functions) -> list[str]:
         """Code of the functions V of each component, and of their posterior."""
         inputs, shared = self._inputs(p, part)
-        kernel, m, lines = KernelCode(self, part, shared), part.size, [inputs]
+        lines, m = [inputs], part.size
+        kernel = KernelCode(self, part, shared, lines)
         for k in range(part.components):
-            value, variance = kernel.rest(k)
-            phi = kernel.features(k)
-            lines += [*kernel.take(), f"  {{\n    double V[{part.weights.shape[1] or 1}];"]
+            value, variance = ("", "0.0") if part.rest is None else kernel.covariance(part.rest, k)
+            phi = [] if part.finite is None else kernel.features(part.finite, k)
+            lines += [f"  {{\n    double V[{part.weights.shape[1] or 1}];"]
             if m:
                 lines.append(f"    for (int j = 0; j < {m}; ++j) V[j] = {value};")
             lines += [f"    V[{m + i}] = {feature};" for i, feature in enumerate(phi)]
@@ -287,13 +266,9 @@ class Writer:
         for k in range(1 if shared else part.components):
             row = []
             for name, columns in raw.items():
-                pair = (scales.mean[name], scales.std[name])
-                mean, std = (x if shared else x[k] for x in pair)
                 given = columns if shared else [columns[k]]
-                row += [
-                    f"({x} - {m!r}) / {s!r}"
-                    for x, m, s in zip(given, mean.tolist(), std.tolist(), strict=True)
-                ]
+                pair = ((x if shared else x[k]).tolist() for x in (scales.mean[name], scales.std[name]))
+                row += [f"({x} - {m!r}) / {s!r}" for x, m, s in zip(given, *pair, strict=True)]
             rows.append(row)
         body = ",\n".join(f"    {{{', '.join(row)}}}" for row in rows)
         return f"  const double x[{len(rows)}][{len(rows[0])}] = {{\n{body}}};\n  (void)x;", shared
@@ -301,7 +276,7 @@ class Writer:
     def _raw_inputs(self, prior: ForcePrior) -> dict[str, list[str]]:
         """C expressions of the inputs by name; of joint friction, one for each joint."""
         joints, revolute = range(self.model.system.robot.nq), self.model.system.robot.revolute.bool().tolist()
-        if isinstance(prior, NormalForcePrior):
+        if isinstance(prior, contact.NormalForcePrior):
             return self._raw_inputs(prior.like)
         if isinstance(prior, JointFrictionPrior):
             raw = {"velocity": [f"qd[{i}]" for i in joints]}
@@ -310,7 +285,7 @@ class Writer:
             if prior.load:
                 raw["load"] = [f"fabs(e->Q_G[{i}]) * {raw['coulomb_0'][i]}" for i in joints]
             return raw
-        if isinstance(prior, ContactForcePrior | SlidingFrictionPrior):
+        if isinstance(prior, contact.SurfaceForcePrior):
             return {name: ALONG[name] for name in prior.inputs}
         if not isinstance(prior, JointForcePrior):
             return {"one": ["0.0"]}
@@ -324,25 +299,11 @@ class Writer:
 class KernelCode:
     """C code of the kernel of one prior; what a leaf needs is computed once in front of its use."""
 
-    def __init__(self, writer: Writer, part: Functions, shared: bool) -> None:
-        self.writer, self.part, self.shared = writer, part, shared
-        self._lines: list[str] = []
+    def __init__(self, writer: Writer, part: Functions, shared: bool, lines: list[str]) -> None:
+        self.writer, self.part, self.shared, self.lines = writer, part, shared, lines
         self._known: dict[tuple[int, int], str] = {}
 
-    def take(self) -> list[str]:
-        """The lines that were asked for since the last call."""
-        lines, self._lines = self._lines, []
-        return lines
-
-    def rest(self, k: int) -> tuple[str, str]:
-        """k(x, z_j) and k(x, x) of component k."""
-        return ("0.0", "0.0") if self.part.rest is None else self._covariance(self.part.rest, k)
-
-    def features(self, k: int) -> list[str]:
-        """φ(x) of component k."""
-        return [] if self.part.finite is None else self._features(self.part.finite, k)
-
-    def _x(self, kernel: Linear | Stationary, k: int, scale: Tensor) -> list[str]:
+    def _x(self, kernel: kernels.Linear | kernels.Stationary, k: int, scale: Tensor) -> list[str]:
         """The inputs of a kernel, each with its factor."""
         widths = {name: x.shape[-1] for name, x in self.part.support.items()}
         starts = dict(zip(widths, accumulate(widths.values(), initial=0), strict=False))
@@ -351,27 +312,33 @@ class KernelCode:
         row, factors = 0 if self.shared else k, scale.expand(len(columns)).tolist()
         return [f"{s!r} * x[{row}][{c}]" for c, s in zip(columns, factors, strict=True)]
 
-    def _features(self, part: KernelPart, k: int) -> list[str]:
+    def features(self, part: KernelPart, k: int) -> list[str]:
+        """φ(x) of component k."""
         kernel, params = part.kernel, part.params
-        if isinstance(kernel, Linear):
+        if isinstance(kernel, kernels.Linear):
             bias = float(_row(kernel.bias_std(params), k))
             return [*self._x(kernel, k, _row(kernel.slope_std(params), k)), repr(bias)]
-        if isinstance(kernel, Constant):
+        if isinstance(kernel, kernels.Constant):
             return [repr(float(_row(kernel.std(params), k)))]
-        assert isinstance(kernel, Sum)
-        left, right = (self._features(KernelPart(*side), k) for side in kernel.parts(params))
-        return [f"{a} * {b}" for a in left for b in right] if isinstance(kernel, Product) else left + right
+        assert isinstance(kernel, kernels.Sum)
+        left, right = (self.features(KernelPart(*side), k) for side in kernel.parts(params))
+        return (
+            [f"{a} * {b}" for a in left for b in right]
+            if isinstance(kernel, kernels.Product)
+            else left + right
+        )
 
-    def _covariance(self, part: KernelPart, k: int) -> tuple[str, str]:
+    def covariance(self, part: KernelPart, k: int) -> tuple[str, str]:
+        """k(x, z_j) and k(x, x) of component k."""
         kernel, params = part.kernel, part.params
-        if isinstance(kernel, Sum):
-            (a, aa), (b, bb) = (self._covariance(KernelPart(*side), k) for side in kernel.parts(params))
-            sign = "*" if isinstance(kernel, Product) else "+"
+        if isinstance(kernel, kernels.Sum):
+            (a, aa), (b, bb) = (self.covariance(KernelPart(*side), k) for side in kernel.parts(params))
+            sign = "*" if isinstance(kernel, kernels.Product) else "+"
             return f"({a} {sign} {b})", f"({aa} {sign} {bb})"
-        if isinstance(kernel, Constant):
+        if isinstance(kernel, kernels.Constant):
             value = repr(float(_row(kernel.std(params), k).square()))
             return value, value
-        if isinstance(kernel, Linear):
+        if isinstance(kernel, kernels.Linear):
             # k = Σ_d (s σ_d)² x_d x′_d + σ_0²
             bias = float(_row(kernel.bias_std(params), k).square())
             common = kernel.shared and self.shared
@@ -381,17 +348,17 @@ class KernelCode:
             u = self._leaf((id(params["log_slope_std"]), 0 if common else k), "combine", x, Z)
             square = " + ".join(f"({a}) * ({a})" for a in x)
             return f"({size!r} * {u}[j] + {bias!r})", f"({size!r} * ({square}) + {bias!r})"
-        assert isinstance(kernel, Stationary)
+        assert isinstance(kernel, kernels.Stationary)
         variance, inverse = (
             float(_row((2.0 * params["log_std"]).exp(), k)),
             torch.exp(-params["log_lengthscale"]),
         )
         each, scale = 0 if self.shared and len(inverse) == 1 else k, _row(inverse, k)
         x, Z = self._x(kernel, k, scale), self._support(kernel, k) * scale
-        u = self._leaf((id(params["log_lengthscale"]), each), PROFILES[type(kernel)], x, Z)
+        u = self._leaf((id(params["log_lengthscale"]), each), type(kernel).__name__.lower(), x, Z)
         return f"{variance!r} * {u}[j]", repr(variance)
 
-    def _support(self, kernel: Linear | Stationary, k: int) -> Tensor:
+    def _support(self, kernel: kernels.Linear | kernels.Stationary, k: int) -> Tensor:
         z = stacked(self.part.support, kernel.inputs)
         return z if z.ndim == 2 else z[k]
 
@@ -401,11 +368,11 @@ class KernelCode:
         if key not in self._known and m:
             u = self._known[key] = f"u{len(self._known)}"
             table = self.writer.array(Z.mT.flatten())
-            self._lines.append(f"  double {u}[{m}];\n  {{\n    const double scaled[] = {{{', '.join(x)}}};")
+            self.lines.append(f"  double {u}[{m}];\n  {{\n    const double scaled[] = {{{', '.join(x)}}};")
             if kind == "combine":
-                self._lines.append(f"    combine({table}, scaled, {len(x)}, {m}, {u});\n  }}")
+                self.lines.append(f"    combine({table}, scaled, {len(x)}, {m}, {u});\n  }}")
             else:
-                self._lines.append(
+                self.lines.append(
                     f"    squares(scaled, {table}, {len(x)}, {m}, {u});\n    {kind}({u}, {m});\n  }}"
                 )
         return self._known.get(key, "")
