@@ -118,6 +118,8 @@ class Program:
     outputs: list[Scalar]
 
 
+PARAMETERS = 10
+"""Inertial parameters of a link: m, m c and the inertia about its origin."""
 _Inertia = tuple[float, np.ndarray, np.ndarray]
 """Mass, first moment and inertia about the base origin."""
 
@@ -276,6 +278,29 @@ def _forward_dynamics_derivatives(links: Links) -> np.ndarray:
     qdd = inverse @ (np.array(links.vector("force"), dtype=object) - needed)
     dq, dqd = _inverse_dynamics_derivatives(links, qd, list(qdd))
     return np.array([-(inverse @ dq), -(inverse @ dqd), inverse], dtype=object)
+
+
+def regressor_program(links: Links) -> Program:
+    """Y `(10 nq, nq)`, the transpose of `identification.regressor`, from the motion of each link's origin."""
+    n = len(links.parents)
+    Y = links.graph.constants(np.zeros((PARAMETERS * n, n)))
+    motion = _motion(links, links.vector("qd"), links.vector("qdd"), gravity=True)
+    for i, ((omega, v, alpha, a), R, p) in enumerate(zip(motion, links.R, links.p, strict=True)):
+        origin = a + cross(alpha, p) + cross(omega, v + cross(omega, p))
+        zero, axes = links.graph.constants(np.zeros(3)), [R[:, x] for x in range(3)]
+        wrenches = [(zero, origin)]
+        # Moment and force about the link's origin: m, then m c along each axis, then I
+        wrenches += [(cross(e, origin), cross(alpha, e) + cross(omega, cross(omega, e))) for e in axes]
+        for x in range(3):
+            for y in range(x, 3):
+                turn = [axes[x] * (axes[y] @ w) + axes[y] * (axes[x] @ w) for w in (alpha, omega)]
+                half = 0.5 if x == y else 1.0
+                wrenches.append(((turn[0] + cross(omega, turn[1])) * half, zero))
+        for k, (torque, force) in enumerate(wrenches):
+            about = torque + cross(p, force)
+            for j in links.ancestors(i):
+                Y[PARAMETERS * i + k, j] = links.z[j] @ about + links.l[j] @ force
+    return Program(("q", "qd", "qdd"), Y.shape, links.graph, list(Y.flat))
 
 
 QUANTITIES: dict[str, tuple[tuple[str, ...], Callable[[Links], np.ndarray]]] = {

@@ -76,15 +76,16 @@ class Source:
     arrays: tuple[str, ...]
 
 
-def _statements(program: Program, load: dict[tuple[str, int], str], store: str) -> str:
-    """One statement a live node, then the stores."""
+def statements(program: Program, load: dict[tuple[str, int], str], store: str, vector: bool = True) -> str:
+    """One statement a live node, then the stores, on vectors `V` of numbers `T` or, in C, on doubles."""
     nodes, lines = program.graph.nodes, []
+    kind, lifted = ("V", "V{{}} + {}") if vector else ("double", "{}")
     name: dict[int, str] = {}
     for position in program.graph.live(program.outputs):
         op, left, right = nodes[position]
         if op == "const":
             # A scalar operand is spread over the lanes by the compiler; repr keeps every bit.
-            name[position] = f"T({left!r})"  # pyright: ignore[reportArgumentType]
+            name[position] = f"T({left!r})" if vector else repr(left)
             continue
         name[position] = f"x{position}"
         if op == "input":
@@ -93,13 +94,13 @@ def _statements(program: Program, load: dict[tuple[str, int], str], store: str) 
             value = f"-{name[left]}"  # pyright: ignore[reportArgumentType]
         else:
             value = f"{name[left]} {op} {name[right]}"  # pyright: ignore[reportArgumentType]
-        lines.append(f"  const V x{position} = {value};")
+        lines.append(f"  const {kind} x{position} = {value};")
     for k, output in enumerate(program.outputs):
-        lines.append("  " + store.format(k=k, value=f"V{{}} + {name[output.position]}"))
+        lines.append("  " + store.format(k=k, value=lifted.format(name[output.position])))
     return "\n".join(lines)
 
 
-def _inputs(program: Program) -> tuple[tuple[str, ...], list[tuple[str, int]]]:
+def inputs_of(program: Program) -> tuple[tuple[str, ...], list[tuple[str, int]]]:
     """The arrays that are read, and their entries that are used."""
     nodes = (program.graph.nodes[i] for i in program.graph.live(program.outputs))
     entries = sorted((str(name), int(index)) for op, name, index in nodes if op == "input")  # pyright: ignore[reportArgumentType]
@@ -112,7 +113,7 @@ def _type(dtype: torch.dtype) -> str:
 
 def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
     """C++ that computes a vector of samples at a time and shares the batch among threads."""
-    arrays, entries = _inputs(program)
+    arrays, entries = inputs_of(program)
     load = "\n".join(
         f"    entry[{k}][lane] = in[{arrays.index(name)}][row * {nq} + {index}];"
         for k, (name, index) in enumerate(entries)
@@ -123,7 +124,7 @@ def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
         inputs=len(entries),
         outputs=len(program.outputs),
         load=load,
-        body=_statements(
+        body=statements(
             program,
             {entry: f"*(const V*)entry[{k}]" for k, entry in enumerate(entries)},
             "*(V*)result[{k}] = {value};",
@@ -133,13 +134,25 @@ def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
     return Source(text, arrays)
 
 
+def c_function(name: str, program: Program) -> str:
+    """A static C99 function of one state: the arguments, sin q and cos q, then where the result goes."""
+    names = (*program.arguments, "sin_q", "cos_q")
+    entry = {"sin": "sin_q", "cos": "cos_q"}
+    load = {(x, i): f"{entry.get(x, x)}[{i}]" for x, i in inputs_of(program)[1]}
+    used = {entry.get(x, x) for x, _ in load}
+    unread = "".join(f"  (void){x};\n" for x in names if x not in used)
+    arguments = ", ".join(f"const double *restrict {x}" for x in names)
+    body = statements(program, load, "out[{k}] = {value};", vector=False)
+    return f"static void {name}({arguments}, double *restrict out) {{\n{unread}{body}\n}}\n"
+
+
 def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
     """CUDA C++ that computes one sample a thread."""
-    arrays, entries = _inputs(program)
+    arrays, entries = inputs_of(program)
     text = _CUDA.format(
         type=_type(dtype),
         parameters=", ".join(f"const T* in_{name}" for name in arrays),
-        body=_statements(
+        body=statements(
             program,
             {(name, index): f"in_{name}[row * {nq} + {index}]" for name, index in entries},
             f"out[row * {len(program.outputs)} + {{k}}] = {{value}};",

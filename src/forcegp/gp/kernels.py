@@ -181,19 +181,20 @@ class Constant(Kernel):
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         return {"log_scale": torch.zeros(outputs // self.group, dtype=torch.float64)}
 
-    def _std(self, params: Parameters) -> Tensor:
+    def std(self, params: Parameters) -> Tensor:
+        """s `(k,)`."""
         return params["log_scale"].exp().repeat_interleave(self.group)
 
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
-        variance, n2 = (self._std(params) ** 2)[:, None, None], stacked(x2, None).shape[-2]
+        variance, n2 = (self.std(params) ** 2)[:, None, None], stacked(x2, None).shape[-2]
         return lambda x1: variance.expand(-1, stacked(x1, None).shape[-2], n2)
 
     def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
-        variance = (self._std(params) ** 2)[:, None]
+        variance = (self.std(params) ** 2)[:, None]
         return lambda x: variance.expand(-1, stacked(x, None).shape[-2])
 
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        return constant_features(self._std(params))
+        return constant_features(self.std(params))
 
 
 @dataclass(frozen=True)

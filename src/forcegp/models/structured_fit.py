@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -49,6 +50,9 @@ from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel
+from forcegp.models.export.folder import Export, write_export
+from forcegp.models.export.library import CompiledFit
+from forcegp.models.export.model import ExportedModel
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Prediction, in_pieces
@@ -225,6 +229,45 @@ class StructuredFit(FittedModel):
         """
         data.check_robot(self.specified.robot)
         return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
+
+    def _exported(self, functions: int | None) -> ExportedModel:
+        parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
+        return ExportedModel(*parts, self.problem.external_std, functions)
+
+    def export(
+        self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None
+    ) -> Export:
+        """Write the fit as C99 that needs libm alone, with a test program, `CMakeLists.txt` and a README.
+
+        The code maps (q, q̇, τ, closed contacts) to mean and covariance of every quantity.
+
+        Args:
+            path: folder, which is made.
+            language: `"c"`.
+            name: of the files, and prefix of all names in them.
+            functions: number r that the covariance is reduced to; `None` for all.
+
+        Returns:
+            The folder, and what a reduced covariance loses at training states.
+
+        Raises:
+            ModelError: a prior, kernel or contact has no C form, or the posterior is too large; names it.
+            UnknownNameError, ParameterError: no such language, or a name that is no C identifier.
+            DestinationError: the folder cannot be written, or holds other files.
+        """
+        return write_export(self._exported(functions), self, self.training, path, language, name)
+
+    def compiled(self, *, functions: int | None = None) -> CompiledFit:
+        """The fit as a fast predictor, by C code that the machine's compiler builds once.
+
+        Args:
+            functions: number r that the covariance is reduced to, which only widens it; `None` for all.
+
+        Raises:
+            ModelError: a prior, kernel or contact has no C form, or the posterior is too large.
+            MissingDependencyError: there is no C++ compiler.
+        """
+        return CompiledFit(self._exported(functions))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """How far the speed and torque of each joint lie beyond those of the training data, in training

@@ -1,0 +1,207 @@
+"""Microseconds per call of a fit as C, from C and from Python.
+
+    python benchmarks/control_rate.py --json result.json
+
+A KUKA iiwa in one contact (`kuka_plane`, simulated), with three models: `friction`, the default of a measured
+robot (some 50 functions); the same with uncertain inertia (some 120); and `residual`, with inducing points
+of a residual force of 21 inputs (some 460). Nothing is learned: time does not depend on hyperparameters.
+The C code is compiled by gcc with `-O3 -march=native -ffp-contract=fast` and with `-O2`, both `-std=c99`,
+and runs on one core over 256 logged states, contact closed; the time is the least mean of several rounds.
+Peers in the same run: `StructuredFit.predict`, and for the mechanics alone Pinocchio's `aba` from Python,
+if it is installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import forcegp
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
+from forcegp.forces.priors.sets import friction_priors
+from forcegp.gp.kernels import Matern32
+from forcegp.gp.sparse import SparsePosterior
+from forcegp.models.prediction import Predictor
+from forcegp.models.structured_fit import StructuredFit
+from forcegp.simulate import SimulationConfig, simulate
+
+POINTS, STATES, ROUNDS = 66, 256, 15
+LEVELS = {"-O3": ["-O3", "-march=native", "-ffp-contract=fast"], "-O2": ["-O2"]}
+BOUNDS = {  # µs, at -O3
+    "friction mean": 8.0,
+    "friction covariance": 30.0,
+    "friction+inertia mean": 8.0,
+    "friction+inertia covariance": 30.0,
+    "residual mean": 20.0,
+    "residual covariance": 120.0,
+    "forward dynamics": 1.0,
+    "python mean": 50.0,
+    "python covariance": 150.0,
+}
+PROGRAM = """\
+#define _POSIX_C_SOURCE 199309L
+#include <stdio.h>
+#include <time.h>
+#include "controller.h"
+#include "states.h"
+
+static double now(void) {
+  struct timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return 1e6 * (double)t.tv_sec + 1e-3 * (double)t.tv_nsec;
+}
+
+int main(void) {
+  static double mean[64], covariance[64 * 64], beyond[64];
+  double best[3] = {1e30, 1e30, 1e30}, sink = 0.0;
+  for (int round = 0; round < ROUNDS; ++round)
+    for (int kind = 0; kind < 3; ++kind) {
+      const double start = now();
+      for (int i = 0; i < STATES; ++i) {
+        if (kind == 2)
+          controller_forward_dynamics(q[i], qd[i], tau[i], mean);
+        else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
+                                    mean, kind ? covariance : NULL, beyond))
+          return 1;
+        sink += mean[0];
+      }
+      const double each = (now() - start) / STATES;
+      best[kind] = each < best[kind] ? each : best[kind];
+    }
+  printf("%g %g %g %g\\n", best[0], best[1], best[2], sink);
+  return 0;
+}
+"""
+
+
+def models() -> dict[str, StructuredFit]:
+    """The fits, conditioned at the hyperparameters where learning begins."""
+    system = forcegp.load_scene("kuka_plane").system()
+    data = simulate(system, SimulationConfig(duration=4.0, seed=1)).data
+    few = data[:: len(data) // 400]
+    fits = {}
+    for name, more in (("friction", []), ("friction+inertia", [InertialPrior()])):
+        priors = [*friction_priors(system), *more]
+        fits[name] = forcegp.StructuredGP(system, "analytical", priors, noise=0.1).fit(few, learn=[])
+    rough = JointForcePrior(Matern32(shared=True))
+    model = forcegp.StructuredGP(
+        system,
+        "analytical",
+        [JointFrictionPrior(), rough],
+        noise=0.1,
+        inference="sparse",
+        inducing_points=POINTS,
+    )
+    fits["residual"] = model.fit(few, learn=[])
+    return fits
+
+
+def logged(fit: StructuredFit) -> tuple[Tensor, Tensor, Tensor]:
+    """Training states."""
+    m = fit.training.measurements[0]
+    return m.q[:STATES], m.qd[:STATES], m.tau[:STATES]
+
+
+def in_c(fit: StructuredFit, flags: list[str]) -> list[float]:
+    """µs of the mean, of mean and covariance, and of forward dynamics alone."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = fit.export(Path(place) / "c").folder
+        tables = dict(zip(("q", "qd", "tau"), logged(fit), strict=True))
+        lines = [f"enum {{ STATES = {STATES}, ROUNDS = {ROUNDS} }};"]
+        for name, x in tables.items():
+            rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
+            lines.append(f"static const double {name}[STATES][7] = {{{rows}}};")
+        (folder / "states.h").write_text("\n".join(lines))
+        (folder / "time.c").write_text(PROGRAM)
+        command = ["gcc", "-std=c99", *flags, "time.c", "controller.c", "-o", "run", "-lm"]
+        subprocess.run(command, cwd=folder, check=True)
+        done = subprocess.run([str(folder / "run")], capture_output=True, text=True, check=True)
+    return [float(x) for x in done.stdout.split()[:3]]
+
+
+def in_python(call: Callable[[int], object], calls: int = 32) -> float:
+    """µs of a call from Python, the least mean of several rounds."""
+    best = float("inf")
+    for _ in range(20):
+        start = time.perf_counter()
+        for i in range(calls):
+            call(i)
+        best = min(best, 1e6 * (time.perf_counter() - start) / calls)
+    return best
+
+
+def predicting(predictor: Predictor, fit: StructuredFit, covariance: bool) -> float:
+    """µs of `predict` of q̈ and λ at single states."""
+    q, qd, tau = logged(fit)
+    return in_python(
+        lambda i: predictor.predict(q[i], qd[i], tau[i], ["qdd", "multiplier"], covariance=covariance)
+    )
+
+
+def pinocchio(fit: StructuredFit) -> float | None:
+    """µs of Pinocchio's articulated-body algorithm from Python."""
+    try:
+        import pinocchio
+    except ImportError:
+        return None
+    path = Path(forcegp.__file__).parent / "robot/bundled/kuka_iiwa.urdf"
+    pin: Any = pinocchio
+    model = pin.buildModelFromUrdf(str(path))
+    data, states = model.createData(), [x.numpy() for x in logged(fit)]
+    return in_python(lambda i: pin.aba(model, data, *(x[i] for x in states)))
+
+
+def measure() -> dict[str, float]:
+    """All times, µs."""
+    result: dict[str, float] = {}
+    for name, fit in models().items():
+        latent = fit.posterior.latent
+        assert isinstance(latent, SparsePosterior)
+        result[f"{name} functions"] = latent.basis.size
+        for level, flags in LEVELS.items():
+            times = in_c(fit, flags)
+            for what, value in zip(("mean", "covariance", "forward dynamics"), times, strict=True):
+                result[f"{name} {what} {level}"] = value
+        fast = fit.compiled()
+        for kind, predictor in (("compiled", fast), ("predict", fit)):
+            for what, covariance in (("mean", False), ("covariance", True)):
+                result[f"{name} {what} python {kind}"] = predicting(predictor, fit, covariance)
+        if name == "friction" and (peer := pinocchio(fit)) is not None:
+            result["forward dynamics pinocchio from python"] = peer
+    return result
+
+
+def main() -> None:
+    """Measure, print, and say which bounds hold."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--json", type=Path, help="file for the result")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    result = measure()
+    for name, value in result.items():
+        print(f"{name:45} {value:9.2f}")
+    found = {
+        **{name: result[f"{name} -O3"] for name in BOUNDS if f"{name} -O3" in result},
+        "forward dynamics": result["friction forward dynamics -O3"],
+        "python mean": result["friction mean python compiled"],
+        "python covariance": result["friction covariance python compiled"],
+    }
+    for name, bound in BOUNDS.items():
+        verdict = "holds" if found[name] <= bound else "MISSED"
+        print(f"{name:45} {found[name]:9.2f}  bound {bound:6.1f}  {verdict}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps({"times": result, "bounds": BOUNDS, "found": found}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

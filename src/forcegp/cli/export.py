@@ -1,0 +1,93 @@
+"""`forcegp export`: a fitted model as source code of a controller, or as figures in a robot file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from forcegp.cli.common import show
+from forcegp.cli.options import AsJson, ModelFile
+
+if TYPE_CHECKING:
+    from forcegp.models.structured_fit import StructuredFit
+
+TARGETS = ("c", "urdf", "mjcf")
+
+
+def export(
+    model: ModelFile,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for the code and its test, or the robot file.")
+    ],
+    to: Annotated[str, typer.Option("--to", help="c, urdf or mjcf.")] = "c",
+    name: Annotated[
+        str, typer.Option(help="Of C code: name of the files, and prefix of the functions.")
+    ] = "controller",
+    functions: Annotated[
+        int | None,
+        typer.Option(min=1, help="Of C code: reduce the covariance to so many functions, which widens it."),
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="The URDF or MJCF file that the robot was loaded from, or its name.")
+    ] = None,
+    samples: Annotated[
+        int, typer.Option(min=0, help="Of a robot file: robots drawn from the posterior, a file each.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(help="Of these samples.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Write a structured Gaussian process as C99 that needs libm alone, or into the file of its robot.
+
+    C: one .h and one .c file: state and closed contacts to accelerations, multipliers and forces, each with
+    mean and covariance. Beside them a test program with reference values, CMakeLists.txt and a README.
+
+    URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, in which nothing else
+    changes. Beside it a report with standard deviations and losses, and robots drawn from the posterior.
+
+    [bold]Examples[/bold]
+
+    forcegp export --model model --to c --out controller/
+
+    forcegp export -m model --functions 100 --name arm -o controller/
+
+    forcegp export -m model --to urdf --robot my.urdf --samples 100 -o calibrated.urdf
+    """
+    from forcegp.errors import ModelError, check_name
+    from forcegp.models.load import load_model
+    from forcegp.models.structured_fit import StructuredFit
+
+    check_name("format to export to", to, TARGETS)
+    fit = load_model(model)
+    if not isinstance(fit, StructuredFit):
+        raise ModelError("only a structured Gaussian process can be exported", expected="sgp", got=fit.kind)
+    if to != "c":
+        show(_written_back(fit, to, robot, out, samples, seed), as_json)
+        return
+    written = fit.export(out, language=to, name=name, functions=functions)
+    lost = {"widest": written.widest, "wider": written.wider} if functions is not None else {}
+    show({"folder": str(out), "functions": written.functions, **lost}, as_json)
+
+
+def _written_back(
+    fit: StructuredFit, to: str, robot: str | None, out: Path, samples: int, seed: int
+) -> dict[str, object]:
+    """Write the robot file, and say what changed."""
+    from forcegp.errors import ModelError, RobotFileError
+    from forcegp.models.calibrated import write_calibrated
+    from forcegp.robot.write_back import is_mjcf
+
+    if robot is None:
+        raise ModelError(
+            "no robot file is named that figures could be written into",
+            expected="--robot my.urdf, the file that the robot was loaded from",
+        )
+    if is_mjcf(robot) != (to == "mjcf"):
+        raise RobotFileError(
+            f"{robot} is of another format", expected=to, got="mjcf" if to == "urdf" else "urdf"
+        )
+    found = write_calibrated(fit, robot, out, samples=samples, seed=seed)
+    determined = sum(parameter.determined for parameter in found.parameters)
+    result = {"file": str(out), "report": str(out.with_name(f"{out.stem}.report.json"))}
+    return result | {"parameters": len(found.parameters), "determined": determined, "samples": samples}

@@ -1,0 +1,616 @@
+/* ---- sums of products; eight partial sums each, so that compilers use vector registers ---- */
+
+static double dot(const double *restrict a, const double *restrict b, int n) {
+  double lanes[8] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0}, sum = 0.0;
+  int i = 0;
+  for (; i + 8 <= n; i += 8)
+    for (int lane = 0; lane < 8; ++lane) lanes[lane] += a[i + lane] * b[i + lane];
+  for (; i < n; ++i) sum += a[i] * b[i];
+  for (int lane = 0; lane < 8; ++lane) sum += lanes[lane];
+  return sum;
+}
+
+/* y = x^T C, for C of n rows and m columns */
+static void combine(const double *restrict C, const double *restrict x, int n, int m, double *restrict y) {
+  int i = 0;
+  for (int c = 0; c < m; ++c) y[c] = 0.0;
+  for (; i + 4 <= n; i += 4) {
+    const double *restrict row = C + (long)i * m;
+    const double x0 = x[i], x1 = x[i + 1], x2 = x[i + 2], x3 = x[i + 3];
+    for (int c = 0; c < m; ++c)
+      y[c] += x0 * row[c] + x1 * row[m + c] + x2 * row[2 * (long)m + c] + x3 * row[3 * (long)m + c];
+  }
+  for (; i < n; ++i)
+    for (int c = 0; c < m; ++c) y[c] += x[i] * C[(long)i * m + c];
+}
+
+/* ---- the constrained equations of motion, M qdd = Q + Q_z + A^T lambda and A qdd = b ---- */
+
+typedef struct {
+  double position[3], velocity[3], jacobian[3][NQ]; /* of the material point that touches */
+  double normal[3], tangent[2][3];                  /* of the surface there */
+  double sliding[3], sliding_jacobian[3][NQ];       /* velocity and Jacobian along the surface */
+  double turning[NQ];                               /* n^T J_omega */
+} touching;
+
+typedef struct {
+  double M[NQ][NQ], Q_C[NQ], Q_G[NQ], Q_D[NQ]; /* mass matrix; bias, gravity and damping force */
+  double A[SOME(ROWS)][NQ], b[SOME(ROWS)];     /* rows of open contacts are zero */
+  double M_inv[NQ][NQ], H[NQ][NQ];             /* H = M^-1 - L A M^-1, from force to acceleration */
+  double L[NQ][SOME(ROWS)];                    /* L = M^-1 A^T (A M^-1 A^T)^+ */
+  double S[SOME(ROWS)][SOME(ROWS)];            /* (A M^-1 A^T)^+ */
+  double qdd[NQ], load[SOME(ROWS)];            /* qdd and lambda of the analytical forces */
+  int closed[SOME(CONTACTS)];
+  touching contact[SOME(CONTACTS)];
+} equations;
+
+/* K = G^-1 of the lower Cholesky factor, M = G G^T; 0 unless M is positive definite */
+static int inverse_factor(const double *restrict M, double *restrict K) {
+  double G[NQ * NQ];
+  for (int i = 0; i < NQ; ++i)
+    for (int j = 0; j <= i; ++j) {
+      double sum = M[i * NQ + j];
+      for (int k = 0; k < j; ++k) sum -= G[i * NQ + k] * G[j * NQ + k];
+      if (i == j && !(sum > 0.0)) return 0;
+      G[i * NQ + j] = i == j ? sqrt(sum) : sum / G[j * NQ + j];
+    }
+  for (int j = 0; j < NQ; ++j)
+    for (int i = 0; i < NQ; ++i) {
+      double sum = i == j ? 1.0 : 0.0;
+      for (int k = j; k < i; ++k) sum -= G[i * NQ + k] * K[k * NQ + j];
+      K[i * NQ + j] = i < j ? 0.0 : sum / G[i * NQ + i];
+    }
+  return 1;
+}
+
+#if CONTACTS > 0
+static double dot3(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+static void cross3(const double *a, const double *b, double *c) {
+  c[0] = a[1] * b[2] - a[2] * b[1];
+  c[1] = a[2] * b[0] - a[0] * b[2];
+  c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* signed distance c of a point from the surface that its tip moves on, normal n and v^T (nabla^2 c) v */
+static double surface(int i, const double *p, const double *v, double *n, double *curvature) {
+  double r[3], w[3], along, length;
+  *curvature = 0.0;
+  if (SURFACE[i] == PLANE) {
+    for (int x = 0; x < 3; ++x) n[x] = AXIS[i][x];
+    return dot3(n, p) - SIZE[i];
+  }
+  for (int x = 0; x < 3; ++x) r[x] = p[x] - CENTER[i][x], w[x] = v[x];
+  if (SURFACE[i] == CYLINDER) {
+    const double far = dot3(r, AXIS[i]), speed = dot3(w, AXIS[i]);
+    for (int x = 0; x < 3; ++x) r[x] -= far * AXIS[i][x], w[x] -= speed * AXIS[i][x];
+  }
+  length = sqrt(dot3(r, r));
+  for (int x = 0; x < 3; ++x) n[x] = r[x] / length;
+  along = dot3(n, w);
+  *curvature = (dot3(w, w) - along * along) / length;
+  return length - SIZE[i];
+}
+
+/* tangent frame that turns with the normal: R e_x and R e_y of the smallest rotation with R e_z = n */
+static void tangents(const double *n, double t[2][3]) {
+  const int down = 1.0 + n[2] < 1e-6;
+  const double share = down ? 0.0 : 1.0 / (1.0 + n[2]);
+  t[0][0] = 1.0 - n[0] * n[0] * share, t[0][1] = -n[0] * n[1] * share, t[0][2] = -n[0];
+  t[1][0] = -n[0] * n[1] * share, t[1][1] = (down ? -1.0 : 1.0) - n[1] * n[1] * share, t[1][2] = -n[1];
+}
+
+/* A, b and the touching point of a contact, from position, Jacobian [omega; v] and J_dot qd of its point */
+static void contact_rows(int i, const double *restrict point, const double *restrict qd, equations *restrict e) {
+  const double *J = point + 3, *bias = point + 3 + 6 * NQ;
+  touching *at = &e->contact[i];
+  double twist[6], arm[3], c, cd, curvature, n_v;
+  for (int x = 0; x < 6; ++x) twist[x] = dot(J + x * NQ, qd, NQ);
+  c = surface(i, point, twist + 3, at->normal, &curvature);
+  for (int j = 0; j < NQ; ++j) {
+    const double column[3] = {J[3 * NQ + j], J[4 * NQ + j], J[5 * NQ + j]}, spin[3] = {J[j], J[NQ + j], J[2 * NQ + j]};
+    double moved[3];
+    e->A[i][j] = dot3(at->normal, column);
+    at->turning[j] = dot3(at->normal, spin);
+    for (int x = 0; x < 3; ++x) arm[x] = -TIP[i] * at->normal[x];
+    cross3(spin, arm, moved);
+    for (int x = 0; x < 3; ++x) at->jacobian[x][j] = column[x] + moved[x];
+  }
+  cross3(twist, arm, at->velocity);
+  for (int x = 0; x < 3; ++x) at->velocity[x] += twist[3 + x], at->position[x] = point[x] + arm[x];
+  cd = dot(e->A[i], qd, NQ);
+  e->b[i] = -(dot3(at->normal, bias + 3) + curvature) - RATE_GAIN * cd - ERROR_GAIN * c;
+  tangents(at->normal, at->tangent);
+  n_v = dot3(at->normal, at->velocity);
+  for (int x = 0; x < 3; ++x) at->sliding[x] = at->velocity[x] - at->normal[x] * n_v;
+  for (int j = 0; j < NQ; ++j) {
+    double n_J = 0.0;
+    for (int x = 0; x < 3; ++x) n_J += at->normal[x] * at->jacobian[x][j];
+    for (int x = 0; x < 3; ++x) at->sliding_jacobian[x][j] = at->jacobian[x][j] - at->normal[x] * n_J;
+  }
+  if (!e->closed[i]) {
+    for (int j = 0; j < NQ; ++j) e->A[i][j] = 0.0;
+    e->b[i] = 0.0;
+  }
+}
+
+/* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows; small singular values count as zero */
+static void pseudo_inverse(double *restrict W, double *restrict P) {
+  double V[ROWS * ROWS], square[ROWS], most = 0.0;
+  for (int r = 0; r < ROWS * ROWS; ++r) V[r] = r % (ROWS + 1) == 0 ? 1.0 : 0.0;
+  for (int sweep = 0; sweep < 30; ++sweep) {
+    int turned = 0;
+    for (int r = 0; r < ROWS; ++r)
+      for (int s = r + 1; s < ROWS; ++s) {
+        double *u = W + r * NQ, *v = W + s * NQ;
+        const double uu = dot(u, u, NQ), vv = dot(v, v, NQ), uv = dot(u, v, NQ);
+        double zeta, t, cosine, sine;
+        if (fabs(uv) <= 1e-16 * sqrt(uu * vv)) continue;
+        turned = 1, zeta = (vv - uu) / (2.0 * uv);
+        t = (zeta < 0.0 ? -1.0 : 1.0) / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
+        cosine = 1.0 / sqrt(1.0 + t * t), sine = cosine * t;
+        for (int j = 0; j < NQ; ++j) {
+          const double x = u[j], y = v[j];
+          u[j] = cosine * x - sine * y, v[j] = sine * x + cosine * y;
+        }
+        for (int j = 0; j < ROWS; ++j) {
+          const double x = V[j * ROWS + r], y = V[j * ROWS + s];
+          V[j * ROWS + r] = cosine * x - sine * y, V[j * ROWS + s] = sine * x + cosine * y;
+        }
+      }
+    if (!turned) break;
+  }
+  for (int r = 0; r < ROWS; ++r) square[r] = dot(W + r * NQ, W + r * NQ, NQ), most = fmax(most, square[r]);
+  for (int j = 0; j < NQ; ++j)
+    for (int s = 0; s < ROWS; ++s) {
+      double sum = 0.0;
+      for (int r = 0; r < ROWS; ++r)
+        if (square[r] > RANK_TOLERANCE * RANK_TOLERANCE * most) sum += W[r * NQ + j] / square[r] * V[s * ROWS + r];
+      P[j * ROWS + s] = sum;
+    }
+}
+#endif
+
+/* qdd and lambda of impressed forces Q: qdd = M^-1 Q + L (b - A M^-1 Q), lambda = S (b - A M^-1 Q) */
+static void motion_under(const equations *restrict e, const double *restrict Q, double *restrict qdd,
+                         double *restrict multiplier) {
+  double free[NQ], gap[SOME(ROWS)] = {0.0};
+  for (int i = 0; i < NQ; ++i) qdd[i] = free[i] = dot(e->M_inv[i], Q, NQ);
+  for (int r = 0; r < ROWS; ++r) gap[r] = e->b[r] - dot(e->A[r], free, NQ);
+  for (int r = 0; r < ROWS; ++r) multiplier[r] = dot(e->S[r], gap, ROWS);
+  for (int i = 0; i < NQ; ++i) qdd[i] += dot(e->L[i], gap, ROWS);
+}
+
+static int assemble(const double *restrict q, const double *restrict qd, const double *restrict tau,
+                    const unsigned char *restrict closed, equations *restrict e) {
+  double sine[NQ], cosine[NQ], out[MECHANICS], K[NQ * NQ], Q[NQ];
+  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
+  mechanics(q, qd, sine, cosine, out);
+  memcpy(e->M, out, sizeof e->M);
+  memcpy(e->Q_C, out + NQ * NQ, sizeof e->Q_C);
+  memcpy(e->Q_G, out + NQ * NQ + NQ, sizeof e->Q_G);
+  for (int i = 0; i < NQ; ++i) {
+    const double fast = qd[i] / STRIBECK_VELOCITY[i], dry = FRICTION[i] + STRIBECK[i] * exp(-fast * fast);
+    e->Q_D[i] = -DAMPING[i] * qd[i] - (dry != 0.0 ? dry * tanh(qd[i] / FRICTION_VELOCITY[i]) : 0.0);
+    Q[i] = e->Q_C[i] + e->Q_G[i] + e->Q_D[i] + tau[i];
+  }
+  if (!inverse_factor(&e->M[0][0], K)) return 0;
+  for (int i = 0; i < NQ; ++i)
+    for (int j = 0; j <= i; ++j) {
+      double sum = 0.0;
+      for (int k = i; k < NQ; ++k) sum += K[k * NQ + i] * K[k * NQ + j];
+      e->M_inv[i][j] = e->M_inv[j][i] = sum;
+    }
+  memcpy(e->H, e->M_inv, sizeof e->H);
+#if CONTACTS > 0
+  {
+    double W[ROWS * NQ], P[NQ * ROWS], along[ROWS][NQ];
+    for (int i = 0; i < CONTACTS; ++i) {
+      e->closed[i] = closed == NULL || closed[i] != 0;
+      contact_rows(i, out + NQ * NQ + 2 * NQ + i * (9 + 6 * NQ), qd, e);
+    }
+    for (int r = 0; r < ROWS; ++r) combine(&e->M_inv[0][0], e->A[r], NQ, NQ, along[r]);
+    for (int r = 0; r < ROWS; ++r)
+      for (int i = 0; i < NQ; ++i) W[r * NQ + i] = dot(K + i * NQ, e->A[r], i + 1);
+    pseudo_inverse(W, P);
+    for (int r = 0; r < ROWS; ++r)
+      for (int s = 0; s < ROWS; ++s) {
+        double sum = 0.0;
+        for (int i = 0; i < NQ; ++i) sum += P[i * ROWS + r] * P[i * ROWS + s];
+        e->S[r][s] = sum;
+      }
+    for (int i = 0; i < NQ; ++i)
+      for (int r = 0; r < ROWS; ++r) {
+        double sum = 0.0;
+        for (int k = i; k < NQ; ++k) sum += K[k * NQ + i] * P[k * ROWS + r];
+        e->L[i][r] = sum;
+      }
+    for (int i = 0; i < NQ; ++i)
+      for (int j = 0; j < NQ; ++j)
+        for (int r = 0; r < ROWS; ++r) e->H[i][j] -= e->L[i][r] * along[r][j];
+  }
+#else
+  (void)closed;
+#endif
+  motion_under(e, Q, e->qdd, e->load);
+  return 1;
+}
+
+/* ---- friction -mu lambda s(v) of contacts, s(v) = v / sqrt(|v|^2 + eps^2), which goes with lambda ---- */
+
+#if COULOMB > 0
+/* u = -J_E^T s(v), the generalized force of a unit friction force */
+static void against_sliding(const touching *at, double smoothing, double *u) {
+  const double size = sqrt(dot3(at->sliding, at->sliding) + smoothing * smoothing);
+  for (int j = 0; j < NQ; ++j) {
+    u[j] = 0.0;
+    for (int x = 0; x < 3; ++x) u[j] -= at->sliding_jacobian[x][j] * at->sliding[x] / size;
+  }
+}
+
+/* gain = U (I + L^T U)^-1 `(NQ, ROWS)`, from the multiplier without friction to the friction */
+static int friction_gain(const equations *e, double *restrict gain) {
+  double U[ROWS][NQ], X[ROWS][ROWS + NQ];
+  memset(U, 0, sizeof U);
+  for (int f = 0; f < COULOMB; ++f) {
+    against_sliding(&e->contact[COULOMB_CONTACT[f]], COULOMB_SMOOTHING[f], U[COULOMB_CONTACT[f]]);
+    for (int j = 0; j < NQ; ++j) U[COULOMB_CONTACT[f]][j] *= COULOMB_COEFFICIENT[f];
+  }
+  /* gain (I + L^T U) = U, so (I + L^T U)^T gain^T = U^T */
+  for (int r = 0; r < ROWS; ++r) {
+    for (int s = 0; s < ROWS; ++s) {
+      X[r][s] = r == s ? 1.0 : 0.0;
+      for (int j = 0; j < NQ; ++j) X[r][s] += e->L[j][s] * U[r][j];
+    }
+    memcpy(X[r] + ROWS, U[r], sizeof U[r]);
+  }
+  for (int r = 0; r < ROWS; ++r) {
+    int pivot = r;
+    for (int s = r + 1; s < ROWS; ++s) pivot = fabs(X[s][r]) > fabs(X[pivot][r]) ? s : pivot;
+    if (X[pivot][r] == 0.0) return 0;
+    for (int c = 0; c < ROWS + NQ; ++c) {
+      const double kept = X[r][c];
+      X[r][c] = X[pivot][c], X[pivot][c] = kept;
+    }
+    for (int s = 0; s < ROWS; ++s) {
+      const double factor = X[s][r] / X[r][r];
+      for (int c = r; s != r && c < ROWS + NQ; ++c) X[s][c] -= factor * X[r][c];
+    }
+  }
+  for (int j = 0; j < NQ; ++j)
+    for (int r = 0; r < ROWS; ++r) gain[j * ROWS + r] = X[r][ROWS + j] / X[r][r];
+  return 1;
+}
+#endif
+
+/* ---- every quantity as an affine map of the forces: z = B_Q Q + B_z Q_z + B_N Q_N + B_F Q_F + o ---- */
+
+typedef struct {
+  double B_Q[SIZE_OF_ALL][NQ]; /* on the joint force Q */
+  double B_z[SIZE_OF_ALL][NQ]; /* on the friction Q_z of contacts */
+  double B_N[SIZE_OF_ALL][NQ]; /* on the part of Q along the constraint, which moves nothing */
+  double B_F[SIZE_OF_ALL][NQ]; /* on the friction of the joints alone */
+  double o[SIZE_OF_ALL];
+} affine;
+
+int forcegp_size(unsigned quantities) {
+  int size = 0;
+  for (int bit = 0; bit < QUANTITIES; ++bit) size += quantities >> bit & 1u ? SIZES[bit] : 0;
+  return size;
+}
+
+/* the rows of the requested quantities; the bits are those of the header, in this order */
+static int maps(const equations *restrict e, const double *restrict gain, unsigned wanted, affine *restrict z) {
+  const int size = forcegp_size(wanted);
+  double lambda_0[SOME(ROWS)]; /* (A M^-1 A^T)^+ b */
+  int row = 0;
+  memset(z->B_Q, 0, sizeof(double[NQ]) * size), memset(z->B_z, 0, sizeof(double[NQ]) * size);
+  memset(z->B_N, 0, sizeof(double[NQ]) * size), memset(z->B_F, 0, sizeof(double[NQ]) * size);
+  memset(z->o, 0, sizeof(double) * size);
+  for (int r = 0; r < ROWS; ++r) lambda_0[r] = dot(e->S[r], e->b, ROWS);
+  if (wanted & FORCEGP_QDD) /* qdd = L b + H (Q + Q_z) */
+    for (int i = 0; i < NQ; ++i, ++row) {
+      memcpy(z->B_Q[row], e->H[i], sizeof e->H[i]), memcpy(z->B_z[row], e->H[i], sizeof e->H[i]);
+      z->o[row] = dot(e->L[i], e->b, ROWS);
+    }
+  if (wanted & FORCEGP_QDD_FREE) /* M^-1 Q */
+    for (int i = 0; i < NQ; ++i, ++row)
+      memcpy(z->B_Q[row], e->M_inv[i], sizeof e->H[i]), memcpy(z->B_N[row], e->M_inv[i], sizeof e->H[i]);
+  for (int kind = 0; kind < 3; ++kind) {
+    /* lambda = (A M^-1 A^T)^+ b - L^T (Q + Q_z), A^T lambda, and n lambda of each contact */
+    static const unsigned of_multiplier[3] = {FORCEGP_MULTIPLIER, FORCEGP_CONSTRAINT_FORCE, FORCEGP_CONTACT_FORCE};
+    static const int rows[3] = {ROWS, NQ, 3 * CONTACTS};
+    if (!(wanted & of_multiplier[kind])) continue;
+    for (int i = 0; i < rows[kind]; ++i, ++row)
+      for (int r = 0; r < ROWS; ++r) {
+        double share = kind == 0 ? (i == r ? 1.0 : 0.0) : e->A[r][i % NQ];
+        if (kind == 2) share = i / 3 == r ? e->contact[r].normal[i % 3] : 0.0;
+        for (int j = 0; j < NQ; ++j) z->B_Q[row][j] -= share * e->L[j][r];
+        z->o[row] += share * lambda_0[r];
+        memcpy(z->B_z[row], z->B_Q[row], sizeof z->B_Q[row]), memcpy(z->B_N[row], z->B_Q[row], sizeof z->B_Q[row]);
+      }
+  }
+  for (int i = 0; wanted & FORCEGP_TOTAL_FORCE && i < NQ; ++i, ++row) z->B_Q[row][i] = z->B_z[row][i] = z->B_N[row][i] = 1.0;
+  for (int i = 0; wanted & FORCEGP_JOINT_FORCE && i < NQ; ++i, ++row) z->B_Q[row][i] = z->B_N[row][i] = 1.0;
+  for (int i = 0; wanted & FORCEGP_CONTACT_FRICTION && i < NQ; ++i, ++row) z->B_z[row][i] = 1.0;
+  for (int i = 0; wanted & FORCEGP_JOINT_FRICTION && i < NQ; ++i, ++row) z->B_F[row][i] = 1.0, z->o[row] = e->Q_D[i];
+#if COULOMB > 0
+  for (row = 0; row < size; ++row) { /* B_Q - G L^T, B_z - G L^T, o + G lambda_0 with G = B_z gain */
+    double G[ROWS];
+    combine(gain, z->B_z[row], NQ, ROWS, G);
+    for (int r = 0; r < ROWS; ++r) {
+      z->o[row] += G[r] * lambda_0[r];
+      for (int j = 0; j < NQ; ++j) {
+        const double back = G[r] * e->L[j][r];
+        z->B_Q[row][j] -= back, z->B_z[row][j] -= back, z->B_N[row][j] -= back;
+      }
+    }
+  }
+#else
+  (void)gain;
+#endif
+  return size;
+}
+
+/* ---- the latent forces f of the priors, Q = m + sum of E f ---- */
+
+typedef struct {
+  double mean[COMPONENTS], prior[COMPONENTS]; /* posterior mean of f; variance before the data */
+  double rest[COMPONENTS];                    /* diagonal part D of the posterior covariance */
+  double E[COMPONENTS][NQ];                   /* generalized force of each f */
+  double T[COMPONENTS][RANK];                 /* the covariance is D + T T^T or, with SIGN -1, D - T T^T */
+} latent;
+
+/* row = V^T C, the functions V of a component in the columns from `first` on */
+static void root_row(const double *restrict C, const double *restrict V, int n, int first, double *restrict row) {
+  for (int c = 0; c < first; ++c) row[c] = 0.0;
+  combine(C, V, n, RANK - first, row + first);
+}
+
+/* posterior of component k, from its functions V: m covariances k(x, Z) of the prior variance `variance`, and
+ * features phi(x) */
+static void component(const double *restrict V, int m, int features, double variance, const double *restrict weights,
+                      const double *restrict whitening, int kept, const double *restrict C, int first, int spread,
+                      int k, latent *restrict f) {
+  const double more = dot(V + m, V + m, features);
+  f->mean[k] = dot(V, weights, m + features);
+  f->prior[k] = variance + more;
+  f->rest[k] = SIGN > 0.0 ? variance : variance + more;
+  if (!spread) return;
+  if (whitening) { /* D = k - |R^T k(Z, x)|^2, what the support points miss */
+    double white[MOST_FUNCTIONS];
+    combine(whitening, V, m, kept, white);
+    memcpy(white + kept, V + m, sizeof(double) * features);
+    f->rest[k] = fmax(variance - dot(white, white, kept), 0.0);
+    root_row(C, white, kept + features, first, f->T[k]);
+  } else
+    root_row(C, V, m + features, first, f->T[k]);
+}
+
+/* HELPERS: each of these is written where a prior uses it */
+
+/* E = 1 of a force of each joint */
+static void identity(int count, double (*restrict E)[NQ]) {
+  for (int k = 0; k < count; ++k)
+    for (int j = 0; j < NQ; ++j) E[k][j] = j == k ? 1.0 : 0.0;
+}
+
+/* E = A^T L^T of a joint force along the constraint */
+static void along_constraint(const equations *restrict e, double (*restrict E)[NQ]) {
+  for (int k = 0; k < NQ; ++k)
+    for (int j = 0; j < NQ; ++j) {
+      E[k][j] = 0.0;
+      for (int r = 0; r < ROWS; ++r) E[k][j] += e->A[r][j] * e->L[k][r];
+    }
+}
+
+/* E = J_E^T (t_1, t_2) of any force along the surface */
+static void tangential(const equations *restrict e, int c, double (*restrict E)[NQ]) {
+  const touching *at = &e->contact[c];
+  memset(E, 0, sizeof(double[2][NQ]));
+  for (int t = 0; e->closed[c] && t < 2; ++t)
+    for (int x = 0; x < 3; ++x)
+      for (int j = 0; j < NQ; ++j) E[t][j] += at->tangent[t][x] * at->jacobian[x][j];
+}
+
+/* E of friction that opposes sliding: viscous, dry, and in proportion to the multiplier Coulomb's, Stribeck's
+ * and torsion; 0 if the contact jams with the friction coefficient mu */
+static int against(const equations *restrict e, const double *restrict qd, int c, const int *restrict terms, int count,
+                   double smoothing, double mu, double stribeck_speed, double torsion_smoothing, double (*restrict E)[NQ]) {
+  enum { VISCOUS, DRY, COULOMBS, STRIBECKS, TORSION };
+  const touching *at = &e->contact[c];
+  const double square = dot3(at->sliding, at->sliding), size = sqrt(square + smoothing * smoothing);
+  const double rate = dot(at->turning, qd, NQ), spin = sqrt(rate * rate + torsion_smoothing * torsion_smoothing);
+  double push[NQ], relief = 1.0, load;
+  int loaded = 0;
+  memset(E, 0, sizeof(double[NQ]) * count);
+  if (!e->closed[c]) return 1;
+  for (int j = 0; j < NQ; ++j) {
+    push[j] = 0.0;
+    for (int x = 0; x < 3; ++x) push[j] -= at->sliding_jacobian[x][j] * at->sliding[x];
+    relief += mu * e->L[j][c] * push[j] / size;
+  }
+  load = fmax(e->load[c], 0.0) / relief; /* lambda of the analytical forces with the friction mu lambda s */
+  for (int k = 0; k < count; ++k) {
+    loaded |= terms[k] >= COULOMBS;
+    for (int j = 0; j < NQ; ++j) {
+      const double dry = push[j] / size, fading = exp(-square / (stribeck_speed * stribeck_speed));
+      E[k][j] = terms[k] == VISCOUS    ? push[j]
+                : terms[k] == DRY      ? dry
+                : terms[k] == COULOMBS ? load * dry
+                : terms[k] == STRIBECKS ? load * dry * fading
+                                        : -load * at->turning[j] * rate / spin;
+    }
+  }
+  return !loaded || relief > 0.0;
+}
+
+/* E = d(mu u)/d(log mu, log eps) lambda, with the multiplier of the analytical forces and this friction */
+static void friction_error(const equations *restrict e, const double *restrict tau, const double *restrict gain, int c,
+                           double mu, double smoothing, double (*restrict E)[NQ]) {
+  const touching *at = &e->contact[c];
+  const double square = dot3(at->sliding, at->sliding), fading = smoothing * smoothing / (square + smoothing * smoothing);
+  double u[NQ], Q[NQ], qdd[NQ], multiplier[SOME(ROWS)];
+  against_sliding(at, smoothing, u);
+  for (int j = 0; j < NQ; ++j)
+    Q[j] = e->Q_C[j] + e->Q_G[j] + e->Q_D[j] + tau[j] + dot(gain + j * ROWS, e->load, ROWS);
+  motion_under(e, Q, qdd, multiplier);
+  for (int j = 0; j < NQ; ++j) {
+    E[0][j] = e->closed[c] ? mu * multiplier[c] * u[j] : 0.0;
+    E[1][j] = -fading * E[0][j];
+  }
+}
+
+/* u_j = |x - z_j|^2 of scaled inputs x and m support points, one input after the other */
+static void squares(const double *restrict x, const double *restrict Z, int width, int m, double *restrict u) {
+  for (int j = 0; j < m; ++j) u[j] = 0.0;
+  for (int d = 0; d < width; ++d)
+    for (int j = 0; j < m; ++j) {
+      const double apart = x[d] - Z[(long)d * m + j];
+      u[j] += apart * apart;
+    }
+}
+
+/* exp(-r^2/2) */
+static void squaredexponential(double *restrict u, int m) {
+  for (int j = 0; j < m; ++j) u[j] = exp(-0.5 * fmin(u[j], 600.0));
+}
+
+/* (1 + r) exp(-r) at sqrt(3) r */
+static void matern32(double *restrict u, int m) {
+  for (int j = 0; j < m; ++j) u[j] = sqrt(3.0 * u[j]), u[j] = (1.0 + u[j]) * exp(-fmin(u[j], 300.0));
+}
+
+/* (1 + r + r^2/3) exp(-r) at sqrt(5) r */
+static void matern52(double *restrict u, int m) {
+  for (int j = 0; j < m; ++j) u[j] = sqrt(5.0 * u[j]), u[j] = (1.0 + u[j] + u[j] * u[j] / 3.0) * exp(-fmin(u[j], 300.0));
+}
+
+/* PRIORS */
+
+#ifdef INERTIAL
+/* E = -Y(q, qdd, qd) S of errors of the inertial parameters */
+static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, latent *restrict f) {
+  double sine[NQ], cosine[NQ], *E = f->E[INERTIAL];
+  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
+  regressor(q, qd, qdd, sine, cosine, E);
+  for (int k = 0; k < 10 * NQ; ++k)
+    for (int j = 0; j < NQ; ++j) E[k * NQ + j] *= -INERTIAL_SCALE[k];
+}
+#endif
+
+/* ---- reading quantities off the posterior of the forces ---- */
+
+/* z = o + B_Q (m + sum of E f) + B_z ... */
+static void read_mean(const affine *restrict z, const latent *restrict f, const double *restrict prior_mean, int size,
+                      double *restrict mean) {
+  double force[4][NQ];
+  memset(force, 0, sizeof force);
+  memcpy(force[JOINT], prior_mean, sizeof force[JOINT]);
+  for (int k = 0; k < COMPONENTS; ++k)
+    for (int j = 0; j < NQ; ++j) {
+      force[TARGET[k]][j] += f->E[k][j] * f->mean[k];
+      if (IS_FRICTION[k]) force[JOINT_FRICTION][j] += f->E[k][j] * f->mean[k];
+    }
+  for (int a = 0; a < size; ++a)
+    mean[a] = z->o[a] + dot(z->B_Q[a], force[JOINT], NQ) + dot(z->B_z[a], force[CONTACT], NQ) +
+              dot(z->B_N[a], force[CONSTRAINT], NQ) + dot(z->B_F[a], force[JOINT_FRICTION], NQ);
+}
+
+/* W D W^T + W T T^T W^T with W = B E, and the variance of unknown forces; 0 if a variance is rounding */
+static int read_covariance(const affine *restrict z, const latent *restrict f, const double *restrict unknown,
+                           int size, double *restrict covariance) {
+  double root[SIZE_OF_ALL][RANK], W[SIZE_OF_ALL][COMPONENTS], scaled[COMPONENTS];
+  int resolved = 1;
+  for (int a = 0; a < size; ++a) {
+    for (int k = 0; k < COMPONENTS; ++k) {
+      const double *B = TARGET[k] == CONTACT ? z->B_z[a] : TARGET[k] == CONSTRAINT ? z->B_N[a] : z->B_Q[a];
+      W[a][k] = dot(B, f->E[k], NQ) + (IS_FRICTION[k] ? dot(z->B_F[a], f->E[k], NQ) : 0.0);
+    }
+    combine(&f->T[0][0], W[a], COMPONENTS, RANK, root[a]);
+  }
+  for (int a = 0; a < size; ++a) {
+    double before = 0.0, carried[NQ];
+    for (int k = 0; k < COMPONENTS; ++k) scaled[k] = W[a][k] * f->rest[k], before += W[a][k] * W[a][k] * f->prior[k];
+    for (int j = 0; j < NQ; ++j) carried[j] = (z->B_Q[a][j] + z->B_F[a][j]) * unknown[j];
+    for (int b = 0; b <= a; ++b) {
+      const double learned = SIGN * dot(root[a], root[b], RANK) + dot(scaled, W[b], COMPONENTS);
+      if (a == b && learned < SMALLEST_FRACTION * before) resolved = 0;
+      covariance[a * size + b] = learned + dot(carried, z->B_Q[b], NQ) + dot(carried, z->B_F[b], NQ);
+    }
+  }
+  for (int a = 0; a < size; ++a)
+    for (int b = a + 1; b < size; ++b) covariance[a * size + b] = covariance[b * size + a];
+  return resolved;
+}
+
+/* how far speed and torque lie beyond those of the training data, in their standard deviations */
+static void distance(const double *restrict qd, const double *restrict tau, double *restrict beyond) {
+  for (int i = 0; i < NQ; ++i) {
+    const double v = fmax(fmax(LOW[0][i] - qd[i], qd[i] - HIGH[0][i]), 0.0) / SPREAD[0][i];
+    const double t = fmax(fmax(LOW[1][i] - tau[i], tau[i] - HIGH[1][i]), 0.0) / SPREAD[1][i];
+    beyond[i] = sqrt(v * v + t * t);
+  }
+}
+
+int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                    unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
+  equations e;
+  latent f;
+  affine z;
+  double prior_mean[NQ], far[NQ], unknown[NQ], gain[NQ * SOME(ROWS)];
+  int size, status;
+  for (int i = 0; i < NQ; ++i)
+    if (!isfinite(q[i]) || !isfinite(qd[i]) || !isfinite(tau[i])) return FORCEGP_NOT_FINITE;
+  if (!assemble(q, qd, tau, closed, &e)) return FORCEGP_NO_INERTIA;
+#if COULOMB > 0
+  if (!friction_gain(&e, gain)) return FORCEGP_JAMMED;
+#endif
+  distance(qd, tau, far);
+  if (beyond) memcpy(beyond, far, sizeof far);
+  for (int i = 0; i < NQ; ++i)
+    prior_mean[i] = MEAN_TERMS[0] * e.Q_C[i] + MEAN_TERMS[1] * e.Q_G[i] + MEAN_TERMS[2] * e.Q_D[i] + MEAN_TERMS[3] * tau[i];
+  if ((status = latent_forces(q, qd, tau, &e, gain, covariance != NULL, &f)) != 0) return status;
+#ifdef INERTIAL
+  inertial(q, qd, e.qdd, &f);
+  if (covariance) { /* errors of the inertia are multiplied by the predicted acceleration */
+    double qdd[NQ];
+    maps(&e, gain, FORCEGP_QDD, &z);
+    read_mean(&z, &f, prior_mean, NQ, qdd);
+    inertial(q, qd, qdd, &f);
+  }
+#endif
+  size = maps(&e, gain, quantities, &z);
+  read_mean(&z, &f, prior_mean, size, mean);
+  if (!covariance) return 0;
+  for (int i = 0; i < NQ; ++i) {
+    const double slow = qd[i] / STICK_SPEED[i], grown = GROWTH[i] * far[i];
+    unknown[i] = STICK_VARIANCE[i] * exp(-slow * slow) + EXTERNAL_VARIANCE[i] + grown * grown;
+    if (noise) unknown[i] += TORQUE_VARIANCE[i];
+  }
+  status = read_covariance(&z, &f, unknown, size, covariance) ? 0 : FORCEGP_UNRESOLVED;
+  if (noise)
+    for (int bit = 0, row = 0; bit < QUANTITIES; ++bit)
+      for (int i = 0; quantities >> bit & 1u && i < SIZES[bit]; ++i, ++row)
+        covariance[row * size + row] += SENSOR_VARIANCE[bit] ? SENSOR_VARIANCE[bit][i] : 0.0;
+  return status;
+}
+
+void forcegp_forward_dynamics(const double *q, const double *qd, const double *force, double *qdd) {
+  double sine[NQ], cosine[NQ];
+  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
+  forward_dynamics(q, qd, force, sine, cosine, qdd);
+}
+
+int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                         unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
+  const int d = forcegp_size(quantities);
+  int worst = 0;
+  for (long i = 0; i < count; ++i) {
+    const int status =
+        forcegp_predict(q + i * NQ, qd + i * NQ, tau + i * NQ, closed ? closed + i * CONTACTS : NULL, quantities, noise,
+                        mean + i * d, covariance ? covariance + i * d * d : NULL, beyond ? beyond + i * NQ : NULL);
+    worst = worst ? worst : status;
+  }
+  return worst;
+}

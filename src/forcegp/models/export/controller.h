@@ -1,0 +1,55 @@
+/* Forces and accelerations of a robot with learned forces, written by forcegp.
+ *
+ * M qdd = Q + Q_z + A^T lambda and A qdd = b. All units are SI, angles in radians, vectors in world axes.
+ * No function allocates, none has state of its own: they are reentrant, and their run time is bounded.
+ *
+ * Joints, in order: @joints@
+ * Contacts, in order: @touching@
+ */
+#ifndef FORCEGP_H
+#define FORCEGP_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define FORCEGP_JOINTS @nq@
+#define FORCEGP_CONTACTS @contacts@
+
+/* Quantities; join them by |. They lie in this order in mean and covariance. */
+@bits@
+
+/* What is returned other than 0 */
+#define FORCEGP_NOT_FINITE 1 /* a state is not finite; nothing is written */
+#define FORCEGP_JAMMED 2     /* friction of a contact would press harder than it opposes */
+#define FORCEGP_UNRESOLVED 3 /* a variance is rounding */
+#define FORCEGP_NO_INERTIA 4 /* the mass matrix is not positive definite */
+
+/* Number d of components of quantities. */
+int forcegp_size(unsigned quantities);
+
+/* Posterior mean and covariance of quantities at one state.
+ *
+ * q, qd, tau   FORCEGP_JOINTS positions, velocities and motor torques
+ * closed       FORCEGP_CONTACTS flags, which contacts are closed; NULL for all
+ * quantities   such as FORCEGP_QDD | FORCEGP_MULTIPLIER
+ * noise        whether the covariance is that of a measurement, noise of torque and sensor included
+ * mean         d numbers
+ * covariance   d x d numbers, row by row; NULL if it is not needed, which costs less
+ * beyond       FORCEGP_JOINTS distances of speed and torque from those of the training data, in their
+ *              standard deviations, 0 inside; beyond 3 error bars are a guess. NULL if not needed
+ */
+int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                    unsigned quantities, int noise, double *mean, double *covariance, double *beyond);
+
+/* The same at `count` states, one after the other; returns the first error. */
+int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                         unsigned quantities, int noise, double *mean, double *covariance, double *beyond);
+
+/* Free acceleration M^-1 (force + Q_C + Q_G) of the robot alone. */
+void forcegp_forward_dynamics(const double *q, const double *qd, const double *force, double *qdd);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

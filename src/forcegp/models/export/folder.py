@@ -1,0 +1,133 @@
+"""The folder of an exported model: C code, a test program with reference values, CMakeLists.txt, README."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from forcegp.destination import check_destination, write_or_keep
+from forcegp.errors import ParameterError, check_name
+from forcegp.files import written_folder
+from forcegp.forces.measurements import Training
+from forcegp.forces.noise import HIGH, LOW
+from forcegp.models.export.library import CompiledFit
+from forcegp.models.export.model import ExportedModel
+from forcegp.models.export.source import READ, c_source, template
+from forcegp.models.prediction import Predictor
+
+LANGUAGES = ("c",)
+STATES, LOSS_STATES = 16, 200
+"""States of the test program, and those at which the loss of a reduced posterior is measured."""
+TOLERANCE, ZERO = 1e-10, 1e-5
+"""Largest difference from Python in units of max(|mean|, σ), or `ZERO` of the largest one of a state."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was written.
+
+    Attributes:
+        folder: where.
+        functions: functions of the covariance.
+        widest, wider: growth of σ of q̈ and λ by a reduced covariance at training states, the largest and the
+            median one, as fractions; the mean loses nothing.
+    """
+
+    folder: Path
+    functions: int
+    widest: float = 0.0
+    wider: float = 0.0
+
+
+def write_export(
+    model: ExportedModel, fit: Predictor, training: Training, path: str | Path, language: str, name: str
+) -> Export:
+    """Write a model to a folder; arguments and errors as of `StructuredFit.export`."""
+    check_name("language of an export", language, LANGUAGES)
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
+        raise ParameterError(
+            f"{name!r} cannot be the prefix of C functions",
+            expected="lower-case letters, digits and underscores, a letter first",
+        )
+    own = (f"{name}.h", f"{name}.c", f"test_{name}.c", "CMakeLists.txt", "README.md", "build")
+    check_destination(path, folder=True, own_files=own)
+    header, source = c_source(model, name)
+    result = Export(Path(path), model.parts()[0].rank, *loss_of(model, fit, training))
+    loss = "It is reduced: at training states σ of q̈ and λ is wider by a fraction\n"
+    loss += f"of {result.widest:.2g} at most, {result.wider:.2g} in the median. The mean loses nothing."
+    fields = {
+        "name": name,
+        "NAME": name.upper(),
+        "robot": model.system.robot.name,
+        "functions": result.functions,
+        "loss": "" if model.functions is None else loss,
+        "tables": _reference(model, fit, name),
+    }
+    texts = {f"{name}.h": header, f"{name}.c": source, f"test_{name}.c": template("test.c", fields)}
+    texts |= {file: template(f"{file}.in", fields) for file in ("CMakeLists.txt", "README.md")}
+
+    def write(folder: Path) -> None:
+        with written_folder(folder) as temporary:
+            for file, text in texts.items():
+                (temporary / file).write_text(text, encoding="utf-8")
+
+    write_or_keep(write, path)
+    return result
+
+
+def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[float, float]:
+    """Growth of σ of q̈ and λ by a reduced covariance at training states, or random ones if none are kept."""
+    if model.functions is None:
+        return 0.0, 0.0
+    states = random_states(model, LOSS_STATES)
+    if training.samples:
+        few = training.evenly(LOSS_STATES).measurements
+        states = tuple(torch.cat([getattr(m, x) for m in few]) for x in ("q", "qd", "tau", "active"))
+    read = [
+        x.predict(*states[:3], ["qdd", "multiplier"], active=states[3])  # pyright: ignore
+        for x in (CompiledFit(model), fit)
+    ]
+    small, whole = (x.covariance.diagonal(dim1=-2, dim2=-1).sqrt() for x in read if x.covariance is not None)
+    # Nothing is lost of structural zeros, such as λ of an open contact.
+    growth = (small / whole - 1.0)[whole > ZERO * whole.amax()]
+    return float(growth.max()), float(growth.median())
+
+
+def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
+    """Random q, q̇, τ and closed contacts within the joint limits and, if it is known, the trained region."""
+    robot, random = model.system.robot, torch.Generator().manual_seed(0)
+    one = torch.ones(robot.nq, dtype=torch.float64)
+    limits = [
+        (robot.lower.clamp(min=-2.0), robot.upper.clamp(max=2.0)),
+        (-one, one),
+        (-10.0 * one, 10.0 * one),
+    ]
+    if LOW in model.tensors:
+        limits[1:] = zip(model.tensors[LOW], model.tensors[HIGH], strict=True)
+    shares = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=random)
+    state = [low + share * (high - low) for (low, high), share in zip(limits, shares, strict=True)]
+    return *state, torch.rand(count, len(model.system.contacts), generator=random) < 0.7
+
+
+def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
+    """C tables of states, and of mean and covariance of all quantities of Python there."""
+    q, qd, tau, active = random_states(model, STATES)
+    read = fit.predict(q, qd, tau, list(READ[:-1]), active=active)  # pyright: ignore[reportArgumentType]
+    assert read.covariance is not None
+    wanted = " | ".join(f"{name.upper()}_{x.upper()}" for x in READ[:-1])
+    reduced = int(model.functions is not None)
+    lines = [
+        f"enum {{ STATES = {STATES}, D = {read.mean.shape[1]}, REDUCED = {reduced}, WANTED = {wanted} }};"
+    ]
+    lines.append(f"static const double TOLERANCE = {TOLERANCE!r}, ZERO = {ZERO!r};")
+    flags = torch.nn.functional.pad(active, (0, int(not active.shape[1]))).int()
+    tables = {"q": q, "qd": qd, "tau": tau, "mean": read.mean, "covariance": read.covariance.flatten(1)}
+    for key, x in {**tables, "closed": flags}.items():
+        kind = "unsigned char" if key == "closed" else "double"
+        rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
+        lines.append(f"static const {kind} {key}[STATES][{x.shape[1]}] = {{{rows}}};")
+    return "\n".join(lines)

@@ -1,0 +1,217 @@
+"""The numbers of a fitted model that its C code contains: functions of each prior, and their posterior.
+
+The posterior covariance of the latent forces f is D ± T Tᵀ, with a diagonal D and rows T = V(x)ᵀ C of each
+component. V are its functions: covariances k(x, X) with support points, and the features φ(x) of the finite
+part of its kernel. For a posterior over basis functions with weights of precision A = L Lᵀ, C = L⁻ᵀ and D is
+what the points miss; V is whitened then. For an exact one with Σ = L Lᵀ, C = Wᵀ L⁻ᵀ, D = k(x, x), with the
+sign −. A posterior reduced to r functions has D = k(x, x) and the sign − too: A⁻¹ = I − U (1 − Λ⁻¹) Uᵀ with
+the r largest eigenvalues Λ of A, or Σ⁻¹ = U Λ⁻¹ Uᵀ with those of Σ. These are the directions that the rows
+of the training states determine most. What is left out only widens the error bars; the mean keeps all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
+from forcegp.errors import ModelError
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors import contact, joint
+from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.gp.basis import KernelPart, split
+from forcegp.gp.exact import ExactPosterior
+from forcegp.gp.features import Features, points
+from forcegp.gp.kernels import Constant, Kernel, Linear, Matern32, Matern52, SquaredExponential, Sum, sub
+from forcegp.gp.sparse import SparsePosterior
+
+PRIORS = (joint.JointForcePrior, joint.JointFrictionPrior, InertialPrior, contact.NormalForcePrior)
+PRIORS += (contact.SlidingFrictionPrior, contact.ContactForcePrior, contact.CoulombErrorPrior)
+KERNELS = (Linear, Constant, SquaredExponential, Matern32, Matern52)
+LARGEST = 1700
+"""Functions of a posterior that is not reduced; some 30 MB of text, which takes a compiler half a minute."""
+
+
+@dataclass(frozen=True, eq=False)
+class Functions:
+    """The functions V of one prior and their posterior.
+
+    Attributes:
+        prior: the force prior.
+        rest, finite: the part of its kernel that has support points, and that with features, if any.
+        support: standardized inputs of the m support points.
+        weights: of k(x, X) and φ, whose sum is the posterior mean `(components, m + features)`.
+        whitening: what k(x, X) is multiplied by in T, a matrix `(m, kept)` for each component, or `None`.
+        roots: C of each component, `(functions, rank − first)`.
+        first: first column that is not zero, by component.
+    """
+
+    prior: ForcePrior
+    rest: KernelPart | None
+    finite: KernelPart | None
+    support: Features
+    weights: Tensor
+    whitening: tuple[Tensor, ...] | None
+    roots: tuple[Tensor, ...]
+    first: tuple[int, ...]
+
+    @property
+    def components(self) -> int:
+        """Number of components of the latent force."""
+        return len(self.weights)
+
+    @property
+    def rank(self) -> int:
+        """Number of columns of T."""
+        return self.first[0] + self.roots[0].shape[1]
+
+    @property
+    def size(self) -> int:
+        """Number m of support points."""
+        return 0 if self.rest is None else points(self.support)
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedModel:
+    """What is exported of a fit.
+
+    Attributes:
+        system: robot and contacts.
+        posterior: over latent forces.
+        tensors: all hyperparameters.
+        noise: standard deviation of a measurement of each measured quantity.
+        torque_std, external_std: of the motor torques' noise and of unknown forces on joints, or `None`.
+        functions: number r that the covariance is reduced to; `None` for all.
+    """
+
+    system: ConstrainedSystem
+    posterior: ForcePosterior
+    tensors: Mapping[str, Tensor]
+    noise: Mapping[str, Tensor]
+    torque_std: Tensor | None
+    external_std: Tensor | None
+    functions: int | None = None
+
+    def check(self) -> None:
+        """Check that all parts of the model have a C form.
+
+        Raises:
+            ModelError: a prior, kernel, contact or mean has none, or the posterior is too large; names it.
+        """
+        if self.system.robot.device.type != "cpu":
+            raise ModelError("a fit on a GPU is not exported", hint="save it, and load it on the CPU")
+        for each in self.system.contacts:
+            if not isinstance(each, SurfaceContact) or each.stick_speed is not None:
+                raise _no_c("contact", each.name, each, "a SurfaceContact that always slides")
+            if type(each.surface) not in (Plane, Sphere, Cylinder):
+                raise _no_c("surface of contact", each.name, each.surface, "plane, sphere or cylinder")
+        if not isinstance(self.posterior.process.mean, joint.AnalyticalMean):
+            raise _no_c("mean", "Q", self.posterior.process.mean, "an AnalyticalMean")
+        for prior in self.posterior.priors:
+            if type(prior) not in PRIORS:
+                raise _no_c("force prior", prior.name, prior, ", ".join(x.__name__ for x in PRIORS))
+            _check_kernel(prior.name, prior.kernel)
+        if sum(isinstance(prior, InertialPrior) for prior in self.posterior.priors) > 1:
+            raise ModelError("a fit with two priors on the inertia is not exported", expected="one at most")
+        if self.functions is not None and self.functions < 1:
+            raise ModelError(
+                "a posterior has one function at least", expected="1 or more", got=self.functions
+            )
+        latent = self.posterior.latent
+        size = latent.basis.size if isinstance(latent, SparsePosterior) else len(latent.alpha)
+        if self.functions is None and size > LARGEST:
+            raise ModelError(
+                f"a posterior over {size} functions is too large for C code",
+                expected=f"at most {LARGEST}",
+                hint="reduce its covariance with functions=200 (--functions 200)",
+            )
+
+    @property
+    def sign(self) -> int:
+        """Of T Tᵀ in the covariance."""
+        return 1 if isinstance(self.posterior.latent, SparsePosterior) and self.functions is None else -1
+
+    def parts(self) -> list[Functions]:
+        """The functions of each prior with their posterior."""
+        if isinstance(self.posterior.latent, SparsePosterior):
+            return self._of_basis(self.posterior.latent)
+        return self._of_rows(self.posterior.latent)
+
+    def _of_basis(self, latent: SparsePosterior) -> list[Functions]:
+        means, basis, parts = self.posterior.means, latent.basis, []
+        assert isinstance(means, SparsePosterior)
+        if self.functions is None:
+            eye = torch.eye(len(latent.L), dtype=latent.L.dtype)
+            # C = L⁻ᵀ, upper triangular
+            C = torch.linalg.solve_triangular(latent.L, eye, upper=False).mT
+        else:
+            # C = U √(1 − Λ⁻¹)
+            values, vectors = torch.linalg.eigh(latent.L @ latent.L.mT)
+            kept = slice(-self.functions, None)
+            C = vectors[:, kept] * (1.0 - 1.0 / values[kept]).clamp(min=0.0).sqrt()
+        for p, (part, components) in enumerate(zip(basis.parts, basis.components, strict=True)):
+            columns = basis.columns[components]
+            on_kernel, on_features = means.folded[p]
+            weights = torch.cat([on_kernel, on_features], dim=1)[..., 0]
+            first = tuple(rows.start if self.functions is None else 0 for rows in columns)
+            roots = [C[rows, start:] for rows, start in zip(columns, first, strict=True)]
+            whitening = tuple(spectrum.root for spectrum in part.spectra) or None
+            if self.functions is not None and whitening is not None:
+                pairs = zip(roots, whitening, strict=True)
+                roots = [torch.cat([R @ x[: R.shape[1]], x[R.shape[1] :]]) for x, R in pairs]
+                whitening = None
+            support = part.inducing if part.to_inducing is not None else _none(part.inducing)
+            prior, (finite, rest) = self.posterior.priors[p], (part.split.finite, part.split.rest)
+            parts.append(Functions(prior, rest, finite, support, weights, whitening, tuple(roots), first))
+        return parts
+
+    def _of_rows(self, latent: ExactPosterior) -> list[Functions]:
+        means, L, parts = self.posterior.means, latent.conditioned.L, []
+        assert isinstance(means, ExactPosterior)
+        if self.functions is None:
+            rows = torch.linalg.solve_triangular(L, torch.eye(len(L), dtype=L.dtype), upper=False).mT
+        else:
+            values, vectors = torch.linalg.eigh(L @ L.mT)
+            rows = vectors[:, -self.functions :] * values[-self.functions :].rsqrt()
+        weights = means.weights_of(means.alpha[:, None])
+        for p, roots in enumerate(latent.weights_of(rows)):
+            prior = self.posterior.priors[p]
+            cut = split(prior.kernel, sub(latent.params, latent.processes[p].prefix))
+            names = latent.blocks[0].features[p]
+            X = {name: torch.cat([block.features[p][name] for block in latent.blocks]) for name in names}
+            # k(x, X) w = k_rest(x, X) w + φ(x)ᵀ (φ(X)ᵀ w), and likewise for C = Wᵀ L⁻ᵀ
+            both = torch.cat([torch.cat(weights[p], dim=1), torch.cat(roots, dim=1)], dim=-1)
+            on_rest = both if cut.rest is not None else both[:, :0]
+            on_features = both[:, :0]
+            if cut.finite is not None:
+                on_features = cut.finite.features(X).basis(X).mT @ both
+            whole = torch.cat([on_rest, on_features], dim=1)
+            support = X if cut.rest is not None else _none(X)
+            C, first = tuple(whole[..., 1:]), (0,) * len(whole)
+            parts.append(Functions(prior, cut.rest, cut.finite, support, whole[..., 0], None, C, first))
+        return parts
+
+
+def _none(features: Features) -> Features:
+    return {name: x[:0] for name, x in features.items()}
+
+
+def _check_kernel(name: str, kernel: Kernel) -> None:
+    if isinstance(kernel, Sum):
+        _check_kernel(name, kernel.left)
+        _check_kernel(name, kernel.right)
+    elif type(kernel) not in KERNELS:
+        raise _no_c("kernel of force prior", name, kernel, ", ".join(x.__name__ for x in KERNELS))
+
+
+def _no_c(what: str, name: str, thing: object, expected: str) -> ModelError:
+    return ModelError(
+        f"the {what} {name!r} cannot be exported as C",
+        expected=expected,
+        got=type(thing).__name__,
+        hint="predict in Python, or leave it out of the model",
+    )
