@@ -43,8 +43,8 @@ def export(
     C: one .h and one .c file: state and closed contacts to accelerations, multipliers and forces, each with
     mean and covariance. Beside them a test program with reference values, CMakeLists.txt and a README.
 
-    URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, in which nothing else
-    changes. Beside it a report with standard deviations and losses, and robots drawn from the posterior.
+    URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, in which nothing
+    else changes. Beside it a report with standard deviations and losses, and robots drawn from the posterior.
 
     [bold]Examples[/bold]
 
@@ -89,5 +89,5 @@ def _written_back(
         )
     found = write_calibrated(fit, robot, out, samples=samples, seed=seed)
     determined = sum(parameter.determined for parameter in found.parameters)
-    result = {"file": str(out), "report": str(out.with_name(f"{out.stem}.report.json"))}
+    result: dict[str, object] = {"file": str(out), "report": str(out.with_name(f"{out.stem}.report.json"))}
     return result | {"parameters": len(found.parameters), "determined": determined, "samples": samples}
