@@ -92,13 +92,11 @@ def mass_factor(M: Tensor) -> Tensor:
     Raises:
         NumericalError: one is not positive definite, as of a robot with negative masses.
     """
-    try:
-        return torch.linalg.cholesky(M)
-    except torch.linalg.LinAlgError as cause:
+    factor, info = torch.linalg.cholesky_ex(M)
+    if bool((info != 0).any()):
         hint = "check the masses and inertias of the robot, and that states are finite"
-        raise NumericalError(
-            "a mass matrix is not positive definite", got=str(cause)[:200], hint=hint
-        ) from cause
+        raise NumericalError("a mass matrix is not positive definite", hint=hint)
+    return factor
 
 
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ The ordered tree of links and joints becomes the robot model, with fixed joints 
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -238,7 +239,7 @@ def load_robot(
 
 
 def _read(source: str | Path) -> Tree:
-    path = Path(source).expanduser()
+    path = Path(os.path.expanduser(source))  # an unknown user is left as it is
     if str(source) in BUNDLED:
         path = Path(__file__).parent / "bundled" / f"{source}.urdf"
     elif not path.suffix and path.name == str(source):
