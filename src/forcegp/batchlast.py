@@ -92,11 +92,11 @@ def mass_factor(M: Tensor) -> Tensor:
     Raises:
         NumericalError: one is not positive definite, as of a robot with negative masses.
     """
-    factor, info = torch.linalg.cholesky_ex(M)
-    if bool((info != 0).any()):
-        hint = "check the masses and inertias of the robot, and that states are finite"
-        raise NumericalError("a mass matrix is not positive definite", hint=hint)
-    return factor
+    try:
+        return torch.linalg.cholesky(M)
+    except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
+        text, hint = "a mass matrix is not positive definite", "check the robot's masses and inertias"
+        raise NumericalError(text, got=str(cause)[:200], hint=hint) from cause
 
 
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
