@@ -94,11 +94,9 @@ def mass_factor(M: Tensor) -> Tensor:
     """
     try:
         return torch.linalg.cholesky(M)
-    except torch.linalg.LinAlgError as cause:
-        hint = "check the masses and inertias of the robot, and that states are finite"
-        raise NumericalError(
-            "a mass matrix is not positive definite", got=str(cause)[:200], hint=hint
-        ) from cause
+    except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
+        text, hint = "a mass matrix is not positive definite", "check the robot's masses and inertias"
+        raise NumericalError(text, got=str(cause)[:200], hint=hint) from cause
 
 
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:

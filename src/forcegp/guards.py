@@ -35,7 +35,7 @@ def check_count(source: str, what: str, count: int, most: int) -> None:
         )
 
 
-def check_expansion(source: str, size: int, file: int, free: int = limits.FREE_TABLE_BYTES) -> None:
+def check_expansion(source: str, size: int, file: int, free: int | None = None) -> None:
     """Raise `DataError` if a small file, of `file` bytes, claims to hold far more, `size` bytes."""
     allowed = allowed_bytes(file, free)
     if size > allowed:
@@ -47,9 +47,9 @@ def check_expansion(source: str, size: int, file: int, free: int = limits.FREE_T
         )
 
 
-def allowed_bytes(file: int, free: int = limits.FREE_TABLE_BYTES) -> int:
+def allowed_bytes(file: int, free: int | None = None) -> int:
     """How many bytes a file of `file` bytes may unpack to, `free` of them whatever its size."""
-    return max(free, limits.TABLE_EXPANSION * file)
+    return max(free or limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
 
 
 @dataclass
@@ -132,6 +132,14 @@ def check_tables(file: Path) -> None:
                 raise DataError(f"{file}: a table of the bag is computed", got=text[:200])
         topics, numbers = bag.execute("SELECT count(*), count(DISTINCT id) FROM topics").fetchone()
         check_count(str(file), "topics", topics, min(limits.LOG_STREAMS, numbers))
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is there; a name that no file can have is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def starts_with(file: Path, magic: bytes) -> bool:

@@ -51,7 +51,7 @@ def test_several_quantities_and_any_batch(monkeypatch: pytest.MonkeyPatch) -> No
     model = AnalyticalModel(system).nominal()
     whole = model.predict(*states(), ["qdd", "multiplier"])
     assert whole.parts == {"qdd": slice(0, 7), "multiplier": slice(7, 8)}
-    monkeypatch.setattr("forcegp.models.base.CHUNK", 7)
+    monkeypatch.setattr("forcegp.models.prediction.CHUNK", 7)
     shaped = model.predict(*(x.reshape(5, 6, 7) for x in states()), ["qdd", "multiplier"])
     torch.testing.assert_close(shaped.mean.reshape(30, 8), whole.mean, rtol=ROUNDING, atol=ROUNDING)
     assert model.predict(test.q[:0], test.qd[:0], test.tau[:0]).mean.shape == (0, 7)

@@ -115,7 +115,7 @@ def test_batches_of_any_shape_and_chunks_agree(
     shaped = model.predict(test.q.reshape(5, 5, 7), test.qd.reshape(5, 5, 7), test.tau.reshape(5, 5, 7))
     assert shaped.covariance is not None and whole.covariance is not None
     torch.testing.assert_close(shaped.mean.reshape(25, 7), whole.mean, rtol=ROUNDING, atol=ROUNDING)
-    monkeypatch.setattr("forcegp.models.base.CHUNK", 4)
+    monkeypatch.setattr("forcegp.models.prediction.CHUNK", 4)
     parts = model.predict(test.q, test.qd, test.tau)
     assert parts.covariance is not None
     torch.testing.assert_close(parts.mean, whole.mean, rtol=ROUNDING, atol=ROUNDING)

@@ -19,6 +19,7 @@ from pydantic import Field
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.checks import lock_hint
 from forcegp.errors import MappingError, did_you_mean
+from forcegp.guards import is_file
 from forcegp.logs import units
 from forcegp.logs.draft import CHECK, Draft, Family, quoted
 from forcegp.logs.readers import read
@@ -214,7 +215,7 @@ def load_mapping(source: str | Path) -> Mapping:
     """
     bundled = str(source) in BUNDLED
     path = Path(str(files("forcegp.logs") / "bundled" / f"{source}.toml")) if bundled else Path(source)
-    if not path.is_file():
+    if not is_file(path):
         raise MappingError(
             f"{path}: no such mapping",
             expected=f"a TOML file, or one of {', '.join(BUNDLED)}",

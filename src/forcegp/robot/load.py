@@ -5,6 +5,7 @@ The ordered tree of links and joints becomes the robot model, with fixed joints 
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -263,7 +264,7 @@ def robot_path(source: str | Path) -> Path:
     Raises:
         UnknownNameError: neither a bundled robot nor a path.
     """
-    path = Path(source).expanduser()
+    path = Path(os.path.expanduser(source))  # an unknown user is left as it is
     if str(source) in BUNDLED:
         return Path(__file__).parent / "bundled" / f"{source}.urdf"
     if not path.suffix and path.name == str(source):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import SceneError, did_you_mean
+from forcegp.guards import is_file
 from forcegp.robot import RobotModel, load_robot
 from forcegp.robot.load import BUNDLED as BUNDLED_ROBOTS
 from forcegp.scene.document import Document
@@ -52,7 +54,7 @@ class Scene:
         section = self.sections.robot
         bundled = section.model in BUNDLED_ROBOTS
         source = section.model if bundled else self.folder / section.model
-        if not bundled and not _is_file(Path(source)):
+        if not bundled and not is_file(Path(source)):
             raise SceneError(
                 f"{self.document.place(('robot', 'model'))}: no such robot",
                 expected=f"a URDF or MJCF file, or one of {', '.join(BUNDLED_ROBOTS)}",
@@ -75,14 +77,6 @@ class Scene:
         return at(("contact",), ConstrainedSystem, robot, constraints, baumgarte=sections.baumgarte)
 
 
-def _is_file(path: Path) -> bool:
-    """Whether a file is there; a name that no file can have is none."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
 def load_scene(source: str | Path) -> Scene:
     """Read a scene file: a path, or the name of a bundled scene, one of `BUNDLED`.
 
@@ -97,8 +91,10 @@ def load_scene(source: str | Path) -> Scene:
     """
     bundled = str(source) in BUNDLED
     path = FOLDER / f"{source}.toml" if bundled else Path(source)
-    if not _is_file(path):
-        beside = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
+    if not is_file(path):
+        beside = []
+        with suppress(OSError, ValueError):
+            beside = [str(p) for p in path.parent.glob("*.toml")]
         raise SceneError(
             f"{path}: no such scene",
             expected=f"a TOML file, or one of {', '.join(BUNDLED)}",
@@ -119,7 +115,7 @@ def load_model_table(path: str | Path) -> ModelTable:
     Raises:
         SceneError: the file does not exist or is not valid; the message names file, line and key.
     """
-    if not _is_file(Path(path)):
+    if not is_file(Path(path)):
         raise SceneError(f"{path}: no such model file", expected="a TOML file with a table [model]")
     document = Document(Path(path).read_bytes(), str(path))
     return ModelTable(document.validated(ModelFile).model, document)

@@ -196,8 +196,7 @@ def _messages(bag: Any, encoding: str, unpacking: Unpacking) -> Iterator[Found]:
     check_count(unpacking.source, "topics", len(bag.connections), limits.LOG_STREAMS)
     check_count(unpacking.source, "messages", bag.message_count, limits.LOG_MESSAGES)
     used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
-    messages: Iterable[Any] = bag.messages(used) if used else ()
-    for done, (connection, stamp, raw) in enumerate(messages):
+    for done, (connection, stamp, raw) in enumerate(bag.messages(used) if used else []):
         unpacking.read(len(raw))
         unpacking.record()
         yield connection.topic, canonical(connection.msgtype), encoding, stamp, raw, done
