@@ -12,7 +12,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.evaluation.judgement import Motion, beyond_gravity, explained, open_loop, torque_response
-from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines, free_directions
+from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines, without_constraint
 from forcegp.evaluation.predicted import (
     MultiplierScore,
     Predicted,
@@ -229,12 +229,11 @@ def _predictors(
 ) -> tuple[PredictorScores, ...]:
     """Errors by joint of the model and of the trivial predictors, in torque and in acceleration."""
     moving = moving_joints(data.qd)
-    N = free_directions(system, data)
 
     def score(name: str, error: Tensor, torque: Tensor, density: float | None) -> PredictorScores:
         by_joint = JointErrors.of(torque, data.tau, moving), JointErrors.of(error, data.qdd, moving)
         of_forces = name != "mean" and (name != "model" or model.force_field() is not None)
-        shares = explained((N @ torque[..., None])[..., 0], rest) if of_forces else ()
+        shares = explained(without_constraint(system, data, torque), rest) if of_forces else ()
         return PredictorScores(name, *by_joint, density, shares)
 
     error = predicted.mean - data.qdd

@@ -56,19 +56,23 @@ class Motion:
 @torch.no_grad()
 def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, float]:
     """N (τ − τ_g) `(n, nq)`, and the share R² of the variance of the torques that gravity alone explains."""
-    scale, rows = data.tau.std(0).clamp(min=1e-9), []
-    for part in data_chunks(data):
+    scale = data.tau.std(0).clamp(min=1e-9)
+
+    def rows(part: Dataset) -> tuple[Tensor, Tensor]:
         still = torch.zeros_like(part.q)
         Y = regressor(system.robot, part.q, still, still)
-        ones = torch.eye(data.nq, dtype=data.dtype).expand(len(part), -1, -1)
+        ones = torch.eye(data.nq).to(data.q).expand(len(part), -1, -1)
         every = torch.cat([Y, ones, part.tau[..., None]], dim=-1)
-        rows.append(free_directions(system, part) @ every / scale[:, None])
-    W, y = (x := torch.cat(rows))[..., :-1], x[..., -1]
-    some = torch.linspace(0, len(y) - 1, min(len(y), GRAVITY_SAMPLES)).round().long().unique()
-    A = W[some].flatten(0, 1)
+        x = (free_directions(system, part) @ every / scale[:, None]).double()
+        return x[..., :-1], x[..., -1]
+
+    some = torch.linspace(0, len(data) - 1, min(len(data), GRAVITY_SAMPLES)).round().long().unique()
+    W, y = rows(data[some])
+    A = W.flatten(0, 1)
     gram, least = A.mT @ A, RIDGE * A.square().sum() / A.shape[-1]
-    theta = torch.linalg.solve(gram + least * torch.eye(len(gram), dtype=A.dtype), A.mT @ y[some].flatten())
-    rest = y - W @ theta
+    theta = torch.linalg.solve(gram + least * torch.eye(len(gram)).to(gram), A.mT @ y.flatten())
+    parts = [(y, y - W @ theta) for W, y in map(rows, data_chunks(data))]
+    y, rest = map(torch.cat, zip(*parts, strict=True))
     whole = (y - y.mean(0)).square().sum().clamp(min=1e-300)
     return rest * scale, float(1.0 - rest.square().sum() / whole)
 
@@ -93,7 +97,7 @@ def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | No
         return None
     rows = free[torch.linspace(0, len(free) - 1, min(len(free), RESPONSE_SAMPLES)).round().long().unique()]
     data, generator = data[rows], torch.Generator().manual_seed(0)
-    added = torch.randn(data.tau.shape, generator=generator, dtype=data.dtype) * (0.1 * data.tau.std(0))
+    added = torch.randn(data.tau.shape, generator=generator).to(data.tau) * (0.1 * data.tau.std(0))
     before, after = (
         model.predict(data.q, data.qd, tau, active=closed[rows], covariance=False).mean
         for tau in (data.tau, data.tau + added)
@@ -110,10 +114,10 @@ def open_loop(model: FittedModel, system: ConstrainedSystem, data: Dataset) -> M
         return None
     dt = data.header.dt or float((data.t[1:] - data.t[:-1]).median())
     closed = data.active(system.contact_names)
-    switches = torch.cat([torch.zeros(1), (closed[1:] != closed[:-1]).any(-1).double()]).cumsum(0)
+    switches = torch.nn.functional.pad((closed[1:] != closed[:-1]).any(-1).long().cumsum(0), (1, 0))
     for count in range(len(HORIZONS), 0, -1):
         steps = round(HORIZONS[count - 1] / dt)
-        first = torch.arange(max(len(data) - steps, 0))
+        first = torch.arange(max(len(data) - steps, 0), device=data.device)
         last = first + steps
         even = ((data.t[last] - data.t[first]) - steps * dt).abs() < 0.5 * dt
         even &= (data.segment[last] == data.segment[first]) & (switches[last] == switches[first])

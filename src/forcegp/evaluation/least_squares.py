@@ -130,9 +130,15 @@ def _rows(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, Tensor]:
     return W, y
 
 
+def without_constraint(system: ConstrainedSystem, data: Dataset, torque: Tensor) -> Tensor:
+    """N torque `(n, nq)`, part by part."""
+    parts = zip(data_chunks(data), torque.split(CHUNK_STATES), strict=True)
+    return torch.cat([(free_directions(system, part) @ x[..., None])[..., 0] for part, x in parts])
+
+
 def free_directions(system: ConstrainedSystem, data: Dataset) -> Tensor:
     """N = 1 − A⁺A `(n, nq, nq)` or `(nq, nq)`, which removes the constraint force, in the range of Aᵀ."""
-    one = torch.eye(data.nq, dtype=data.dtype)
+    one = torch.eye(data.nq).to(data.q)
     if not system.m:
         return one
     A = system.equations(data.q, data.qd, data.active(system.contact_names)).A
