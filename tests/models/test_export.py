@@ -36,6 +36,7 @@ from forcegp.forces.quantities import QUANTITIES, states_at
 from forcegp.gp.kernels import Linear, Matern32, Matern52, SquaredExponential
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.library import CompiledFit
+from forcegp.models.export.source import c_source
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, mixed_contacts, two_contacts
@@ -376,6 +377,23 @@ def test_a_prior_without_a_c_form_is_named(priors: list, named: str, tmp_path: P
     with pytest.raises(ModelError, match=r"(?s)force prior " + named):
         fit.compiled()
     assert not (tmp_path / "c").exists()
+
+
+def test_names_do_not_become_code() -> None:
+    fit = fitted("one_contact")
+    robot = fit.system.robot
+    names = ("*/ int injected; /*", "a\\", "b\n#error", *robot.joint_names[3:])
+    renamed = dataclasses.replace(fit.system.contacts[0], name="*/ int injected; /*")
+    system = forcegp.ConstrainedSystem(robot.replace(joint_names=names), [renamed])
+    model = fitted("free_friction").compiled().model
+    process = model.posterior.process
+    priors = tuple(dataclasses.replace(prior, name="*/ int injected; /*") for prior in process.priors)  # type: ignore[type-var]
+    posterior = dataclasses.replace(model.posterior, process=dataclasses.replace(process, priors=priors))
+    free = dataclasses.replace(model, system=system, posterior=posterior)
+    header, source = c_source(free, "arm")
+    assert "injected" in header and "injected" in source
+    for text in (header, source):
+        assert "int injected;" not in text and "\\" not in text.replace("\\\n", "") and "#error" not in text
 
 
 def test_two_priors_on_the_inertia_are_refused() -> None:

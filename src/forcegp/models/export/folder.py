@@ -33,8 +33,8 @@ class Export:
     Attributes:
         folder: where.
         functions: functions of the covariance.
-        widest, wider: growth of σ of q̈ and λ by a reduced covariance at training states, the largest and the
-            median one, as fractions; the mean loses nothing.
+        widest, wider: growth of σ of q̈ and λ by a reduced covariance, the largest and the median one, as
+            fractions, at training states or, where a saved fit has kept none, at random ones.
     """
 
     folder: Path
@@ -57,7 +57,8 @@ def write_export(
     check_destination(path, folder=True, own_files=own)
     header, source = c_source(model, name)
     result = Export(Path(path), model.parts()[0].rank, *loss_of(model, fit, training))
-    loss = "It is reduced: at training states σ of q̈ and λ is wider by a fraction\n"
+    where = "training" if training.samples else "random"
+    loss = f"It is reduced: at {where} states σ of q̈ and λ is wider by a fraction\n"
     loss += f"of {result.widest:.2g} at most, {result.wider:.2g} in the median. The mean loses nothing."
     fields = {
         "name": name,

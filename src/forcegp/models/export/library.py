@@ -32,13 +32,7 @@ MESSAGES = {
 class CompiledFit(Predictor):
     """A fit whose predictions come from its C code: the numbers of `StructuredFit.predict`, in microseconds.
 
-    Made by `StructuredFit.compiled`.
-
-    Attributes:
-        model: what the code contains.
-        system: robot and contacts.
-        library: the functions of the C header, with the prefix `forcegp_`.
-    """
+    Made by `StructuredFit.compiled`; `library` has the functions of the C header, named `forcegp_…`."""
 
     kind = "compiled"
 

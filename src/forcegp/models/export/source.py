@@ -1,11 +1,11 @@
 """C99 source text of a fitted model: its numbers, its straight-line mechanics, and the code of its priors.
 
-What does not depend on the model is in `controller.c`: the constrained equations of motion, the affine map of
-each quantity, and how mean and covariance are read off the latent forces.
+What does not depend on the model, from the equations of motion to reading a quantity, is in `controller.c`.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from importlib.resources import files
 from itertools import accumulate
@@ -64,8 +64,8 @@ def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
     fields = {
         "nq": robot.nq,
         "contacts": len(contacts),
-        "joints": ", ".join(robot.joint_names),
-        "touching": ", ".join(contacts) or "none",
+        "joints": _comment(", ".join(robot.joint_names)),
+        "touching": _comment(", ".join(contacts) or "none"),
         "bits": "\n".join(f"#define FORCEGP_{x.upper()} {1 << i}u" for i, x in enumerate(READ)),
     }
     return tuple(  # pyright: ignore[reportReturnType]
@@ -82,6 +82,11 @@ def template(name: str, fields: dict[str, object] | None = None) -> str:
     for field, value in (fields or {}).items():
         text = text.replace(f"@{field}@", str(value))
     return text
+
+
+def _comment(text: str) -> str:
+    """Names as they may stand in a comment of code that is run: a model file must not end the comment."""
+    return re.sub(r"[^\w ,.+-]", "_", text)
 
 
 def _called(text: str) -> str:
@@ -108,11 +113,7 @@ def _mechanics(model: ExportedModel) -> list[str]:
 
 
 class Writer:
-    """Writes tables, and the code of priors that reads them.
-
-    Attributes:
-        lines: constants, in front of the code.
-    """
+    """Writes the code of priors, and in `lines` the tables that it reads."""
 
     def __init__(self, model: ExportedModel) -> None:
         self.model, self.parts, self.lines = model, model.parts(), []
@@ -207,7 +208,7 @@ class Writer:
         texts, calls = [], []
         for p, part in enumerate(self.parts):
             body = [*self._operator(part, self.starts[p]), *self._functions(p, part)]
-            title = f"/* {part.prior.name}: {type(part.prior).__name__} */\n"
+            title = f"/* {_comment(part.prior.name)}: {type(part.prior).__name__} */\n"
             title += f"static int prior_{p}({ARGUMENTS}) {{\n"
             unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread;\n"
             texts.append(title + unread + "\n".join(body) + "\n  return 0;\n}\n")
