@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
+from typer.testing import CliRunner
 
 import forcegp
+from forcegp.cli.app import app
 from forcegp.dynamics import inverse_dynamics, mass_matrix
 from forcegp.errors import ModelError, ParameterError
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
@@ -153,3 +155,27 @@ def test_forces_around_zero_are_no_calibration(fit: StructuredFit) -> None:
     blind = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(log_of(robot, 60, 1))
     with pytest.raises(ModelError, match="not those that the robot file lacks"):
         calibrated(blind)
+
+
+def test_the_command_writes_the_file_a_report_and_samples(fit: StructuredFit, tmp_path: Path) -> None:
+    fit.save(tmp_path / "model")
+    runner, base = CliRunner(), ["export", "--model", str(tmp_path / "model")]
+    out = tmp_path / "out.urdf"
+    done = runner.invoke(
+        app, [*base, "--to", "urdf", "--robot", "double_pendulum", "-o", str(out), "--samples", "1", "--json"]
+    )
+    result = json.loads(done.stdout)
+    assert done.exit_code == 0 and result["file"] == str(out) and result["parameters"] == 2 * 13
+    assert (
+        out.exists()
+        and (tmp_path / "out.sample_000.urdf").exists()
+        and (tmp_path / "out.report.json").exists()
+    )
+    for arguments, message in (
+        (["--to", "urdf"], "no robot file is named"),
+        (["--to", "mjcf", "--robot", "double_pendulum"], "is of another format"),
+        (["--to", "sdf"], "format to export to"),
+    ):
+        failed = runner.invoke(app, [*base, *arguments, "-o", str(tmp_path / "none.urdf")])
+        assert failed.exit_code != 0 and not (tmp_path / "none.urdf").exists()
+        assert message in f"{failed.output} {failed.exception}"
