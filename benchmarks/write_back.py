@@ -17,8 +17,8 @@ import tempfile
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -28,12 +28,14 @@ from solver_arms import ARMS, STEP, Arm, Imperfections, case_of
 
 import forcegp
 from forcegp.dynamics import inverse_dynamics
+from forcegp.errors import optional_module
 from forcegp.evaluation.least_squares import identify_rigid
 from forcegp.kinematics import frame_pose
 from forcegp.models.calibrated import write_calibrated
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.urdf import write_urdf
 
+mujoco = optional_module("mujoco", "This benchmark")
 WRONG = Imperfections(mass=0.3, gain=0.0, offset=0.0)
 """Links off by up to 30 %, undeclared friction and drives; torque sensors are right."""
 RIGHT = replace(WRONG, mass=0.0, drive=0.0, dry=0.0, viscous=0.0)
@@ -43,7 +45,7 @@ STARTS, AHEAD = 30, 1.0
 Array = NDArray[np.float64]
 
 
-def simulated(robot: RobotModel) -> mujoco.MjModel:
+def simulated(robot: RobotModel) -> Any:
     """A robot file in MuJoCo, with its joint friction."""
     model = mujoco.MjModel.from_xml_string(write_urdf(robot))
     model.opt.gravity[:] = robot.gravity.numpy()

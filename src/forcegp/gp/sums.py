@@ -258,10 +258,10 @@ def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
     Raises:
         ModelError: they differ, or no group of processes has been initialised.
     """
-    _require_processes()
     own = torch.tensor(values, dtype=torch.int64)
-    every = [torch.empty_like(own) for _ in range(dist.get_world_size())]
-    dist.all_gather(every, own)
+    with _processes():
+        every = [torch.empty_like(own) for _ in range(dist.get_world_size())]
+        dist.all_gather(every, own)
     differ = [str(rank) for rank, x in enumerate(every) if not torch.equal(x, every[0])]
     if differ:
         got = f"another one in process {', '.join(differ)} than in process 0"
