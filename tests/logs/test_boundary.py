@@ -40,7 +40,8 @@ def columns(draw: st.DrawFn) -> dict[str, np.ndarray]:
         if change == "values":
             found[name] = np.resize(np.array(draw(st.lists(NUMBERS, min_size=1, max_size=9))), n)
         elif change == "one" and n:
-            found[name] = np.where(np.arange(n) == draw(st.integers(0, n - 1)), value, found.get(name, t))
+            before = np.resize(found.get(name, t), n)
+            found[name] = np.where(np.arange(n) == draw(st.integers(0, n - 1)), value, before)
         elif change == "length":
             found[name] = np.full(draw(st.integers(0, 9)), value)
         elif change == "constant":

@@ -504,4 +504,4 @@ def test_the_command(tmp_path: Path) -> None:
     arguments[2] = str(tmp_path / "file")
     done = CliRunner().invoke(app, arguments)
     assert isinstance(done.exception, ForceGPError)
-    assert "only a structured Gaussian process has a C form" in str(done.exception)
+    assert "only a structured Gaussian process can be exported" in str(done.exception)

@@ -271,9 +271,8 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))
     if not wrong.any():
         return [], log
-    if "qdd" in log.header.derived:
-        return [_mismatch("filter-wide", log, level, wrong, "qdd", "qd")], log
-    finding = _mismatch("acceleration-mismatch", log, level, wrong, "qdd", "qd")
+    kind = "filter-wide" if "qdd" in log.header.derived else "acceleration-mismatch"
+    finding = _mismatch(kind, log, level, wrong, "qdd", "qd")
     qdd = log.qdd.copy()
     for s in log.stretches:
         qdd[s, wrong] = np.gradient(log.qd[s][:, wrong], log.t[s], axis=0)
