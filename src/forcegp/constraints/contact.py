@@ -76,7 +76,7 @@ class SurfaceContact(Constraint):
     A contact that may stick has two more rows, (t_1, t_2)ᵀ J_E q̇ = 0 with the tangent frame of the surface,
     which hold while the touching point moves along it by less than `stick_speed`. Their multipliers are
     the components of a tangential force that no law of sliding gives. A rollout ends sticking where that
-    force exceeds the friction that a prior of the model gives the contact (`rollout/law.py`).
+    force exceeds the friction that a prior of the model gives the contact (`rollout/cone.py`).
 
     Args:
         name: name of the contact, as in `contact.<name>` of a data set.

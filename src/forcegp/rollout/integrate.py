@@ -16,16 +16,7 @@ from torch import Tensor
 from forcegp.constraints.unilateral import project_state
 from forcegp.errors import ForceGPError, ModelError, NumericalError
 from forcegp.rollout.events import ContactEvent, advance, settle
-from forcegp.rollout.law import (
-    REGULARIZATION,
-    STILL,
-    Instant,
-    RolloutProblem,
-    State,
-    Step,
-    arrested,
-    compliance_of,
-)
+from forcegp.rollout.law import REGULARIZATION, STILL, Instant, RolloutProblem, State, Step, compliance_of
 from forcegp.rollout.trajectory import Divergence, Rollout
 
 Progress = Callable[[int, int], None]
@@ -178,7 +169,7 @@ def _stopping(step: Step) -> Step:
     """The method, with contacts and joints at rest that friction stops within the step, up to its error."""
 
     def stopped(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
-        reached = arrested(problem, state, step(problem, state, first, h))
+        reached = problem.stopped(state, step(problem, state, first, h))
         if first.held is None:
             return reached
         slowed = (reached.qd.abs() <= 0.5 * state.qd.abs()) | (state.qd == 0.0)

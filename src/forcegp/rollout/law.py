@@ -18,31 +18,21 @@ their friction, exchange those that contradict the guess.
 Where h G_ii D_i > 1 for a light joint with viscous friction D, an explicit step turns its motion round, and
 above 2 it grows without end. There viscous friction is that at the end of the step, q̈ = q̈₀ + G (p − h D q̈),
 as in MuJoCo's Euler integrator; elsewhere it is that of the start.
-
-A contact that sticks holds with the tangential force λ_t that it takes, within its friction cone. The cone is
-that of the model: the contact slides away along d = −λ_t/|λ_t| if the friction that the model gives at a
-velocity v d does not stop it, dᵀ(A_t q̈ − b_t) > 0, with v above `stick_speed` and above the speeds over which
-the friction is smooth. Within a step, friction stops a contact that slides instead of turning it round.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.linalg import vecdot
-from torch.nn.functional import normalize
 
-from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.constraints.gauss import tangent_frame
-from forcegp.constraints.unilateral import project_velocity
+from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, NumericalError
 from forcegp.forces.posterior import ForcePosterior, ForceSamples
 from forcegp.forces.priors.base import ForcePrior
@@ -54,6 +44,7 @@ from forcegp.forces.priors.contact import (
 )
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import ForceField, States, affine_map
+from forcegp.rollout.cone import accelerating, arrested, may_stick, sliding_away, sticking_contacts
 from forcegp.rollout.inputs import ForwardModel, Inputs, Reached
 
 REGULARIZATION = 1e-10
@@ -367,91 +358,6 @@ class Instant(NamedTuple):
     held: Tensor | None = None
 
 
-def _tangential(system: ConstrainedSystem) -> list[tuple[int, SurfaceContact, slice]]:
-    """The contacts that may stick: index, contact and its two tangential rows."""
-    ends = itertools.accumulate(contact.rows for contact in system.contacts)
-    return [
-        (k, contact, slice(end - 2, end))
-        for k, (contact, end) in enumerate(zip(system.contacts, ends, strict=True))
-        if isinstance(contact, SurfaceContact) and contact.stick_speed is not None
-    ]
-
-
-def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[str]) -> Tensor:
-    """Closed contacts that stick `(n, n_contacts)` bool, among those named."""
-    sticks = torch.zeros_like(at.active)
-    for k, contact, _ in _tangential(system):
-        rests = at.eom.contact_points[contact.name].sticks
-        if contact.name in among and rests is not None:
-            sticks[:, k] = rests & at.active[:, k]
-    return sticks
-
-
-def sliding_away(
-    system: ConstrainedSystem, at: States, multiplier: Tensor, slides: Tensor, speeds: Mapping[str, float]
-) -> States:
-    """The states where contacts that stick start to slide against the force that would hold them.
-
-    Args:
-        system: robot and contacts.
-        at: n states.
-        multiplier: λ `(n, m)` of sticking.
-        slides: `(n, n_contacts)` bool, which contacts slide.
-        speeds: at which, by name [m/s].
-    """
-    eom, points = at.eom, dict(at.eom.contact_points)
-    free = torch.zeros_like(eom.b, dtype=torch.bool)
-    for k, contact, rows in _tangential(system):
-        if contact.name not in speeds:
-            continue
-        point, gone = points[contact.name], slides[:, k, None]
-        # ṗ = −v (t_1, t_2) λ_t/|λ_t|
-        along = tangent_frame(point.unit_normal) @ normalize(multiplier[:, rows], dim=-1)[..., None]
-        velocity = torch.where(gone, -speeds[contact.name] * along[..., 0], point.velocity)
-        sticks = None if point.sticks is None else point.sticks & ~gone[:, 0]
-        points[contact.name] = dataclasses.replace(point, velocity=velocity, sticks=sticks)
-        free[:, rows] = gone
-    A, b, holds = eom.A.masked_fill(free[..., None], 0.0), eom.b.masked_fill(free, 0.0), eom.holds & ~free
-    return dataclasses.replace(at, eom=dataclasses.replace(eom, A=A, b=b, holds=holds, contact_points=points))
-
-
-def accelerating(system: ConstrainedSystem, at: States, multiplier: Tensor, qdd: Tensor) -> Tensor:
-    """Contacts `(n, n_contacts)` bool that q̈ moves against the force that would hold them."""
-    away = torch.zeros_like(at.active)
-    # −λ_tᵀ(A_t q̈ − b_t) > 0
-    held = multiplier * ((at.eom.A @ qdd[..., None])[..., 0] - at.eom.b)
-    for k, _, rows in _tangential(system):
-        away[:, k] = held[:, rows].sum(-1) < 0.0
-    return away
-
-
-def arrested(problem: RolloutProblem, before: State, after: State) -> State:
-    """The state after a step, with contacts at rest that friction would have turned round within it.
-
-    The impulse is that of an impact on the tangential rows, q̇ ← q̇ − L A q̇.
-    """
-    system = problem.system
-    sliding = [each for each in _tangential(system) if each[1].name in problem.rough]
-    if not sliding:
-        return after
-    first = system.equations(before.q, before.qd, before.active)
-    last = system.equations(after.q, after.qd, after.active)
-    A, stops = last.A, torch.zeros_like(after.t, dtype=torch.bool)
-    for k, contact, rows in sliding:
-        old, new = first.contact_points[contact.name], last.contact_points[contact.name]
-        turned = vecdot(old.sliding[1], new.sliding[1]) < 0.0
-        if old.sticks is not None:
-            turned = turned & ~old.sticks & before.active[:, k] & after.active[:, k]
-        held = tangent_frame(new.unit_normal).mT @ new.jacobian
-        A = A.clone()
-        A[:, rows] = torch.where(turned[:, None, None], held, A[:, rows])
-        stops = stops | turned[:, None]
-    if not bool(stops.any()):
-        return after
-    qd = project_velocity(dataclasses.replace(last, A=A), after.qd)
-    return after._replace(qd=torch.where(stops, qd, after.qd))
-
-
 @dataclass(frozen=True)
 class RolloutProblem:
     """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the stabilization of the rollout.
@@ -471,7 +377,7 @@ class RolloutProblem:
     @cached_property
     def rough(self) -> Mapping[str, float]:
         """Contacts that may stick and have friction, with the speed from which it is that of sliding."""
-        speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in _tangential(self.system)}
+        speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in may_stick(self.system)}
         known = self.law.rough if speeds else {}
         return {name: max(speeds[name], known[name]) for name in speeds if name in known}
 
@@ -498,6 +404,14 @@ class RolloutProblem:
         if not bool(slides.any()):
             return now
         return self._instant(sliding_away(self.system, at, now.multiplier, slides, rough), h)
+
+    def stopped(self, before: State, after: State) -> State:
+        """The state after a step, with contacts at rest that friction stops within it."""
+        if not self.rough:
+            return after
+        first, last = (self.system.equations(x.q, x.qd, x.active) for x in (before, after))
+        closed = before.active & after.active
+        return after._replace(qd=arrested(self.system, self.rough, first, last, closed, after.qd))
 
     def _instant(self, at: States, h: Tensor) -> Instant:
         """The motion at states, over a step h `(n, 1)` [s]."""

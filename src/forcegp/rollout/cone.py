@@ -1,0 +1,115 @@
+"""Contacts that stick in a rollout: the friction cone that ends sticking, and sliding that comes to rest.
+
+A contact that sticks holds with the tangential force λ_t that it takes, within its friction cone. The cone is
+that of the model: the contact slides away along d = −λ_t/|λ_t| if the friction that the model gives at a
+velocity v d does not stop it, dᵀ(A_t q̈ − b_t) > 0, with v above `stick_speed` and above the speeds over which
+the friction is smooth. Within a step, friction stops a contact that slides instead of turning it round.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Container, Mapping
+
+import torch
+from torch import Tensor
+from torch.linalg import vecdot
+from torch.nn.functional import normalize
+
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.constraints.gauss import Equations, tangent_frame
+from forcegp.constraints.unilateral import project_velocity
+from forcegp.forces.quantities import States
+
+
+def may_stick(system: ConstrainedSystem) -> list[tuple[int, SurfaceContact, slice]]:
+    """The contacts that may stick: index, contact and its two tangential rows."""
+    ends = itertools.accumulate(contact.rows for contact in system.contacts)
+    return [
+        (k, contact, slice(end - 2, end))
+        for k, (contact, end) in enumerate(zip(system.contacts, ends, strict=True))
+        if isinstance(contact, SurfaceContact) and contact.stick_speed is not None
+    ]
+
+
+def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[str]) -> Tensor:
+    """Closed contacts that stick `(n, n_contacts)` bool, among those named."""
+    sticks = torch.zeros_like(at.active)
+    for k, contact, _ in may_stick(system):
+        rests = at.eom.contact_points[contact.name].sticks
+        if contact.name in among and rests is not None:
+            sticks[:, k] = rests & at.active[:, k]
+    return sticks
+
+
+def sliding_away(
+    system: ConstrainedSystem, at: States, multiplier: Tensor, slides: Tensor, speeds: Mapping[str, float]
+) -> States:
+    """The states where contacts that stick start to slide against the force that would hold them.
+
+    Args:
+        system: robot and contacts.
+        at: n states.
+        multiplier: λ `(n, m)` of sticking.
+        slides: `(n, n_contacts)` bool, which contacts slide.
+        speeds: at which, by name [m/s].
+    """
+    eom, points = at.eom, dict(at.eom.contact_points)
+    free = torch.zeros_like(eom.b, dtype=torch.bool)
+    for k, contact, rows in may_stick(system):
+        if contact.name not in speeds:
+            continue
+        point, gone = points[contact.name], slides[:, k, None]
+        # ṗ = −v (t_1, t_2) λ_t/|λ_t|
+        along = tangent_frame(point.unit_normal) @ normalize(multiplier[:, rows], dim=-1)[..., None]
+        velocity = torch.where(gone, -speeds[contact.name] * along[..., 0], point.velocity)
+        sticks = None if point.sticks is None else point.sticks & ~gone[:, 0]
+        points[contact.name] = dataclasses.replace(point, velocity=velocity, sticks=sticks)
+        free[:, rows] = gone
+    A, b, holds = eom.A.masked_fill(free[..., None], 0.0), eom.b.masked_fill(free, 0.0), eom.holds & ~free
+    return dataclasses.replace(at, eom=dataclasses.replace(eom, A=A, b=b, holds=holds, contact_points=points))
+
+
+def accelerating(system: ConstrainedSystem, at: States, multiplier: Tensor, qdd: Tensor) -> Tensor:
+    """Contacts `(n, n_contacts)` bool that q̈ moves against the force that would hold them."""
+    away = torch.zeros_like(at.active)
+    # −λ_tᵀ(A_t q̈ − b_t) > 0
+    held = multiplier * ((at.eom.A @ qdd[..., None])[..., 0] - at.eom.b)
+    for k, _, rows in may_stick(system):
+        away[:, k] = held[:, rows].sum(-1) < 0.0
+    return away
+
+
+def arrested(
+    system: ConstrainedSystem,
+    rough: Container[str],
+    before: Equations,
+    after: Equations,
+    closed: Tensor,
+    qd: Tensor,
+) -> Tensor:
+    """Velocity `(n, nq)` after a step, with contacts at rest that friction would have turned round within it.
+
+    The impulse is that of an impact on the tangential rows, q̇ ← q̇ − L A q̇.
+
+    Args:
+        system: robot and contacts.
+        rough: contacts with friction.
+        before, after: the equations of motion at both ends of the step.
+        closed: `(n, n_contacts)` bool, contacts that are closed at both.
+        qd: `(n, nq)` velocity after the step.
+    """
+    A, stops = after.A, torch.zeros_like(closed[:, :1])
+    for k, contact, rows in may_stick(system):
+        old, new = before.contact_points[contact.name], after.contact_points[contact.name]
+        if contact.name not in rough or old.sticks is None:
+            continue
+        turned = (vecdot(old.sliding[1], new.sliding[1]) < 0.0) & ~old.sticks & closed[:, k]
+        held = tangent_frame(new.unit_normal).mT @ new.jacobian
+        A = A.clone()
+        A[:, rows] = torch.where(turned[:, None, None], held, A[:, rows])
+        stops = stops | turned[:, None]
+    if not bool(stops.any()):
+        return qd
+    return torch.where(stops, project_velocity(dataclasses.replace(after, A=A), qd), qd)
