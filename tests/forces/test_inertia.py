@@ -160,6 +160,7 @@ def test_a_drive_and_the_link_that_it_turns_share_their_uncertainty(file: RobotM
     fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(data)
     (p,) = (p for p, prior in enumerate(fit.force_priors) if isinstance(prior, InertialPrior))
     prior, robot = fit.force_priors[p], fit.system.robot
+    assert isinstance(prior, InertialPrior)
     inputs = one_row(fit.posterior, fit.problem)
     delta = fit.posterior.latent.latent_mean(p, inputs[p])[0]
     covariance = torch.linalg.inv(latent_precision(fit.posterior, inputs, p, robot))

@@ -281,7 +281,8 @@ class _Reader:
             self._constants(drawn, PayloadPrior),
         ]
         sizes = [part.shape[-1] for part in parts]
-        free = _without_offsets(self._offsets(curves), torch.cat(parts, dim=-1))
+        offset, (kept,) = self._offsets(curves), self._offsets(self._kept()[None])
+        free = _without_offsets(offset, offset[0] - kept, torch.cat(parts, dim=-1))
         rows = (row.split(sizes) for row in free)
         return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
 
@@ -289,6 +290,15 @@ class _Reader:
         """The offset of each curve by least squares `(1 + samples, nq)`."""
         columns = torch.stack([self.speeds, self.speeds.sign(), torch.ones_like(self.speeds)], dim=-1)
         return (torch.linalg.pinv(columns.movedim(1, 0)) @ curves.movedim(-1, 1)[..., None])[..., 2, 0]
+
+    def _kept(self) -> Tensor:
+        """Friction at the identified inertia, less the friction of the posterior mean of both."""
+        fit, at, force = self.fit, self.at, torch.zeros_like(self.at.q)
+        for p, prior in enumerate(fit.force_priors):
+            if isinstance(prior, JointFrictionPrior) and fit.posterior.process.pinned:
+                latent = fit.posterior.shift(p, fit.posterior.process.features(p, fit.system, at))
+                force = force + torch.einsum("nij,nj->ni", prior.operator(fit.system, at), latent)
+        return self._over_poses(force)
 
     def _curves(self, drawn: ForceSamples) -> Iterator[Tensor]:
         """The friction Q_D over speeds `(k, nq)` of the posterior mean and of samples, mean over poses."""
@@ -339,13 +349,18 @@ class _Reader:
         return robot, (curve, left, offset)
 
 
-def _without_offsets(offset: Tensor, values: Tensor) -> Tensor:
+def _without_offsets(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
     """The mean and samples of values `(1 + samples, d)` given that offsets `(1 + samples, nq)` are zero where
     the data leave that open.
 
     With the samples' covariances, E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c.
+
+    Args:
+        offset: at the identified inertia, and of samples around it.
+        mean: `(nq,)` of the posterior of offset and inertia, by which zero is open or not.
+        values: to be conditioned.
     """
-    c = offset[:, offset[0].abs() <= OPEN * offset[1:].std(0)]
+    c = offset[:, mean.abs() <= OPEN * offset[1:].std(0)]
     gain = torch.linalg.lstsq(c[1:] - c[1:].mean(0), values[1:] - values[1:].mean(0)).solution
     return values - c @ gain
 
