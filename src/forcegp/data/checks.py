@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields, component_names, mapped, named_columns
+from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields, component_names, named_columns
 from forcegp.errors import DataError, near_names
 from forcegp.limits import LOGGED_VALUE
 from forcegp.robot.model import RobotModel
@@ -284,16 +283,3 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     agreed["filtered"] = any(header.filtered for header in headers)
     agreed["filter_span"] = max((h.filter_span for h in headers if h.filter_span is not None), default=None)
     return DataHeader(**agreed)
-
-
-def concatenated(parts: Sequence[Fields]) -> dict[str, Any]:
-    """Fields of data sets one after another, each with segments of its own; errors as of `check_alike`."""
-    check_alike(parts)
-    segments, start = [], 0
-    for part in parts:
-        _, numbers = torch.unique_consecutive(part.segment, return_inverse=True)
-        segments.append(numbers + start)
-        start += int(numbers.max()) + 1 if len(part) else 0
-    header = common_header([part.header for part in parts])
-    own = {"joint_names": parts[0].joint_names, "segment": torch.cat(segments), "header": header}
-    return mapped(parts, torch.cat) | own
