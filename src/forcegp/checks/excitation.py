@@ -51,25 +51,18 @@ def still_joints(log: Log) -> np.ndarray:
 
 def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     """Joints that do not move, or hardly ever change direction."""
-    still, findings = still_joints(log), []
-    if still.any():
-        joints = log.named(still)
-        unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
-        text = f"range of {', '.join(joints)} below {STILL} {unit}: friction and inertia are not seen"
-        findings.append(log.finding("joint-still", text, joints))
+    still = still_joints(log)
+    unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
+    text = f"range of {{}} below {STILL} {unit}: friction and inertia are not seen"
+    findings = log.on_joints("joint-still", still, text)
     if not log.header.ordered:
         return findings, log
     turns = np.zeros(log.nq, int)
     fast = HYSTERESIS * np.percentile(np.abs(log.qd[log.usable]), 99, axis=0)
     for j, x in ((j, log.qd[s, j]) for s in log.stretches for j in range(log.nq)):
         turns[j] += np.count_nonzero(np.diff(np.sign(x[np.abs(x) > fast[j]])))
-    few = (turns < REVERSALS) & ~still
-    if few.any():
-        joints = log.named(few)
-        few_turns = f"fewer than {REVERSALS} changes of direction"
-        text = f"{', '.join(joints)}: {few_turns}: friction looks like an offset"
-        findings.append(log.finding("few-reversals", text, joints))
-    return findings, log
+    text = f"{{}}: fewer than {REVERSALS} changes of direction: friction looks like an offset"
+    return findings + log.on_joints("few-reversals", (turns < REVERSALS) & ~still, text), log
 
 
 def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:

@@ -122,6 +122,11 @@ class Log:
         """A finding on the whole log."""
         return Finding(kind, text, self.all_rows, joints, evidence=evidence)
 
+    def on_joints(self, kind: str, mask: Array, text: str, **evidence: Any) -> list[Finding]:
+        """A finding on the joints that a mask picks, listed at the `{}` of its text; none without a joint."""
+        joints = self.named(mask)
+        return [self.finding(kind, text.format(", ".join(joints)), joints, **evidence)] if joints else []
+
     def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
         """Names of the joints that a mask picks."""
         return tuple(self.joint_names[j] for j in np.flatnonzero(joints))

@@ -84,14 +84,10 @@ def _without_torque(log: Log) -> list[Finding]:
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
-    if not still.any():
-        return []
-    joints = log.named(still)
     word = "zero" if zero[still].all() else "constant"
+    findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")
     # One passive joint is a design; an arm without any torque is a missing column.
-    weight = "error" if still.all() else "warning"
-    text = f"the torque of {', '.join(joints)} is {word} throughout"
-    return [Finding("torque-zero", text, log.all_rows, joints, weight=weight)]
+    return [replace(finding, weight="error" if still.all() else "warning") for finding in findings]
 
 
 def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:

@@ -62,11 +62,12 @@ def fit(
 
     forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model
     """
+    from forcegp.destination import check_destination
     from forcegp.models.configured import configured
     from forcegp.storage.checkpoint import beside
-    from forcegp.storage.model_file import check_model_destination, model_path
+    from forcegp.storage.model_file import model_path
 
-    check_model_destination(out)
+    check_destination(model_path(out))
     if checkpoint is not None:
         common.check_output(checkpoint, model_path(out), *data)
     system = common.system_of(scene, robot)

@@ -169,15 +169,15 @@ def check(
     """
     from threadpoolctl import threadpool_limits
 
-    from forcegp.checks import read_log
+    from forcegp import checks
 
     if out is not None:
         common.check_output(out, data)
     system = common.system_of(scene, robot)
-    log = read_log(data)
+    log = checks.read_log(data)
     # Matrices are small: threads of BLAS cost more than they save, and two checks at once would fight.
     with progress_bar("checking", 1) as progress, threadpool_limits(1, user_api="blas"):
-        report = forcegp.check(system, log, progress=progress)
+        report = checks.check(system, log, progress=progress)
     if out is not None:
         from forcegp.report.check import write_check
 

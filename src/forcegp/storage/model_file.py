@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.destination import check_destination
 from forcegp.errors import ModelError
 from forcegp.files import Header, M, Record, atomic_file, validated
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
@@ -203,11 +202,6 @@ def _digest(data: bytes, stated: str) -> str:
 def _entry(digest: str) -> bytes:
     """The hash in the header; within the text of another entry its quotes would be escaped."""
     return f'"{HEADER}":"{digest}'.encode()
-
-
-def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:
-    """Check, before a long fit, that `write_model` will be able to write a model."""
-    check_destination(model_path(path), needed_bytes=needed_bytes)
 
 
 def model_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -90,11 +90,10 @@ def with_rollout(motion: Motion, path: Rollout) -> Motion:
     return replace(motion, paths=[*motion.paths, *paths])
 
 
-def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float, seed: int = 0) -> Rollout:
+def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float) -> Rollout:
     """A model rolled out under the logged torques from the first state of a trajectory."""
     options = RolloutOptions(sampling_period(data), on_divergence="keep")
-    drawn = samples if model.has_function_samples else 0
-    return replayed(model, data, drawn, seconds, seed=seed, options=options)
+    return replayed(model, data, samples if model.has_function_samples else 0, seconds, options=options)
 
 
 def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:
