@@ -185,11 +185,7 @@ def check_chunks(dataset: Any, file: int) -> None:
 
 
 def within(folder: Path, files: Iterable[Path]) -> list[Path]:
-    """Files of a folder that is read as one log, none of which a link leads out of it.
-
-    Raises:
-        DataError: a file lies elsewhere; names it.
-    """
+    """Files of a folder that is read as one log; `DataError` names one that a link leads out of it."""
     files, root = list(files), folder.resolve()
     for file in files:
         if not file.resolve().is_relative_to(root):

@@ -20,8 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forcegp.errors import MissingDependencyError
-from forcegp.files import atomic_file
-from forcegp.temporary import Temporary, discard, sweep
+from forcegp.files import Temporary, atomic_file, discard, sweep
 
 FLAGS = ["-std=c++17", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-w", "-shared", "-fPIC"]
 LIBRARY = "kernel.so"
@@ -30,11 +29,7 @@ PROC = Path("/proc/self/fd")
 
 
 def find_compiler() -> str:
-    """Path of the C++ compiler: `$CXX`, or the first of c++, g++ and clang++ on the PATH.
-
-    Raises:
-        MissingDependencyError: there is none.
-    """
+    """Path of the C++ compiler: `$CXX` or one on the PATH; `MissingDependencyError` if there is none."""
     wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
     for name in wanted:
         if path := shutil.which(name):

@@ -51,8 +51,7 @@ def rollout(
     """
     from forcegp.destination import check_destination
     from forcegp.files import written_folder
-    from forcegp.report.rollout_data import rollout_data
-    from forcegp.report.rollouts import write_rollouts
+    from forcegp.report.rollouts import rollout_data, write_rollouts
     from forcegp.rollout import beside_log
     from forcegp.rollout.forward import replayed
     from forcegp.rollout.inputs import sampling_period

@@ -125,11 +125,7 @@ def check_values(data: Fields) -> None:
 
 
 def check_time(data: Fields) -> None:
-    """Check that rows of a segment are together, and that time increases strictly within each.
-
-    Raises:
-        DataError: they are not; the message names the row.
-    """
+    """Check that a segment's rows are together, with strictly increasing time; `DataError` names the row."""
     t, segment = data.t, data.segment
     same = segment[1:] == segment[:-1]
     back = same & (t[1:] <= t[:-1])

@@ -45,11 +45,7 @@ def check_ending(path: str | Path) -> None:
 
 
 def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> None:
-    """Write columns and header to a Parquet file, whole or not at all.
-
-    Raises:
-        OSError: the place cannot be written.
-    """
+    """Write columns and header to a Parquet file, whole or not at all; `OSError` where that fails."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -106,11 +102,7 @@ def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
 
 @contextmanager
 def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], DataHeader]]:
-    """A Parquet file, its numeric columns and its header; errors of the format become a `DataError`.
-
-    Raises:
-        DataError: the file is damaged, or is not a log.
-    """
+    """A Parquet file, its numeric columns and its header; `DataError` if it is damaged or not a log."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

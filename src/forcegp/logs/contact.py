@@ -240,11 +240,7 @@ def _misplaced(
     displaced: bool,
     report: ImportReport,
 ) -> float:
-    """Distance from the scene's surface at which the tip slides [m], 0 where it touches.
-
-    Raises:
-        DataError: the tip never touches: the surface lies elsewhere, or two joints are exchanged.
-    """
+    """Distance from the scene's surface at which the tip slides [m], 0 where it touches; else `DataError`."""
     if len(c) < 2 or (np.abs(c) <= TOUCHING).mean() > TOUCHED:
         return 0.0
     p, name = _rowwise(signals, ("q",), lambda q: _tip(system, contact, q)), contact.name

@@ -225,11 +225,7 @@ def load_mapping(source: str | Path) -> Mapping:
 
 
 def parse_mapping(content: bytes, source: str) -> Mapping:
-    """A mapping from the bytes of its file.
-
-    Raises:
-        MappingError: it is not valid; the message names file, line and key.
-    """
+    """A mapping from the bytes of its file; a `MappingError` names file, line and key."""
     document = Document(content, source, MappingError)
     lines = content.decode().splitlines()
     doubts = tuple(line[len(CHECK) :] for line in lines if line.startswith(CHECK))

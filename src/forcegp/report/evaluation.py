@@ -12,8 +12,7 @@ from forcegp.evaluation import Evaluation
 from forcegp.evaluation.scores import JointErrors
 from forcegp.files import write_text
 from forcegp.models.fit_result import Compared
-from forcegp.report.html import PictureBlock, Table, cell, render
-from forcegp.report.style import INK, Picture, colour, draw, label
+from forcegp.report.page import INK, Picture, PictureBlock, Table, cell, colour, draw, label, render
 from forcegp.report.window import WindowData, draw_errors, draw_forces, draw_predictions
 
 PAGE, WINDOW = "evaluation.html", "window.json"

@@ -14,8 +14,7 @@ from forcegp.evaluation.predicted import logged_forces, predicted_forces
 from forcegp.files import Header, Record
 from forcegp.models.base import Predictor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.report.html import Series, as_tensor, columns, series
-from forcegp.report.style import INK, Picture, colour, draw, label
+from forcegp.report.page import INK, Picture, Series, as_tensor, colour, columns, draw, label, series
 
 WIDTH, WIDE, ROW, MARGIN = 4.1, 12.0, 0.92, 0.75
 """Widths of a plot by joint and of one across the page, height of a row and of the rest [inch]."""

@@ -259,11 +259,7 @@ def load_robot(
 
 
 def robot_path(source: str | Path) -> Path:
-    """The file of a bundled name or a path.
-
-    Raises:
-        UnknownNameError: neither a bundled robot nor a path.
-    """
+    """The file of a bundled name or a path; `UnknownNameError` if it is neither."""
     path = Path(os.path.expanduser(source))  # an unknown user is left as it is
     if str(source) in BUNDLED:
         return Path(__file__).parent / "bundled" / f"{source}.urdf"

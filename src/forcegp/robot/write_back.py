@@ -257,11 +257,7 @@ def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
-    """Compare a robot with what the written text gives.
-
-    Raises:
-        RobotFileError: they differ.
-    """
+    """Compare a robot with what the written text gives; `RobotFileError` where they differ."""
     for figure in ("mass", "com", "inertia", *writer.figures):
         wanted, got = getattr(robot, figure), getattr(read, figure)
         error = (wanted - got).abs().flatten(1).amax(-1) if wanted.ndim > 1 else (wanted - got).abs()

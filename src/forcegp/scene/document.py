@@ -64,11 +64,7 @@ class Document:
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
-        """The content as an instance of a pydantic model.
-
-        Raises:
-            ForceGPError: the first error in the content, with its line and key.
-        """
+        """The content as an instance of a pydantic model; the first error is raised with its line and key."""
         # In JSON mode, strict validation accepts a list for a tuple and an integer for a float.
         try:
             return schema.model_validate_json(json.dumps(self.data, default=str))

@@ -85,11 +85,7 @@ class Checkpoint:
             self.write(tensors())
 
     def write(self, tensors: Mapping[str, Tensor]) -> None:
-        """Write tensors, whole or not at all.
-
-        Raises:
-            DestinationError: the place cannot be written.
-        """
+        """Write tensors, whole or not at all; `DestinationError` where the place cannot be written."""
         copies = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
         with atomic_file(self.path) as temporary:
             temporary.write_bytes(safetensors.torch.save(copies, {"key": self.key}))

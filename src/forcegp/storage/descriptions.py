@@ -23,11 +23,7 @@ _CHECK = ConfigDict(arbitrary_types_allowed=True, strict=True, allow_inf_nan=Fal
 
 
 def encode(value: Any, classes: Classes) -> Any:
-    """A description as what JSON can hold.
-
-    Raises:
-        ModelError: the description, or a part of it, is of a class that has no JSON form.
-    """
+    """A description as what JSON can hold; `ModelError` for a class that has no JSON form."""
     names = {kind: name for name, kind in classes.items()}
     if type(value) in names:
         members = {field.name: encode(getattr(value, field.name), classes) for field in _written(value)}

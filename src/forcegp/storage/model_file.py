@@ -79,11 +79,7 @@ class ModelHeader(Header):
     system: dict[str, Any]
 
     def settings_as(self, kind: type[M], source: str) -> M:
-        """The settings of a saved model, checked.
-
-        Raises:
-            ModelError: a field is missing, unknown or not valid; names file and field.
-        """
+        """The settings of a saved model, checked; a `ModelError` names file and field."""
         return validated(kind, self.settings, source, ModelError, ("settings",))
 
 
@@ -113,22 +109,14 @@ def write_model(
     settings: Record,
     tensors: Mapping[str, Tensor],
 ) -> None:
-    """Write the file of a model, whole or not at all; see `model_bytes`.
-
-    Raises:
-        DestinationError: the place cannot be written.
-    """
+    """Write the file of a model, whole or not at all; `DestinationError` where it cannot be written."""
     data = model_bytes(kind, system, settings, tensors)
     with atomic_file(model_path(path)) as temporary:
         temporary.write_bytes(data)
 
 
 def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
-    """Header and tensors of a saved model, those of its system among them.
-
-    Raises:
-        ModelError: no model is there, or it is damaged; names the file.
-    """
+    """Header and tensors of a saved model, its system's too; `ModelError` if it is missing or damaged."""
     file = model_path(path)
     try:
         if not file.is_file():
@@ -147,11 +135,7 @@ def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
 
 
 def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor]]:
-    """Header and tensors of the content of a model's file.
-
-    Raises:
-        ModelError: it is damaged, or not a model.
-    """
+    """Header and tensors of the content of a model's file; `ModelError` if it is damaged, or not a model."""
     stated, _, text = _metadata(data, source).partition("\n")
     digest = _digest(data, stated)
     if digest != stated:

@@ -226,11 +226,7 @@ def take(
     *,
     finite: bool = True,
 ) -> Tensor:
-    """A named tensor of a saved model, checked; a shape of `None` is any.
-
-    Raises:
-        ModelError: it is missing, of another shape or type, or not finite where it must be.
-    """
+    """A named tensor of a saved model, a shape of `None` being any; `ModelError` unless it fits and is finite."""
     if name not in tensors:
         raise ModelError(f"{source}: tensor {name!r} is missing")
     value = tensors[name]
