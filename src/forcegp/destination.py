@@ -18,14 +18,9 @@ PROBE_BYTES = 1 << 16
 
 
 def check_destination(path: str | Path, *, folder: bool = False, own_files: Iterable[str] = ()) -> None:
-    """Check that a file or folder can be written, without leaving anything behind.
+    """Check, before long work, that a file or folder can be written, without leaving anything behind.
 
-    Call it before long work; `write_or_keep` is its counterpart afterwards.
-
-    Args:
-        path: what will be written.
-        folder: whether that is a folder, which may replace an empty one or one of nothing but `own_files`.
-        own_files: patterns of the names in such a folder; with none, any folder may be replaced.
+    A folder may replace an empty one or one of nothing but `own_files` (patterns; with none, any folder).
 
     Raises:
         DestinationError: a file is to replace a folder or the reverse, the folder holds other files, or the
@@ -44,12 +39,7 @@ def check_destination(path: str | Path, *, folder: bool = False, own_files: Iter
 
 
 def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
-    """Write a result by `write(path)`; if that fails, write it to another place, which the error names.
-
-    Raises:
-        DestinationError: the place cannot be written; the message says where the result is instead.
-        ForceGPError: the result cannot be written anywhere, for a reason of its own.
-    """
+    """Write a result by `write(path)`, or else to another place, which the `DestinationError` names."""
     target = Path(path)
     try:
         write(target)

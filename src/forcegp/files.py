@@ -297,14 +297,7 @@ def validated(
     place: tuple[str, ...] = (),
     what: str = "field",
 ) -> M:
-    """What was read as an instance of a pydantic model.
-
-    Args:
-        kind: the model.
-        fields: what was read.
-        source, place, what: the file, the keys that lead to the fields, and their kind, for the message.
-        error: the class of error to raise; it names the file and the first wrong field.
-    """
+    """What was read as a pydantic model; an `error` names `source`, `place` and the wrong field."""
     try:
         return kind.model_validate(fields)
     except ValidationError as cause:

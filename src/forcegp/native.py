@@ -52,11 +52,7 @@ def _machine() -> str:
 
 
 def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
-    """The shared library of a C++ source text, with functions `extern "C"`, compiled unless the cache has it.
-
-    Raises:
-        MissingDependencyError: there is no compiler, it failed, or the cache cannot be written or trusted.
-    """
+    """The library of a C++ text, compiled unless it is cached; `MissingDependencyError` if it cannot be."""
     compiler = find_compiler()
     try:
         version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
@@ -134,11 +130,7 @@ def cache_directory() -> Path:
 
 
 def private_folder(folder: Path) -> Path:
-    """The folder, made for its owner alone where it does not exist (OSError if it cannot be made).
-
-    Raises:
-        MissingDependencyError: others own it or can write to it or replace it; names the folder at fault.
-    """
+    """The folder, private to its owner; `MissingDependencyError` names one that others can replace."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)

@@ -35,17 +35,10 @@ def free_memory() -> int | None:
 
 
 def announce_memory(needed: int, what: str, *, certain: int | None = None) -> None:
-    """Announce work that needs more than half of the free memory, and refuse what needs more than all of it.
+    """Announce work that needs more than half of the free memory; `MemoryLimitError` if more than all of it.
 
-    Call it before the allocation, with an upper bound.
-
-    Args:
-        needed: [bytes].
-        what: the work, as the subject of a sentence: "the covariance of 20,000 points".
-        certain: what it needs in any case [bytes], where `needed` is a rough bound; by default `needed`.
-
-    Raises:
-        MemoryLimitError: it certainly needs more than is free.
+    Call it before the allocation, with an upper bound [bytes], and where that is rough what is `certain` to
+    be needed; `what` is the subject of a sentence: "the covariance of 20,000 points".
     """
     free = free_memory()
     if free is None or needed <= LARGE * free:

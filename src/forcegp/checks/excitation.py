@@ -85,11 +85,7 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
-    """Standard deviation of each base parameter after the log over that before it.
-
-    Before: the robot file, with masses known to 30 % and centres of mass to 0.1 m. After: that and the
-    torques of the rows, with noise of a hundredth of each joint's torque.
-    """
+    """Deviation of each base parameter after the log, with torque noise of 1 %, over that before it."""
     robot = system.robot
     base = base_parameters(robot)
     columns = np.array(base.columns)

@@ -27,10 +27,7 @@ def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
 
 
 def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, Array]:
-    """The unexplained torque at some rows, r `(n, nq)` [N m, N], and J `(n, k, nq)` of the touching points.
-
-    J is zero where they do not touch. The robot must be in double precision on the CPU.
-    """
+    """Unexplained torque r `(n, nq)` [N m, N], and J `(n, k, nq)` of the points, 0 where they are off."""
     robot, r, J = system.robot, [], []
     with torch.no_grad():
         for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
@@ -189,10 +186,7 @@ def _with_instruments(A: Array, problem: TorqueProblem, instruments: Array) -> A
 
 
 def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
-    """Parameters of the columns and of the nuisance that rows with a large residual hardly move.
-
-    Huber's weights, min(1, k/|r|) with k twice the median residual (*Robust Statistics*, 1981, ch. 7).
-    """
+    """Parameters by Huber's weights min(1, k/|r|), k twice the median (*Robust Statistics*, 1981, ch. 7)."""
     A, y, unit, weight = _equations(problem, columns, prior)
     w, theta = np.ones(len(y)), np.zeros(A.shape[-1])
     for _ in range(REWEIGHTED):

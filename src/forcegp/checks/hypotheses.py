@@ -168,10 +168,7 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
 def current_hypothesis(
     log: Log, rows: np.ndarray, problem: TorqueProblem, joints: tuple[int, ...]
 ) -> Hypothesis:
-    """Gains of joints by instrumental variables; the instrument is the torque that the motion needs.
-
-    Errors in a logged torque, mostly friction of a light joint, would bias its gain towards zero.
-    """
+    """Gains with the torque that the motion needs as instrument: errors of the logged one would bias them."""
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)
 

@@ -255,11 +255,7 @@ SMOOTHED_SECONDS, SMOOTHED_ORDER = 0.1, 3
 
 
 def smoothed(log: Log) -> Log:
-    """The log after a Savitzky-Golay filter on each stretch without a contact switch.
-
-    Rows within half a window of an end, a gap or a switch are masked. A log in order of selection, and one
-    sampled too slowly for a filter, is left as it is.
-    """
+    """The log after a Savitzky-Golay filter between contact switches, ends masked, if it is in order."""
     from scipy.signal import savgol_filter
 
     half = round(SMOOTHED_SECONDS / log.dt / 2.0) if np.isfinite(log.dt) and log.header.ordered else 0

@@ -110,10 +110,7 @@ def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) ->
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
-    """The explanation without friction that the log does not determine: it would drive, or is below its σ.
-
-    What is left out has the parameter and the spread 0.
-    """
+    """The explanation without friction that would drive, or is below its σ: parameter and spread become 0."""
     declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
     for _ in range(robot.nq):
         fit = explanation.fit
@@ -244,11 +241,7 @@ def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
 
 
 def _upper_spread(level: Array) -> float:
-    """Standard deviation of the level, from its upper side alone where that is narrower.
-
-    If a contact leaves one free torque, the level is the logarithm of a few squares. Its lower tail is twice
-    as long as its upper one and says nothing about how large a residual is usual.
-    """
+    """Deviation of the level, from its upper side where narrower: of few squares the lower tail is long."""
     middle, upper = np.percentile(level, [50.0, ONE_SIGMA])
     return float(min(robust_std(level), upper - middle))
 

@@ -199,10 +199,7 @@ def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
 
 
 def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
-    """`(n, nq)` bool, values that depart as others do, of which each is compared with its column's range.
-
-    A shock moves several joints, or shows in torque and acceleration, and never in the position.
-    """
+    """`(n, nq)` bool, values but positions that depart with others, each compared with its column's range."""
     departure = departures[name][0]
     if name == "q":
         return np.zeros(departure.shape, bool)
@@ -236,10 +233,7 @@ def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) ->
 
 
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
-    """`(n, d)` bool, departures that those of the neighbours follow from, as they do for one wrong value.
-
-    A value that is off by h departs by h, its neighbours by −4h/6 and h/6; a kink or a step has other shapes.
-    """
+    """`(n, d)` bool, departures h with −4h/6 and h/6 around: one wrong value makes them, a kink does not."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
     shape = departure[..., None] * np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
     misfit = np.abs(around - shape).max(axis=-1)

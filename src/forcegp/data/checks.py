@@ -103,10 +103,7 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 
 
 def check_values(data: Fields) -> None:
-    """Check that every number is finite, and that time increases within each segment.
-
-    Predictions of what is not determined are NaN.
-    """
+    """Check that numbers, but for predictions of what is not determined, are finite, and time increases."""
     for name, value in (("t", data.t), *named_columns(data).items()):
         wrong = ~(value.abs() <= LOGGED_VALUE)
         if name.startswith("predicted_"):
@@ -148,11 +145,7 @@ def check_time(data: Fields) -> None:
 
 
 def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
-    """Row numbers `(k,)` of a slice, mask or list of indices, negative ones counted from the end.
-
-    Raises:
-        DataError: a mask of another length, or an index that does not exist.
-    """
+    """Row numbers `(k,)` of a slice, mask or list, negative from the end; `DataError` if there is none."""
     if isinstance(rows, slice):
         return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
     rule = "rows are selected by a slice, a mask or a list of row numbers"

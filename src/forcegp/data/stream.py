@@ -53,12 +53,8 @@ def shape_of(path: Path) -> tuple[int, DataHeader]:
 
 
 def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece]:
-    """The pieces of a file, of `size` rows each but for the last; `number` is that of its first trajectory.
-
-    A piece is read with `window` rows before and after it, within its trajectories.
-
-    Raises:
-        DataError: the file is damaged, a value is missing, or rows of a trajectory are not together.
+    """The pieces of a file, `size` rows each, with `window` rows around them within their trajectories, which
+    are numbered from `number`; `DataError` if it is damaged, or rows of a trajectory are not together.
     """
     import pyarrow as pa
 
@@ -264,15 +260,8 @@ class StreamedDataset:
 
 
 def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = None) -> tuple[Dataset, int]:
-    """Evenly spaced rows of a log of unknown length, in one pass, and the number of all rows that count.
-
-    Args:
-        pieces: the log.
-        count: how many rows to keep at least, if there are so many; fewer than twice as many are kept.
-        keep: which rows of a piece count; all by default.
-
-    Raises:
-        DataError: there are no pieces.
+    """Evenly spaced rows of a log of unknown length, `count` to twice as many if there are so many, in one
+    pass, and the number of all rows that count by `keep`; `DataError` without any piece.
     """
     kept: list[tuple[Tensor, Dataset]] = []
     step, total = 1, 0

@@ -64,12 +64,8 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
 def read_table(
     path: str | Path, *, missing: Literal["refuse", "nan"] = "refuse"
 ) -> tuple[Columns, DataHeader]:
-    """Read the numeric columns of a Parquet or CSV file, and its header (defaults where it has none).
-
-    An empty value is an error, or a NaN where `missing` is `"nan"`.
-
-    Raises:
-        DataError: no such file, a kind of file that is not read, or one that is damaged or too large.
+    """Numeric columns of a Parquet or CSV file, and its header (defaults where it has none); an empty value
+    is an error, or NaN where `missing` is `"nan"`. A `DataError` says why a file cannot be read.
     """
     file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}

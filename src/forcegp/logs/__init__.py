@@ -98,10 +98,7 @@ def import_log(
     progress: Callable[[int, int], None] | None = None,
     displaced: bool = False,
 ) -> Imported:
-    """Read a log as `read_log` does, and say what was found and done; `progress` gets work done and total.
-
-    With `displaced`, a contact by distance whose tip slides beside the surface of the scene is closed there.
-    """
+    """Read a log as `read_log` does, with a report; `displaced` lets a tip slide beside its surface."""
     system = system_of(scene)
     robot = system.robot
     if mapping is None:

@@ -51,10 +51,7 @@ def _tip(system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor) ->
 def _wrench(
     robot: RobotModel, mapping: Mapping, q: torch.Tensor, reading: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Force, moment about the sensor and its position, `(n, 3)` each, in the world, less the tool's weight.
-
-    The reading `(n, 6)` is in the sensor's axes or the world's [N], [N m].
-    """
+    """Force, moment about the sensor and its position `(n, 3)` in the world, less the tool [N, N m]."""
     section = mapping.sections.wrench
     assert section is not None
     if section.frame == GROUND:
@@ -75,10 +72,7 @@ def _wrench(
 
 
 def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
-    """The sensor's force and moment at each contact with a surface: `F_sensor` and `M_sensor`.
-
-    A load cell has the normal force alone, which is the `multiplier`.
-    """
+    """`F_sensor` and `M_sensor` at each contact with a surface, or of a load cell the `multiplier`."""
     touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
     section = mapping.sections.wrench
     if section is not None and len(section.force) == 1:
@@ -97,11 +91,7 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
 
 
 def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
-    """λ `(n,)` of the rigid-body model at one contact [N], zero in free motion where the model is right.
-
-    M q̈ − Q is the generalized force that the known forces do not explain, and
-    λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) the part of it along the surface's normal.
-    """
+    """λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` of the rigid body at one contact [N], about zero in free motion."""
     alone = ConstrainedSystem(system.robot, [contact])
 
     def value(q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:

@@ -115,10 +115,7 @@ class _Gathering:
         return stream, result
 
     def _wrench(self) -> tuple[Stream, Array]:
-        """Force and moment as the sensor gives them, in SI units, offsets taken off; no moment is zero.
-
-        The one column of a load cell is a force along its axis.
-        """
+        """Force and moment `(n, 6)` in SI units, offsets taken off; zero where the sensor measures none."""
         section = self.mapping.sections.wrench
         assert section is not None
         stream = self.table.stream_of(section.force[0], section.stream)

@@ -33,10 +33,7 @@ class Signals:
         return len(self.t)
 
     def keep(self, mask: NDArray[np.bool_], split: bool = False) -> None:
-        """Keep only some rows `(n,)`, one column after another, so that memory holds one copy.
-
-        With `split`, what lies on two sides of dropped rows is not one trajectory.
-        """
+        """Keep some rows `(n,)`, column by column to save memory; with `split`, gaps part trajectories."""
         if mask.all():
             return
         if split:

@@ -163,12 +163,8 @@ def _run(y: Array, gain: Array, back: Array) -> Array:
 
 
 def add_derivatives(signals: Signals, settings: DerivativesSection, report: ImportReport) -> Array | None:
-    """Compute `qd` and `qdd` where the log has none, and pass the torque through the same filter.
-
-    The clock is even; contact switches cut the log into pieces, and pieces that are too short are dropped.
-
-    Returns:
-        `(n, nq)` standard deviation of the computed q̈, or `None` where q̈ is logged.
+    """Compute `qd` and `qdd` where the log has none, piece by piece between contact switches, and pass the
+    torque through the same filter; returns σ of the computed q̈ `(n, nq)`, or `None` where it is logged.
     """
     logged = [name for name in ("qd", "qdd") if name in signals.vectors]
     if len(logged) == 2:

@@ -120,13 +120,10 @@ LEAST_WIDTH, LARGEST_TILT = 10.0, 0.2
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """A fitted surface of a contact.
+    """A fitted surface, with the radius of the tip that touched [m] and standard deviations.
 
-    Attributes:
-        std: standard deviations: `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane;
-            `center` [m] (the largest of its three) and `radius` [m] of a sphere; `tip_radius` [m] if fitted.
-        solution: the least squares that it comes from.
-        tip_radius: of the tip that touched [m].
+    These are `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane, `center` [m] (the largest
+    of three) and `radius` [m] of a sphere, and `tip_radius` [m] if fitted.
     """
 
     contact: str
@@ -161,15 +158,8 @@ def fit_surface(
     """Fit a surface to the path of the touching point while a contact is closed.
 
     Least squares of the signed distances, without the rows that a robust fit finds off the surface. The error
-    bars count residuals that are correlated in time as fewer independent ones.
-
-    Args:
-        data: a log with the contact's state.
-        system: the robot with its contacts; the point and the side of the surface are the scene's.
-        contact: which contact.
-        kind: the kind of surface.
-        tip_radius: of a ball that ends at the scene's point, on the line from the frame's origin to it
-            [m], or `"fit"`; by default the scene's tip.
+    bars count residuals that are correlated in time as fewer independent ones. The ball that touches, of
+    `tip_radius` [m] or `"fit"`, ends at the scene's point; by default the tip is the scene's.
 
     Raises:
         DataError: the scene has another tip, the contact is closed in too few rows, or the path is too

@@ -115,10 +115,7 @@ class RolloutData(Header):
 
 
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
-    """The data of the section from a comparison; curves are those of its first start.
-
-    Bands are calibrated on `calibration`, the same models on another motion.
-    """
+    """The data of the section, curves of the first start; `calibration`, on another motion, widens bands."""
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
     tip = comparison.frame, comparison.point

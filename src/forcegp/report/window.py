@@ -155,13 +155,7 @@ def draw_predictions(window: WindowData) -> Picture:
 
 
 def draw_errors(window: WindowData, limit: float | None = None) -> Picture:
-    """Errors of the predictions: noise-free and measured acceleration less the predicted mean.
-
-    Args:
-        window: the predictions.
-        limit: half height of every row [rad/s²], to compare models at one scale; each row has its own
-            scale by default.
-    """
+    """Errors of the predictions by joint, within ±`limit` [rad/s²], or each row at its own scale."""
     error = window.error.abs()
     alt = (
         f"error of the predicted accelerations of {{}}, mean magnitude {error.mean():.2g}, "

@@ -50,12 +50,7 @@ class _Placed:
 
 
 def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
-    """The robot that a tree describes, in double precision, with pose of the base and gravity as given.
-
-    Raises:
-        UnsupportedRobotError: the name of a frame is ambiguous.
-        InertiaError: the robot can move without inertia.
-    """
+    """The robot of a tree in a world; typed errors for ambiguous frames and motion without inertia."""
     remarks, placed = list(tree.remarks), _place(tree.joints)
     bodies = _merge(tree, placed)
     remarks += _held_base(tree, placed)
@@ -274,11 +269,7 @@ def _read(source: str | Path) -> Tree:
 
 
 def read_tree(data: bytes, path: Path) -> Tree:
-    """Links and joints of a URDF or MJCF document; `path` names it, and files that it includes are beside it.
-
-    Raises:
-        RobotFileError: the document is neither, or not valid.
-    """
+    """Links and joints of a URDF or MJCF document of a `path`; `RobotFileError` if it is not valid."""
     root = parse_xml(data, str(path))
     if root.tag == "robot":
         return read_urdf(root, str(path))

@@ -29,14 +29,9 @@ _KINDS: dict[int, JointKind] = {
 
 
 def read_mjcf(root: Element, path: Path) -> Tree:
-    """Links and joints of the `<mujoco>` document of a file: bodies are links, bodies and sites are frames.
-
-    A body with several joints gets a massless link between each two of them.
-
-    Raises:
-        RobotFileError: the document is not valid; errors of MuJoCo's compiler are quoted.
-        UnsupportedRobotError: the document uses an unsupported feature; the message names it.
-        InertiaError: a mass or an inertia is not physical.
+    """Links and joints of the `<mujoco>` document of a file: bodies are links, bodies and sites are frames,
+    and massless links lie between several joints of a body. Typed errors quote MuJoCo's compiler, or name
+    what is not supported or not physical.
     """
     document, coupled, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):

@@ -40,13 +40,7 @@ WORLD = "world"
 
 
 def read_urdf(root: Element, label: str) -> Tree:
-    """Links and joints of a URDF document from its `<robot>` element; `label` names the file in messages.
-
-    Raises:
-        RobotFileError: an element or a number is missing or not valid; the message names it.
-        UnsupportedRobotError: a joint is of an unsupported type.
-        InertiaError: a mass or an inertia is not a finite number.
-    """
+    """Links and joints of a `<robot>` element; typed errors name what is not valid or not supported."""
     _refuse_xacro(root, label)
     links = tuple(_link(element, label) for element in root.findall("link"))
     joints = tuple(_joint(element, label) for element in root.findall("joint"))

@@ -44,13 +44,7 @@ ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
 
 
 class Change(NamedTuple):
-    """A figure of the file that changed.
-
-    Attributes:
-        element: link or joint.
-        figure: attribute, such as `mass` or `damping`.
-        before, after: values in SI units.
-    """
+    """A figure that changed, such as `mass` or `damping`, of a link or joint, with its values in SI units."""
 
     element: str
     figure: str
@@ -60,12 +54,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenRobot:
-    """What was written.
-
-    Attributes:
-        changes: figures that changed.
-        losses: figures of the robot that the format has no place for, one sentence each.
-    """
+    """Figures that changed, and sentences on figures of the robot that the format has no place for."""
 
     changes: tuple[Change, ...]
     losses: tuple[str, ...]
@@ -182,13 +171,8 @@ def _listed(name: str, old: Inertial, new: Inertial) -> list[Change]:
 
 
 class _Part(NamedTuple):
-    """A link of the file that is fixed to a link of the robot.
-
-    Attributes:
-        name: of the link.
-        pose: T `(4, 4)` of its frame in the link of the robot.
-        J: its pseudo-inertia `(4, 4)` there.
-        sound: whether some body has its figures.
+    """A link of the file that is fixed to a link of the robot: pose T and pseudo-inertia J `(4, 4)` of it
+    there, and whether some body has its figures.
     """
 
     name: str

@@ -35,13 +35,7 @@ _TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
 
 
 class Document:
-    """A parsed TOML file that knows the line of each key.
-
-    Args:
-        content: the bytes of the file.
-        source: its name, for messages.
-        error: the class of error to raise, also by the methods.
-    """
+    """A parsed TOML file that knows the line of each key; errors are of class `error` and name `source`."""
 
     def __init__(self, content: bytes, source: str, error: type[ForceGPError] = SceneError) -> None:
         self.source, self.error = source, error

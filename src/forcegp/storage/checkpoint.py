@@ -110,16 +110,7 @@ class Evaluations:
 
     @classmethod
     def resumed(cls, path: str | Path | None, start: Mapping[str, Tensor], *key: object) -> Evaluations:
-        """The evaluations in a file, if there is one.
-
-        Args:
-            path: the file; `None` to keep nothing.
-            start: initial tensors of what is learned.
-            key: settings and tensors that identify what is learned.
-
-        Raises:
-            ModelError: see `read`.
-        """
+        """The evaluations in a file, if any; `key` identifies what is learned from `start`."""
         if path is None:
             return cls(None)
         result = cls(Checkpoint(Path(path), Checkpoint.key_of(*key)))

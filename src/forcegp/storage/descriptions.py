@@ -38,14 +38,7 @@ def encode(value: Any, classes: Classes) -> Any:
 
 
 def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bool = True) -> Any:
-    """The description that `encode` wrote.
-
-    Args:
-        json: what was read.
-        classes: as given to `encode`.
-        place: file and field, for messages.
-        depth: level of nesting.
-        whole: whether every field must be there; otherwise fields that are left out have their defaults.
+    """The description that `encode` wrote, with all fields if `whole`, else with defaults for those left out.
 
     Raises:
         ForceGPError: a field is missing, unknown or of another type, or a class is unknown; names the place.

@@ -35,12 +35,7 @@ _POSITIVE = re.compile(r"(data\.\d+|training)\.noise_std|std\.[^.]+|scale\..+\.s
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
-    """Check the number, types and values of tensors that were read; their shapes the loader checks.
-
-    Raises:
-        ModelError: a tensor is of another type, NaN, infinite but no joint limit, or a standard deviation
-            that is not positive.
-    """
+    """Check number, types and values of tensors; deviations are positive. The loader checks shapes."""
     if len(tensors) > TENSORS:
         raise ModelError(f"{source}: too many tensors", expected=f"at most {TENSORS}", got=len(tensors))
     for name, value in tensors.items():

@@ -67,11 +67,7 @@ def at_rest(system: ConstrainedSystem) -> Motion:
 
 
 def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = None) -> Motion:
-    """The logged motion of one trajectory, with the force of a model or else the logged multiplier.
-
-    Raises:
-        DataError: no rows, or they do not fit the robot.
-    """
+    """The logged motion, with a model's force or the logged one; `DataError` unless it fits the robot."""
     data = data.select(system.robot.joint_names)
     if not len(data):
         raise DataError("there is no motion to look at", expected="one row or more", got="none")

@@ -272,10 +272,7 @@ HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
 def read_matlab(path: Path, **_: object) -> LogTable:
-    """Read the numeric arrays of a MATLAB file; fields of a struct are `struct.field`.
-
-    Cells, objects, sparse matrices and function handles are left out with a remark.
-    """
+    """Read the numeric arrays of a MATLAB file, fields of a struct as `struct.field`; remark the rest."""
     with path.open("rb") as file:
         head = file.read(520)
     remarks: list[str] = []

@@ -36,10 +36,7 @@ def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 def read_columns(
     paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
 ) -> dict[str, Column]:
-    """The columns of one or more files one after another; `remarks` gets a sentence for each one left out.
-
-    A list column is wanted by its name, or by `name[i]`.
-    """
+    """Columns of files one after another, of lists by name or `name[i]`; `remarks` gets what is left out."""
     import pyarrow.parquet as pq
 
     chunks: dict[str, list[Column]] = {}
@@ -139,11 +136,7 @@ MAX_INFO_BYTES = 4 << 20
 
 
 def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the columns of numbers of all episodes; `observation.state` of six motors becomes six columns.
-
-    The columns are named as in `meta/info.json`: `observation.state.<motor>`, or `observation.state[i]`
-    where the motors have no names. Images and videos are not read.
-    """
+    """Read the numbers of all episodes, with the names in `meta/info.json`: `observation.state.<motor>`."""
     description, *files = within(
         path, [path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))]
     )

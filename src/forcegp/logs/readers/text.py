@@ -277,10 +277,7 @@ ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".asc")
 
 
 def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the tables of a folder; a column is `file[i]`, or `file.heading` where the file has headings.
-
-    Files with the same number of rows share a clock and make one stream.
-    """
+    """Read the tables of a folder as `file[i]` or `file.heading`; those of as many rows make one stream."""
 
     def in_file(file: Path, column: str) -> str:
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"
