@@ -205,7 +205,9 @@ def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[F
         assert column is not None
         yield Fault("encoder-offset", joint, column[..., 0], 1)
     if log.header.ordered:  # rows in order of selection have no neighbours in time
-        yield Fault("torque-delay", "", _rate(system, log, rows), log.nq)
+        # The torque that the motion needs; the measured one has more noise.
+        ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
+        yield Fault("torque-delay", "", (ahead - behind) / (2.0 * SPAN * log.dt), log.nq)
     # Per degree of a tilt, about the horizontal axis that shows it better.
     gravity, columns = system.robot.gravity.numpy(), robot_columns(system, log, rows, "gravity")[0]
     axes = np.linalg.svd(gravity[None])[2][1:] * np.linalg.norm(gravity) * np.pi / 180.0
@@ -214,9 +216,3 @@ def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[F
     # The inertial parameters of every other link are taken as wrong by the same share.
     wrong = -np.repeat((-1.0) ** np.arange(log.nq), 10) * parameter_vector(system.robot).numpy()
     yield Fault("masses-mismatch", "", robot_columns(system, log, rows, "masses")[0] @ wrong, log.nq)
-
-
-def _rate(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """`(n, nq)` rate of change of the torque that the motion needs; the measured one has more noise."""
-    ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
-    return (ahead - behind) / (2.0 * SPAN * log.dt)

@@ -145,7 +145,11 @@ def cross_validate(
     """
     p = columns.shape[-1] if columns is not None else 0
     A, y, unit, weight = _equations(problem, columns, prior)
-    Z = None if instruments is None else _with_instruments(A, problem, instruments)
+    Z = None
+    if instruments is not None:  # in place of the leading columns, in the same units
+        Z = problem.without_contact(instruments)
+        size = np.sqrt((Z**2).sum(axis=(0, 1)))
+        Z = np.concatenate([Z / np.where(size > 0.0, size, np.inf), A[..., Z.shape[-1] :]], axis=-1)
     rest, thetas, whole = _held_out(A, y, weight, Z)
     block = blocks_of(len(y))
     error = np.stack([np.sqrt((rest[block == k] ** 2).mean(axis=0)) for k in range(BLOCKS)])
@@ -175,14 +179,6 @@ def _equations(
     if prior is not None:
         weight[:p] += 1.0 / (prior * unit[:p]) ** 2
     return A / unit, y, unit, weight
-
-
-def _with_instruments(A: Array, problem: TorqueProblem, instruments: Array) -> Array:
-    """The columns, the leading ones replaced by their instruments, in the same units."""
-    Z = problem.without_contact(instruments)
-    size = np.sqrt((Z**2).sum(axis=(0, 1)))
-    Z = Z / np.where(size > 0.0, size, np.inf)
-    return np.concatenate([Z, A[..., Z.shape[-1] :]], axis=-1)
 
 
 def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> Array:

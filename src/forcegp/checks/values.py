@@ -163,13 +163,15 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     """Single values far off the curve through their neighbours."""
     bad, hit, joints, vectors = np.zeros(len(log), bool), [], [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
+    near = np.zeros(len(log), bool)
+    for label in log.contact.values():  # next to a contact switch values jump by nature
+        near[1:] |= label[1:] != label[:-1]
     for name in vectors:
         departure, around, scale = departures[name]
         reach = log.reach(name)
         least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
-        # Next to a contact switch values jump by nature.
         outlier = (
-            ~_switches(log)[:, None]
+            ~_within_two(near)[:, None]
             & (np.abs(departure) > np.maximum(SPIKE * scale, least))
             & (np.abs(departure) > SPIKE_ALONE * around)
             & _one_value(departure, scale)
@@ -238,14 +240,6 @@ def _one_value(departure: Array, scale: Array) -> np.ndarray:
     shape = departure[..., None] * np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
     misfit = np.abs(around - shape).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
-
-
-def _switches(log: Log) -> np.ndarray:
-    """`(n,)` bool, rows within two of a contact switch."""
-    near = np.zeros(len(log), bool)
-    for label in log.contact.values():
-        near[1:] |= label[1:] != label[:-1]
-    return _within_two(near)
 
 
 def _within_two(x: Array) -> Array:

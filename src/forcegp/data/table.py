@@ -91,8 +91,18 @@ def existing(path: str | Path) -> Path:
 
 
 def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
+    """The columns, whose size in memory is checked before: a small file can claim to hold more than fits."""
     with opened_parquet(file) as (parquet, usable, header):
-        _check_size(file, parquet.metadata.num_rows, len(usable))
+        rows, columns = parquet.metadata.num_rows, len(usable)
+        allowed = min(allowed_bytes(file.stat().st_size), limits.TABLE_BYTES)
+        if 8 * rows * columns > allowed:
+            raise DataError(
+                f"{file}: the file claims to be larger than what is read at once",
+                expected=f"at most {allowed // 8:,} numbers in a file of this size",
+                got=f"{rows:,} rows × {columns} columns",
+                hint="split the log into several files",
+            )
+        announce_memory(COPIES * 8 * rows * columns, f"reading {file}")
         return parquet.read(columns=usable, use_threads=False), header
 
 
@@ -107,7 +117,8 @@ def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], Data
         with pq.ParquetFile(file.absolute()) as parquet:  # Arrow expands a leading ~
             shape = parquet.metadata
             _check_count(file, shape.num_columns)
-            header = _header(file, parquet.schema_arrow.metadata or {})
+            text = (parquet.schema_arrow.metadata or {}).get(HEADER_KEY)
+            header = DataHeader() if text is None else DataHeader.from_json(text, str(file), DataError)
             usable = _usable(file, parquet.schema_arrow)
             _check_flat(file, usable, [parquet.schema.column(i).path for i in range(shape.num_columns)])
             yield parquet, usable, header
@@ -129,25 +140,6 @@ def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
         outer = next((prefix for prefix in prefixes if prefix in names), None)
         if outer is not None:
             raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
-
-
-def _check_size(file: Path, rows: int, columns: int) -> None:
-    """Check the size in memory before anything is unpacked: a small file can claim to hold more than fits."""
-    size = rows * columns * 8
-    allowed = min(allowed_bytes(file.stat().st_size), limits.TABLE_BYTES)
-    if size > allowed:
-        raise DataError(
-            f"{file}: the file claims to be larger than what is read at once",
-            expected=f"at most {allowed // 8:,} numbers in a file of this size",
-            got=f"{rows:,} rows × {columns} columns",
-            hint="split the log into several files",
-        )
-    announce_memory(COPIES * size, f"reading {file}")
-
-
-def _header(file: Path, metadata: dict[bytes, bytes]) -> DataHeader:
-    text = metadata.get(HEADER_KEY)
-    return DataHeader() if text is None else DataHeader.from_json(text, str(file), DataError)
 
 
 def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:

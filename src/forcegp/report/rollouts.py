@@ -226,20 +226,6 @@ def draw_tip(data: RolloutData) -> Picture:
     return draw(paint, (WIDTH, 5.0), alt, "Position of the tip")
 
 
-def draw_tip_error(data: RolloutData) -> Picture:
-    """Distance between predicted and logged tip over time, on a logarithmic scale."""
-    curves = [(path, path.tip_error) for path in data.models]
-    alt = f"Tip error over time, median over {data.starts} starts, logarithmic scale, one curve per model."
-    return _draw_logarithmic(data, curves, 1e-9, "tip error [m]", alt, "Tip error over time")
-
-
-def draw_drift(data: RolloutData) -> Picture:
-    """Constraint error of the predicted trajectories."""
-    curves = [(path, path.drift) for path in data.models if path.drift]
-    alt = "Distance of the predicted tip from the surface over time, logarithmic scale, one curve per model."
-    return _draw_logarithmic(data, curves, 1e-16, "|c(q)| [m]", alt, "Drift off the surface")
-
-
 def _draw_logarithmic(
     data: RolloutData, curves: list[tuple[ModelPath, Series]], least: float, name: str, alt: str, title: str
 ) -> Picture:
@@ -295,8 +281,14 @@ def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band:
 
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
     """The plots of the section for which there are data."""
-    pictures = [draw_tip(data), draw_tip_error(data)]
-    pictures += [draw_drift(data)] if any(path.drift for path in data.models) else []
+    log = "logarithmic scale, one curve per model."
+    errors = [(path, path.tip_error) for path in data.models]
+    alt = f"Tip error over time, median over {data.starts} starts, {log}"
+    picture = _draw_logarithmic(data, errors, 1e-9, "tip error [m]", alt, "Tip error over time")
+    pictures = [draw_tip(data), picture]
+    if drifts := [(path, path.drift) for path in data.models if path.drift]:
+        alt = f"Distance of the predicted tip from the surface over time, {log}"
+        pictures += [_draw_logarithmic(data, drifts, 1e-16, "|c(q)| [m]", alt, "Drift off the surface")]
     pictures += [draw_contact_force(data)] if any(path.multiplier for path in data.models) else []
     return tuple(pictures)
 

@@ -25,7 +25,7 @@ from forcegp.errors import (
 )
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import Inertial, Joint, Site, Tree, checked, joint_motion, lock_joints
+from forcegp.robot.tree import Inertial, Joint, Tree, checked, joint_motion, lock_joints
 from forcegp.robot.urdf import read_urdf
 
 FRICTION_VELOCITY = 0.1
@@ -183,22 +183,16 @@ def _frames(tree: Tree, placed: _Placed, remarks: list[str]) -> list[tuple[str, 
     frames = [(link.name, *placed.links[link.name]) for link in tree.links if link.frame]
     taken = {name for name, _, _ in frames}
     for site in tree.sites:
-        name = _free_name(tree, site, taken, remarks)
-        index, T = placed.links[site.link]
+        name, (index, T) = site.name, placed.links[site.link]
+        if name in taken:  # in MJCF, a site and a body may share a name
+            doubt = f"{tree.label}: site {name!r} shares its name with a body"
+            name = f"site/{name}"
+            if name in taken:
+                raise UnsupportedRobotError(doubt, expected="different names")
+            remarks.append(f"{doubt}; its frame is {name!r}")
         frames.append((name, index, T @ site.placement))
         taken.add(name)
     return frames
-
-
-def _free_name(tree: Tree, site: Site, taken: set[str], remarks: list[str]) -> str:
-    """A unique frame name: in MJCF, a site and a body may share a name."""
-    if site.name not in taken:
-        return site.name
-    name, doubt = f"site/{site.name}", f"{tree.label}: site {site.name!r} shares its name with a body"
-    if name in taken:
-        raise UnsupportedRobotError(doubt, expected="different names")
-    remarks.append(f"{doubt}; its frame is {name!r}")
-    return name
 
 
 BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa", "kuka_iiwa14", "ur5")

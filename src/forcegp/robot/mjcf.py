@@ -164,14 +164,12 @@ def _effort(model: Any, j: int) -> float:
     """Largest force that the joint and its actuators allow; the control range of a motor limits it too."""
     effort = float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
     of_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
-    drives = np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == j))
-    return min(effort, sum(_drive_effort(model, a) for a in drives.tolist())) if len(drives) else effort
-
-
-def _drive_effort(model: Any, a: int) -> float:
-    gear, limit = abs(float(model.actuator_gear[a, 0])), np.inf
-    if model.actuator_forcelimited[a]:
-        limit = float(np.abs(model.actuator_forcerange[a]).max())
-    if model.actuator_ctrllimited[a] and model.actuator(a).name.startswith("motor"):
-        limit = min(limit, float(np.abs(model.actuator_ctrlrange[a]).max()))
-    return gear * limit if limit < np.inf else np.inf
+    efforts = []
+    for a in np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == j)).tolist():
+        gear, limit = abs(float(model.actuator_gear[a, 0])), np.inf
+        if model.actuator_forcelimited[a]:
+            limit = float(np.abs(model.actuator_forcerange[a]).max())
+        if model.actuator_ctrllimited[a] and model.actuator(a).name.startswith("motor"):
+            limit = min(limit, float(np.abs(model.actuator_ctrlrange[a]).max()))
+        efforts.append(gear * limit if limit < np.inf else np.inf)
+    return min(effort, sum(efforts)) if efforts else effort

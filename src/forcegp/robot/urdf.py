@@ -41,7 +41,10 @@ WORLD = "world"
 
 def read_urdf(root: Element, label: str) -> Tree:
     """Links and joints of a `<robot>` element; typed errors name what is not valid or not supported."""
-    _refuse_xacro(root, label)
+    for element in root.iter():
+        macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
+        if macros or "xacro" in element.tag:
+            raise xacro_error(label, macros[0][:80] if macros else f"<{element.tag.rpartition('}')[2]}>")
     links = tuple(_link(element, label) for element in root.findall("link"))
     joints = tuple(_joint(element, label) for element in root.findall("joint"))
     remarks: tuple[str, ...] = ()
@@ -51,13 +54,6 @@ def read_urdf(root: Element, label: str) -> Tree:
         links = (Link(WORLD), *links)
         remarks = (f"{label}: link {WORLD!r} is used but not declared; it is taken as the base",)
     return Tree(root.get("name") or "robot", label, links, joints, remarks=remarks)
-
-
-def _refuse_xacro(root: Element, label: str) -> None:
-    for element in root.iter():
-        macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
-        if macros or "xacro" in element.tag:
-            raise xacro_error(label, macros[0][:80] if macros else f"<{element.tag.rpartition('}')[2]}>")
 
 
 def _name(element: Element, label: str) -> str:

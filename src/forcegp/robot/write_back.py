@@ -149,7 +149,13 @@ def _link_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: Ro
             continue
         for name, body in _shared(_parts(file, i, old), J_old[i], J_new[i], joint).items():
             writer.set_inertial(name, body)
-            changes += _listed(name, old[name] or NOTHING, body)
+            before = old[name] or NOTHING
+            changes.append(Change(name, "mass", before.mass, body.mass))
+            for axis, *pair in zip("xyz", before.com, body.com, strict=True):
+                changes.append(Change(name, f"com {axis}", *map(float, pair)))
+            for axes, *place in zip(_MOMENTS, *_PLACES, strict=True):
+                pair = (float(x.inertia[tuple(place)]) for x in (before, body))
+                changes.append(Change(name, f"inertia {axes}", *pair))
     return changes
 
 
@@ -157,17 +163,6 @@ NOTHING = Inertial(0.0, np.zeros(3), np.zeros((3, 3)))
 """The inertia of a link that has none."""
 _MOMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 _PLACES = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
-
-
-def _listed(name: str, old: Inertial, new: Inertial) -> list[Change]:
-    """The ten parameters of a link before and after."""
-    changes = [Change(name, "mass", old.mass, new.mass)]
-    for axis, before, after in zip("xyz", old.com, new.com, strict=True):
-        changes.append(Change(name, f"com {axis}", float(before), float(after)))
-    for axes, row, column in zip(_MOMENTS, *_PLACES, strict=True):
-        before, after = (float(x.inertia[row, column]) for x in (old, new))
-        changes.append(Change(name, f"inertia {axes}", before, after))
-    return changes
 
 
 class _Part(NamedTuple):

@@ -104,7 +104,9 @@ class Document:
         if kind == "missing":
             return self.error(f"{place}: key {last!r} is missing", expected=f"{last} = …")
         if kind in ("union_tag_invalid", "union_tag_not_found"):
-            tags = re.findall(r"'(\w+)'", context.get("expected_tags", "")) or _tags(schema, key)
+            tags = re.findall(r"'(\w+)'", context.get("expected_tags", ""))
+            tables = () if tags else _tables_at(schema, key)
+            tags += [tag for table in tables for tag in get_args(_hints(table).get("type"))]
             if kind == "union_tag_not_found":
                 return self.error(f"{place}: key 'type' is missing", expected=_one_of(tags))
             tag = str(context["tag"])
@@ -144,11 +146,6 @@ def _check_keys(text: str, source: str, error: type[ForceGPError]) -> None:
 
 def _one_of(names: list[str]) -> str:
     return f"one of {', '.join(names)}"
-
-
-def _tags(schema: type, key: Key) -> list[str]:
-    """The values of `type` that a table may have."""
-    return [tag for table in _tables_at(schema, key) for tag in get_args(_hints(table).get("type"))]
 
 
 def _tables_at(schema: type, key: Key) -> list[type]:
