@@ -78,7 +78,14 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
     listed = ", ".join(names[k] for k in np.flatnonzero(weak)[:6])
     more = f" and {weak.sum() - 6} more" if weak.sum() > 6 else ""
     count = f"{weak.sum()} of {len(weak)} base parameters are not identified"
-    text = f"{count}: {listed}{more}; missing: {_missing(log, joints)}"
+    # The motion that would show the parameters of these links.
+    reach, push = np.ptp(log.q[log.usable], axis=0), np.sqrt((log.qdd[log.usable] ** 2).mean(axis=0))
+    narrow = [log.joint_names[j] for j in joints if reach[j] < 0.5]
+    slow = [log.joint_names[j] for j in joints if push[j] < 1.0]
+    parts = [f"larger range of {', '.join(narrow[:3])}"] if narrow else []
+    parts += [f"faster changes of speed of {', '.join(slow[:3])}"] if slow else []
+    missing = "; ".join(parts) or "other poses of the whole arm, fast and slow"
+    text = f"{count}: {listed}{more}; missing: {missing}"
     concerned = tuple(log.joint_names[j] for j in joints)
     numbers = {"identified": int((~weak).sum()), "base_parameters": len(weak)}
     return [log.finding("poor-excitation", text, concerned, **numbers)], log
@@ -99,17 +106,6 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     gram = A.T @ A * (looks / len(rows))
     after = np.linalg.inv(gram + np.eye(len(columns)))
     return np.sqrt(np.diag(after)), base.names, columns
-
-
-def _missing(log: Log, joints: list[int]) -> str:
-    """The motion that would show the parameters of some links, in words."""
-    q, qdd = log.q[log.usable], log.qdd[log.usable]
-    reach, push = np.ptp(q, axis=0), np.sqrt((qdd**2).mean(axis=0))
-    slow = [log.joint_names[j] for j in joints if push[j] < 1.0]
-    narrow = [log.joint_names[j] for j in joints if reach[j] < 0.5]
-    parts = [f"larger range of {', '.join(narrow[:3])}"] if narrow else []
-    parts += [f"faster changes of speed of {', '.join(slow[:3])}"] if slow else []
-    return "; ".join(parts) or "other poses of the whole arm, fast and slow"
 
 
 LEAST_TOUCHING = 20

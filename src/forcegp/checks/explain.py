@@ -40,14 +40,11 @@ Tried = tuple[Hypothesis, TorqueFit]
 
 @dataclass(frozen=True)
 class Explanation:
-    """What explains the torque: faults of the log, which are undone, and of the robot file.
+    """What explains the torque: faults of the log, which are undone in `log`, and of the robot file.
 
-    Attributes:
-        system, log, rows: robot and contacts, the log without the faults, and the rows that are looked at.
-        problem: the torques that remain, over `rows`.
-        columns, prior, robot: of the accepted hypotheses on the robot, which stay in the model, with names.
-        findings, repairs: faults found, and what takes them out of a log, in order.
-        taken: names and joints of the accepted hypotheses.
+    `problem` has the torques that remain over `rows`; `columns`, `prior` and the names `robot` are those of
+    the accepted hypotheses on the robot, which stay in the model; `repairs` take the faults out of a log, in
+    order.
     """
 
     system: ConstrainedSystem

@@ -50,11 +50,8 @@ def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
 
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
     """Rows of J of all contacts, those of the surface normal alone where all of J would leave no torque."""
-    contacts, whole = labelled_contacts(system, log), takes_friction_out(system, log)
-    if not contacts or not len(rows):
-        return np.zeros((len(rows), 0, log.nq))
-    parts = []
-    for c in contacts:
+    whole, parts = takes_friction_out(system, log), [np.zeros((len(rows), 0, log.nq))]
+    for c in labelled_contacts(system, log) if len(rows) else ():
         if whole and isinstance(c, SurfaceContact):
             J = kinematics.point_jacobian(system.robot, q, c.frame, c.point).numpy()
         else:
@@ -84,12 +81,9 @@ FLOOR = 0.03
 
 @dataclass(frozen=True)
 class TorqueProblem:
-    """Torques to be explained by known columns and by those of a hypothesis.
-
-    Attributes:
-        r, J: `(n, nq)` unexplained torque [N m, N], and Jacobian of the touching points `(n, k, nq)`.
-        nuisance: `(n, nq, p)` columns that every hypothesis may use: friction and offset.
-        size, scale: `(nq,)` of the logged torque, for comparison, and of its noise, which weighs the joints.
+    """Unexplained torque r `(n, nq)` [N m, N], Jacobian J of the touching points `(n, k, nq)`, columns that
+    every hypothesis may use `(n, nq, p)`, size of the logged torque, and scale of its noise, which weighs the
+    joints.
     """
 
     r: Array
@@ -108,11 +102,8 @@ class TorqueProblem:
 class TorqueFit:
     """A hypothesis fitted to a log, and tested on its blocks.
 
-    Attributes:
-        error, shares: `(blocks, nq)` root mean square of the held-out residual, over `scale` and over `size`.
-        theta, spread: `(p,)` parameters of the hypothesis, and their deviation by the jackknife over blocks.
-        nuisance, nuisance_spread: the same of the nuisance columns.
-        score: `(blocks,)` Σ_j log of the shares, with a floor where errors do not matter.
+    `error` and `shares` `(blocks, nq)` are the root mean square of the held-out residual over `scale` and
+    over `size`; `theta` and `nuisance` `(p,)` are parameters, with deviations by the jackknife over blocks.
     """
 
     error: Array

@@ -39,16 +39,12 @@ SLOW, GRAVITY = 0.01, 10.0
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One explanation.
+    """One explanation, named by a kind of finding, or a family of kinds.
 
-    Attributes:
-        name: what is wrong: a kind of finding, or a family of kinds.
-        size: number of parameters, discrete choices counted as none.
-        change: makes the log as it would be, were the hypothesis right; parameters come on top.
-        columns, prior: `(n, nq, p)` torque that the parameters add to r, and how large these may be `(p,)`.
-        joints: indices of the joints concerned.
-        shift: delay of the torque in samples.
-        instruments: `(n, nq, p)` in place of least squares on columns that hold errors.
+    `size` counts parameters, discrete choices as none; `change` makes the log as it would be, were the
+    hypothesis right, parameters aside. `columns` `(n, nq, p)` are the torque that parameters of size `prior`
+    `(p,)` add to r, `instruments` of the same shape replace least squares on columns that hold errors, and
+    `shift` is a delay of the torque in samples.
     """
 
     name: str

@@ -47,12 +47,8 @@ UNIT_TOLERANCE = 0.1
 
 @dataclass(frozen=True)
 class Match:
-    """Changes and integrals of one level, and the slopes between them.
-
-    Attributes:
-        change, integral: `(w, nq)` over windows, zero where an impact crosses one; `whole`, both as they are.
-        low, high, correlation: `(nq,)` bounds of the slope, and correlation.
-        moving: `(nq,)` bool, joints whose change stands out from noise.
+    """Changes and integrals of one level `(w, nq)` over windows, zero where an impact crosses one (`whole`:
+    as they are), bounds of the slopes between them `(nq,)`, and joints whose change stands out from noise.
     """
 
     change: Array

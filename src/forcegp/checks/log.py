@@ -85,11 +85,8 @@ SMOOTHING = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Columns of a log, named as in a `Dataset`, unchecked.
-
-    Attributes:
-        derived: the columns among `qd`, `qdd` that were computed here, not logged.
-        masked: `(n,)` bool, rows that a check excludes from those after it.
+    """Columns of a log, named as in a `Dataset`, unchecked; `qd` and `qdd` may be `derived` here, and a check
+    has rows `masked` `(n,)` for those after it.
     """
 
     t: Array

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from forcegp.errors import MappingError
 from forcegp.logs import units
-from forcegp.logs.draft import Draft, Family
+from forcegp.logs.mapping import Draft, Family
 from forcegp.logs.table import LogTable, Stream
 from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
