@@ -79,8 +79,13 @@ def match(log: Log, value: str, rate: str) -> Match | None:
         integrals.append(np.diff(total[::width], axis=0))
     if sum(map(len, changes)) < 20:
         return None
-    whole = np.concatenate(changes), np.concatenate(integrals)
-    change, integral = _without_jumps(*whole)
+    whole = change, integral = np.concatenate(changes), np.concatenate(integrals)
+    # Windows that an impact crosses, `JUMPS` of them at most, are left out.
+    scale = np.sqrt((change**2).sum(axis=0) / np.maximum((integral**2).sum(axis=0), 1e-300))
+    misfit = change - scale * integral
+    outlier = np.abs(misfit) > 8.0 * robust_std(misfit) + 1e-12
+    jumps = outlier & (np.abs(misfit) > np.quantile(np.abs(misfit), 1.0 - JUMPS, axis=0))
+    change, integral = (np.where(jumps, 0.0, x) for x in whole)
     cross = (change * integral).sum(axis=0)
     integral_square, change_square = (integral**2).sum(axis=0), (change**2).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -90,15 +95,6 @@ def match(log: Log, value: str, rate: str) -> Match | None:
     moving = speed > 1e-3 * speed.max()
     low, high, correlation = np.nan_to_num((low, high, correlation))
     return Match(change, integral, whole, low, high, correlation, moving)
-
-
-def _without_jumps(change: Array, integral: Array) -> tuple[Array, Array]:
-    """Zero in the windows of each joint that an impact crosses, `JUMPS` of them at most."""
-    scale = np.sqrt((change**2).sum(axis=0) / np.maximum((integral**2).sum(axis=0), 1e-300))
-    misfit = change - scale * integral
-    outlier = np.abs(misfit) > 8.0 * robust_std(misfit) + 1e-12
-    jumps = outlier & (np.abs(misfit) > np.quantile(np.abs(misfit), 1.0 - JUMPS, axis=0))
-    return np.where(jumps, 0.0, change), np.where(jumps, 0.0, integral)
 
 
 def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:

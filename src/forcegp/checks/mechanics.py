@@ -194,6 +194,8 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
     """Times at which far more torque is unexplained than usual, and the rows around them."""
+    from scipy.ndimage import minimum_filter1d
+
     log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
     trace = residual_trace(system, explanation, rows)
     scale = np.maximum(explanation.problem.scale, FLOOR * explanation.problem.size)
@@ -201,7 +203,10 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     width = max(1, round(DISTURBANCE_SECONDS / stride))
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
-    friction = _dry_friction(system.robot, explanation, rows, width)
+    # Dry friction of joints that rest or reverse within the window may be as large as this.
+    dry = system.robot.friction.numpy() - explanation.fit.nuisance[log.nq : 2 * log.nq]
+    slowest = minimum_filter1d(np.abs(log.qd[rows]), 2 * width + 1, axis=0)
+    friction = np.maximum(dry, 0.0) * (slowest < system.robot.friction_velocity.numpy())
     visible = np.asarray((np.abs(trace) > VISIBLE * explanation.problem.size + friction).any(axis=1))
     bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
@@ -244,16 +249,6 @@ def _upper_spread(level: Array) -> float:
     """Deviation of the level, from its upper side where narrower: of few squares the lower tail is long."""
     middle, upper = np.percentile(level, [50.0, ONE_SIGMA])
     return float(min(robust_std(level), upper - middle))
-
-
-def _dry_friction(robot: RobotModel, explanation: Explanation, rows: np.ndarray, width: int) -> Array:
-    """Largest dry friction torque `(n, nq)` of joints that rest or reverse within the window, else zero."""
-    from scipy.ndimage import minimum_filter1d
-
-    log = explanation.log
-    size = np.maximum(robot.friction.numpy() - explanation.fit.nuisance[log.nq : 2 * log.nq], 0.0)
-    slowest = minimum_filter1d(np.abs(log.qd[rows]), 2 * width + 1, axis=0)
-    return size * (slowest < robot.friction_velocity.numpy())
 
 
 def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:

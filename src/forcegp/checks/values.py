@@ -45,9 +45,7 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
     """Steps that are so uneven that filters for even sampling do not apply."""
     with np.errstate(invalid="ignore"):
         regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
-    if len(regular) < 2:
-        return [], log
-    spread = float(robust_std(regular) / log.dt)
+    spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
     if spread <= UNIFORM_TOLERANCE:
         return [], log
     text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"

@@ -20,8 +20,8 @@ from forcegp.logs.clock import even_clock, usual_step
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
-from forcegp.logs.signals import Array, ImportFinding, ImportReport, Signals
 from forcegp.logs.smoothing import add_derivatives, impact_mask
+from forcegp.logs.table import Array, ImportFinding, ImportReport, Signals
 from forcegp.resources import announce_memory
 from forcegp.robot import RobotModel
 from forcegp.scene import Scene, load_scene

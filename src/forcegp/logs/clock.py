@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from forcegp import limits
 from forcegp.errors import DataError
 from forcegp.guards import check_count
-from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.rows import describe, numbered
 
 RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10

@@ -25,7 +25,7 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
 from forcegp.logs.mapping import GROUND, ContactStateSection, Mapping
-from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.robot import RobotModel
 from forcegp.robust import level_of, robust_std
 from forcegp.rows import runs
@@ -160,15 +160,12 @@ class Evidence:
     def sentence(self) -> str:
         """The evidence in one sentence."""
         unit, scale = ("mm", 1e3) if self.source == "distance" else ("N", 1.0)
-        states = (
+        levels = (
             (self.closed_level, self.closed_spread, "closed"),
             (self.open_level, self.open_spread, "open"),
         )
-        listing = "".join(
-            f", {scale * level:.3g} ± {scale * spread:.2g} {unit} {state}"
-            for level, spread, state in states
-            if np.isfinite(level)
-        )
+        known = ((scale * level, scale * spread, state) for level, spread, state in levels if level == level)
+        listing = "".join(f", {level:.3g} ± {spread:.2g} {unit} {state}" for level, spread, state in known)
         return (
             f"contact {self.contact!r} by {self.source}: {len(self.intervals)} closed intervals{listing}, "
             f"threshold {scale * self.threshold:.3g} {unit}"

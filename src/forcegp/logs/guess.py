@@ -27,9 +27,8 @@ from forcegp.logs.gather import gather
 from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
 from forcegp.logs.mapping import ContactStateSection, Draft, parse_mapping, quoted
 from forcegp.logs.readers import read
-from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.logs.smoothing import add_derivatives
-from forcegp.logs.table import LogTable, Progress
+from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals
 from forcegp.rows import runs
 
 ROWS, TRIED_ROWS = 100_000, 3000

@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 from forcegp.data.derivative import SavitzkyGolay, differentiate
 from forcegp.errors import DataError
 from forcegp.logs.mapping import DerivativesSection
-from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.rows import runs
 
 STATES, SHORTEST = 4, 8
