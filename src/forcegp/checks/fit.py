@@ -226,11 +226,10 @@ def gain_of(better: Array, worse: Array) -> tuple[float, float]:
 
 
 def pooled_gain_of(better: Array, worse: Array) -> tuple[float, float]:
-    """Drop of Σ_j log of the error over all blocks, and its standard error by the jackknife.
+    """Drop of Σ_j log of errors `(blocks, nq)` over all blocks, and its standard error by the jackknife.
 
-    Errors are shares of the torque `(blocks, nq)`. Where blocks differ in what they show, as touching and
-    free ones do, the mean drop over blocks scatters with that; the ratio of errors over all blocks does not
-    (Cochran, *Sampling Techniques*, 1977, ch. 6).
+    Unlike the mean over blocks it does not scatter with what they show (Cochran, *Sampling Techniques*, ch.
+    6).
     """
 
     def drop(rows: Array) -> float:

@@ -139,11 +139,9 @@ BINS = 512
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a contact's state was read from: `wrench`, `multiplier` or `distance`, in N or m.
-
-    Closed from `threshold` on, and then up to `release` on either side; median and deviation of the evidence
-    in each state, NaN where it does not occur; first and last time of each closed interval [s]; and how many
-    intervals were too short and got their neighbours' state.
+    """What a contact's state was read from [N, m]: closed from `threshold` on, and then up to `release` on
+    either side; median and deviation in each state, NaN where it does not occur; first and last time of each
+    closed interval [s]; and how many intervals were too short and got their neighbours' state.
     """
 
     contact: str
@@ -160,12 +158,10 @@ class Evidence:
     def sentence(self) -> str:
         """The evidence in one sentence."""
         unit, scale = ("mm", 1e3) if self.source == "distance" else ("N", 1.0)
-        levels = (
-            (self.closed_level, self.closed_spread, "closed"),
-            (self.open_level, self.open_spread, "open"),
-        )
-        known = ((scale * level, scale * spread, state) for level, spread, state in levels if level == level)
-        listing = "".join(f", {level:.3g} ± {spread:.2g} {unit} {state}" for level, spread, state in known)
+        listing = ""
+        for state in ("closed", "open"):
+            level, spread = (scale * getattr(self, f"{state}_{name}") for name in ("level", "spread"))
+            listing += f", {level:.3g} ± {spread:.2g} {unit} {state}" if np.isfinite(level) else ""
         return (
             f"contact {self.contact!r} by {self.source}: {len(self.intervals)} closed intervals{listing}, "
             f"threshold {scale * self.threshold:.3g} {unit}"

@@ -35,10 +35,8 @@ CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
 
 @dataclass
 class Family:
-    """Columns of one quantity, one for each joint; `declared`, if the log says their unit.
-
-    `columns` has what stands for `{joint}` in the common pattern → column; `by_joint` joint of the robot →
-    column, where that does not name the joints as the positions do.
+    """Columns of one quantity by what stands for `{joint}` in the common pattern, or `by_joint` of the robot
+    where that does not name the joints as the positions do; `declared`, if the log says their unit.
     """
 
     pattern: str
@@ -287,10 +285,7 @@ class Mapping:
 
 
 def load_mapping(source: str | Path) -> Mapping:
-    """Read a mapping file.
-
-    Args:
-        source: a path, or the name of a mapping that comes with the library.
+    """Read a mapping file by its path, or the name of one that comes with the library.
 
     Raises:
         MappingError: no such mapping, or it is not valid; the message names file, line and key.

@@ -43,10 +43,8 @@ W = np.outer(TAYLOR, TAYLOR) / (7.0 - np.add.outer(np.arange(STATES), np.arange(
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Estimates of one joint, `(n,)` each, the standard deviation of q̈ and σ of the measured position.
-
-    `also` is another column through the same filter, as if it were a position.
-    """
+    """Estimates of one joint `(n,)`, another column through the same filter, and σ of the measured
+    position."""
 
     position: Array
     velocity: Array

@@ -63,10 +63,8 @@ LEAST_RADIUS_STD = 4.0
 
 @dataclass(frozen=True)
 class Tip:
-    """A ball of radius r [m], to be fitted if `None`, that ends at the path's points or has its centre there.
-
-    `axes` are unit vectors `(n, 3)` from its centre to the path's points; zero where these are centres.
-    """
+    """A ball of radius r [m], to be fitted if `None`, with unit vectors `(n, 3)` to the path's points, or
+    zero."""
 
     axes: Array
     radius: float | None

@@ -35,10 +35,7 @@ Wanted = Callable[[str], bool]
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Columns `(n,)` with a common clock: a table, a topic of a bag, arrays of one length.
-
-    A missing value is NaN. The name is empty for the only table of a file; units are those it declares.
-    """
+    """Columns `(n,)` with a common clock, NaN where a value is missing, and units that the log declares."""
 
     name: str
     columns: Mapping[str, Column]
@@ -138,10 +135,9 @@ def table_of_arrays(
 
 @dataclass
 class Signals:
-    """Quantities of a log; each step of the import takes them and leaves them valid.
-
-    Time [s], number in the log and trajectory of each row, `(n,)`; `q`, `qd`, `qdd`, `tau` as far as they are
-    logged, `(n, nq)` each, and `wrench` `(n, 6)`; name of each contact → `(n,)` bool.
+    """Quantities of a log: time [s], number in the log and trajectory of each row, `(n,)`; `q`, `qd`, `qdd`,
+    `tau` as far as they are logged, `(n, nq)` each, and `wrench` `(n, 6)`; name of each contact → `(n,)`
+    bool.
     """
 
     joint_names: tuple[str, ...]
@@ -177,10 +173,7 @@ MOST_INTERVALS = 20
 
 @dataclass(frozen=True)
 class ImportFinding:
-    """Something that was found in a log: its kind in a word, and a sentence with what was done about it.
-
-    `count` rows are concerned; `rows` has the first intervals, first and last, as numbered in the log.
-    """
+    """A kind in a word and a sentence with what was done; `rows` has the first of the intervals concerned."""
 
     kind: str
     message: str
@@ -190,10 +183,7 @@ class ImportFinding:
 
 @dataclass
 class ImportReport:
-    """What was found and done, in order; `steps` are lines of provenance.
-
-    `rows_read` counts the rows of the stream that sets the clock.
-    """
+    """What was found and done, in order; `rows_read` are those of the stream that sets the clock."""
 
     source: str
     format: str = ""

@@ -41,10 +41,8 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a text table is written, after `first_line` lines without numbers.
-
-    Each column is a `number`, `bool`, `date`, `text` or `empty`; a line below the heading may declare units.
-    """
+    """How a text table is written from `first_line` on: columns are `number`, `bool`, `date`, `text` or
+    `empty`."""
 
     encoding: str
     separator: str
