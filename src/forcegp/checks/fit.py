@@ -50,8 +50,11 @@ def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
 
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
     """Rows of J of all contacts, those of the surface normal alone where all of J would leave no torque."""
-    whole, parts = takes_friction_out(system, log), [np.zeros((len(rows), 0, log.nq))]
-    for c in labelled_contacts(system, log) if len(rows) else ():
+    contacts, whole = labelled_contacts(system, log), takes_friction_out(system, log)
+    if not contacts or not len(rows):
+        return np.zeros((len(rows), 0, log.nq))
+    parts = []
+    for c in contacts:
         if whole and isinstance(c, SurfaceContact):
             J = kinematics.point_jacobian(system.robot, q, c.frame, c.point).numpy()
         else:
