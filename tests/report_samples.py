@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from forcegp.report.rollout_data import Band, Film, ModelPath, RolloutData
+from forcegp.report.rollouts import Band, Film, ModelPath, RolloutData
 from forcegp.report.window import WindowData
 from reproduction.covariance import CovarianceData
 from reproduction.identification import IdentificationData, IdentificationRun

@@ -21,7 +21,6 @@ LAYERS = (
         "limits",
         "errors",
         "types",
-        "temporary",
         "guards",
         "files",
         "destination",

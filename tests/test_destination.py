@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import stat
 import tempfile
 from pathlib import Path
@@ -18,7 +17,7 @@ from forcegp.files import write_text, written_folder
 
 
 def test_a_place_that_can_be_written_is_left_as_it_was(tmp_path: Path) -> None:
-    check_destination(tmp_path / "a" / "b" / "model", folder=True, needed_bytes=1000)
+    check_destination(tmp_path / "a" / "b" / "model", folder=True)
     check_destination(tmp_path / "run.parquet")
     assert os.listdir(tmp_path) == []
 
@@ -75,9 +74,6 @@ def test_a_name_that_is_too_long_is_refused_and_the_longest_written(folder: bool
 
 
 def test_a_full_disk_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(DestinationError, match=r"not enough room(.|\n)*free"):
-        check_destination(tmp_path / "model", needed_bytes=shutil.disk_usage(tmp_path).total)
-
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

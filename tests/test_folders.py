@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from forcegp.errors import DestinationError
-from forcegp.files import atomic_file, check_kind, write_text, written_folder
-from forcegp.temporary import NEW
+from forcegp.files import NEW, atomic_file, check_kind, write_text, written_folder
 
 
 def folder(path: Path, content: str) -> Path:

@@ -17,18 +17,10 @@ PROBE_BYTES = 1 << 16
 """Written and removed again to see whether there is room, and whether a quota allows it."""
 
 
-def check_destination(
-    path: str | Path, *, folder: bool = False, own_files: Iterable[str] = (), needed_bytes: int = 0
-) -> None:
-    """Check that a file or folder can be written, without leaving anything behind.
+def check_destination(path: str | Path, *, folder: bool = False, own_files: Iterable[str] = ()) -> None:
+    """Check, before long work, that a file or folder can be written, without leaving anything behind.
 
-    Call it before long work; `write_or_keep` is its counterpart afterwards.
-
-    Args:
-        path: what will be written.
-        folder: whether that is a folder, which may replace an empty one or one of nothing but `own_files`.
-        own_files: patterns of the names in such a folder; with none, any folder may be replaced.
-        needed_bytes: room that the result takes on the disk [bytes].
+    A folder may replace an empty one or one of nothing but `own_files` (patterns; with none, any folder).
 
     Raises:
         DestinationError: a file is to replace a folder or the reverse, the folder holds other files, or the
@@ -39,16 +31,15 @@ def check_destination(
         check_kind(target, folder=folder)
         if folder and target.is_dir():
             _check_replaceable(target, tuple(own_files))
-        _probe(next(parent for parent in target.absolute().parents if parent.exists()), needed_bytes)
+        parent = next(parent for parent in target.absolute().parents if parent.exists())
+        with tempfile.NamedTemporaryFile(prefix=".forcegp-probe-", dir=parent) as file:
+            file.write(b"\0" * PROBE_BYTES)
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
-    """Write a result by `write(path)`; if that fails, write it to another place, which the error names.
-
-    Raises:
-        DestinationError: the place cannot be written; the message says where the result is instead.
-        ForceGPError: the result cannot be written anywhere, for a reason of its own.
-    """
+    """Write a result by `write(path)`, or else to another place, which the `DestinationError` names."""
     target = Path(path)
     try:
         write(target)
@@ -89,19 +80,4 @@ def _check_replaceable(folder: Path, own_files: tuple[str, ...]) -> None:
             expected="a folder that is new, empty, or holds nothing but " + ", ".join(own_files),
             got=", ".join(foreign[:5]),
             hint="name another folder, or move these files",
-        )
-
-
-def _probe(parent: Path, needed_bytes: int) -> None:
-    with tempfile.NamedTemporaryFile(prefix=".forcegp-probe-", dir=parent) as file:
-        file.write(b"\0" * PROBE_BYTES)
-        file.flush()
-        os.fsync(file.fileno())
-    free = shutil.disk_usage(parent).free
-    if free < needed_bytes:
-        raise DestinationError(
-            f"{parent}: not enough room on the disk",
-            expected=f"{needed_bytes:,} bytes",
-            got=f"{free:,} bytes free",
-            hint="make room, or name a place on another disk",
         )

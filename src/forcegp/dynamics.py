@@ -162,8 +162,8 @@ def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None =
     """Joint friction of the robot: viscous, Coulomb (smoothed at zero speed) and the Stribeck effect.
 
     Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]; `slip` `(*batch, nq)` is a
-    direction of sliding in place of tanh(q̇/v_0). See Armstrong-Hélouvry, Dupont, Canudas de Wit, *A survey of
-    models, analysis tools and compensation methods for the control of machines with friction* (1994).
+    direction of sliding in place of tanh(q̇/v_0). See Armstrong-Hélouvry, Dupont, Canudas de Wit, *A survey
+    of models, analysis tools and compensation methods for the control of machines with friction* (1994).
 
     Raises:
         ShapeError: qd does not fit the robot.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
@@ -109,9 +109,11 @@ class UnknownNameError(ForceGPError, LookupError):
 
     def __init__(self, kind: str, name: object, valid: Iterable[str]) -> None:
         names = list(valid)
+        more = f" and {len(names) - NAMES_COMPARED} more" if len(names) > NAMES_COMPARED else ""
+        listed = ", ".join(names[:NAMES_COMPARED])
         super().__init__(
             f"unknown {kind} {_shortened(repr(name), NAME_COMPARED)}",
-            expected="one of " + _listed(names) if names else "none are defined",
+            expected=f"one of {listed}{more}" if names else "none are defined",
             hint=did_you_mean(name, names),
         )
 
@@ -128,11 +130,6 @@ class ParameterError(ForceGPError, ValueError):
 
 def _shortened(text: str, length: int) -> str:
     return text if len(text) <= length else text[:length] + "…"
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - NAMES_COMPARED
-    return ", ".join(names[:NAMES_COMPARED]) + (f" and {more} more" if more > 0 else "")
 
 
 class ShapeError(ForceGPError, ValueError):

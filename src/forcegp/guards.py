@@ -54,13 +54,7 @@ def allowed_bytes(file: int, free: int | None = None) -> int:
 
 @dataclass
 class Unpacking:
-    """What a log with compressed parts has unpacked to so far, bounded in proportion to its file.
-
-    Attributes:
-        source: the log, for messages.
-        file: its size [bytes].
-        size, records: bytes and records unpacked so far, those that are read twice twice.
-    """
+    """Bytes and records that a log of `file` bytes has unpacked to so far, in bounds by its size."""
 
     source: str
     file: int
@@ -154,14 +148,8 @@ DEFLATE_RATIO = 1032
 
 
 def check_chunks(dataset: Any, file: int) -> None:
-    """Check that no chunk of an HDF5 data set unpacks to more than it should, which HDF5 itself does not.
-
-    Args:
-        dataset: of h5py.
-        file: size of the file [bytes].
-
-    Raises:
-        DataError: a chunk is larger than what is read at once, or compressed in another way than is read.
+    """Check that no chunk of an h5py data set unpacks to more than it should, as HDF5 itself does not; a
+    chunk of another compression is a `DataError` too.
     """
     source, properties = f"{dataset.file.filename}: {dataset.name!r}", dataset.id.get_create_plist()
     filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
@@ -185,11 +173,7 @@ def check_chunks(dataset: Any, file: int) -> None:
 
 
 def within(folder: Path, files: Iterable[Path]) -> list[Path]:
-    """Files of a folder that is read as one log, none of which a link leads out of it.
-
-    Raises:
-        DataError: a file lies elsewhere; names it.
-    """
+    """Files of a folder that is read as one log; `DataError` names one that a link leads out of it."""
     files, root = list(files), folder.resolve()
     for file in files:
         if not file.resolve().is_relative_to(root):

@@ -27,6 +27,8 @@ from forcegp.types import JointVector
 Regressor = Float[Tensor, "*batch nq p"]
 RANK = 1e-9
 """Share of the largest pivot of the scaled regressor below which a direction does not act on the motion."""
+STATES = 100
+"""Random states at which the rank is found."""
 MASS_SHARE, MOMENT_ARM = 0.3, 0.1
 """How far the mass m of a link may be off a robot file, as a share, and its centre of mass [m]: the standard
 deviations of its parameters are 30 % of m, m · 0.1 m and m · (0.1 m)²."""
@@ -105,7 +107,7 @@ class BaseParameters:
         return self.combination @ parameter_vector(robot).detach().cpu().numpy()
 
 
-def base_parameters(robot: RobotModel, samples: int = 100, seed: int = 0) -> BaseParameters:
+def base_parameters(robot: RobotModel) -> BaseParameters:
     """Base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
 
     Runs in double precision on the CPU, wherever the robot is. Only its kinematics and gravity enter.
@@ -120,8 +122,8 @@ def base_parameters(robot: RobotModel, samples: int = 100, seed: int = 0) -> Bas
     # Kinematics in single precision break symmetries by its rounding, and so seem to have a higher rank.
     tolerance = max(RANK, 100.0 * torch.finfo(robot.dtype).eps)
     robot = robot.to("cpu", torch.float64)
-    random = np.random.default_rng(seed)
-    states = (torch.as_tensor(random.uniform(-r, r, (samples, robot.nq))) for r in (np.pi, 2.0, 4.0))
+    random = np.random.default_rng(0)
+    states = (torch.as_tensor(random.uniform(-r, r, (STATES, robot.nq))) for r in (np.pi, 2.0, 4.0))
     Y = regressor(robot, *states).detach().flatten(0, 1).numpy()
     scale = np.linalg.norm(Y, axis=0)
     acting = np.flatnonzero(scale > tolerance * scale.max())

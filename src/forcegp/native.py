@@ -20,8 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forcegp.errors import MissingDependencyError
-from forcegp.files import atomic_file
-from forcegp.temporary import Temporary, discard, sweep
+from forcegp.files import Temporary, atomic_file, discard, sweep
 
 FLAGS = ["-std=c++17", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-w", "-shared", "-fPIC"]
 LIBRARY = "kernel.so"
@@ -30,11 +29,7 @@ PROC = Path("/proc/self/fd")
 
 
 def find_compiler() -> str:
-    """Path of the C++ compiler: `$CXX`, or the first of c++, g++ and clang++ on the PATH.
-
-    Raises:
-        MissingDependencyError: there is none.
-    """
+    """Path of the C++ compiler: `$CXX` or one on the PATH; `MissingDependencyError` if there is none."""
     wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
     for name in wanted:
         if path := shutil.which(name):
@@ -57,11 +52,7 @@ def _machine() -> str:
 
 
 def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
-    """The shared library of a C++ source text, with functions `extern "C"`, compiled unless the cache has it.
-
-    Raises:
-        MissingDependencyError: there is no compiler, it failed, or the cache cannot be written or trusted.
-    """
+    """The library of a C++ text, compiled unless it is cached; `MissingDependencyError` if it cannot be."""
     compiler = find_compiler()
     try:
         version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
@@ -139,11 +130,7 @@ def cache_directory() -> Path:
 
 
 def private_folder(folder: Path) -> Path:
-    """The folder, made for its owner alone where it does not exist (OSError if it cannot be made).
-
-    Raises:
-        MissingDependencyError: others own it or can write to it or replace it; names the folder at fault.
-    """
+    """The folder, private to its owner; `MissingDependencyError` names one that others can replace."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)

@@ -166,13 +166,9 @@ class Panel:
 def draw_panels(
     panels: Sequence[Panel], time: Timeline, closed: Sequence[Tensor] = (), ax: Target = None
 ) -> list[Axes]:
-    """Draw panels one above the other, and return their axes.
+    """Draw panels from top to bottom on `ax`, by default a new figure, and return their axes.
 
-    Args:
-        panels: from top to bottom.
-        time: of the samples.
-        closed: flags `(n,)` of contacts; the time in which any of them is closed is shaded.
-        ax: axes to draw on, one per panel; default a new figure.
+    The time in which any contact is `closed` `(n,)` is shaded.
 
     Raises:
         ParameterError: another number of axes is given.

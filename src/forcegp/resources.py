@@ -6,7 +6,7 @@ Operations on small tensors run on one thread, and SciPy uses as many threads as
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -34,25 +34,11 @@ def free_memory() -> int | None:
     return min(limits) if limits else None
 
 
-def announce_memory(
-    needed: int,
-    what: str,
-    say: Callable[[str], None] | None = None,
-    *,
-    certain: int | None = None,
-) -> None:
-    """Announce work that needs more than half of the free memory, and refuse what needs more than all of it.
+def announce_memory(needed: int, what: str, *, certain: int | None = None) -> None:
+    """Announce work that needs more than half of the free memory; `MemoryLimitError` if more than all of it.
 
-    Call it before the allocation, with an upper bound.
-
-    Args:
-        needed: [bytes].
-        what: the work, as the subject of a sentence: "the covariance of 20,000 points".
-        say: what to do with the sentence, by default a `MemoryNeedWarning`.
-        certain: what it needs in any case [bytes], where `needed` is a rough bound; by default `needed`.
-
-    Raises:
-        MemoryLimitError: it certainly needs more than is free.
+    Call it before the allocation, with an upper bound [bytes], and where that is rough what is `certain` to
+    be needed; `what` is the subject of a sentence: "the covariance of 20,000 points".
     """
     free = free_memory()
     if free is None or needed <= LARGE * free:
@@ -67,10 +53,7 @@ def announce_memory(
         )
     bound = "" if certain is None else "up to "
     sentence = f"{what} needs {bound}{_gib(needed)} of {_gib(free)} of free memory"
-    if say is not None:
-        say(sentence)
-    else:
-        warnings.warn(sentence, MemoryNeedWarning, stacklevel=2)
+    warnings.warn(sentence, MemoryNeedWarning, stacklevel=2)
 
 
 def _gib(value: int) -> str:

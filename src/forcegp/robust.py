@@ -11,10 +11,9 @@ MAD_TO_STD = 1.4826
 """Standard deviation over median absolute deviation of a normal distribution."""
 
 
-def robust_std(x: NDArray[Any], axis: int = 0) -> NDArray[Any]:
+def robust_std(x: NDArray[Any]) -> NDArray[Any]:
     """Standard deviation of a normal distribution with the same median absolute deviation."""
-    centre = np.median(x, axis=axis, keepdims=True)
-    return np.asarray(MAD_TO_STD * np.median(np.abs(x - centre), axis=axis))
+    return np.asarray(MAD_TO_STD * np.median(np.abs(x - np.median(x, axis=0)), axis=0))
 
 
 def level_of(x: NDArray[Any], width: float, share: float) -> float | None:

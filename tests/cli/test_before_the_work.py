@@ -75,7 +75,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_anything_is_read(
     monkeypatch.setattr("forcegp.scene.load.Document", read)
     monkeypatch.setattr(Dataset, "read", read)
     monkeypatch.setattr("forcegp.checks.read_log", read)
-    monkeypatch.setattr("forcegp.models.load.load_model", read)
+    monkeypatch.setattr("forcegp.load_model", read)
     monkeypatch.setattr("forcegp.logs.import_log", read)
     monkeypatch.setattr("forcegp.logs.guess.guess_mapping", read)
     (tmp_path / "file").write_text("in the way")

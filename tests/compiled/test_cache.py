@@ -13,7 +13,7 @@ import torch
 from forcegp import dynamics, native
 from forcegp.compiled import compile_dynamics
 from forcegp.errors import MissingDependencyError
-from forcegp.temporary import NEW
+from forcegp.files import NEW
 from random_robots import random_robot
 from robots import random_states
 

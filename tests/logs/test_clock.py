@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from forcegp.errors import DataError
 from forcegp.logs.clock import drop_repeated, even_clock, find_held, join_stream, split_trajectories
 from forcegp.logs.mapping import DerivativesSection
-from forcegp.logs.signals import ImportReport, Signals
 from forcegp.logs.smoothing import add_derivatives, impact_mask
+from forcegp.logs.table import ImportReport, Signals
 
 
 def signals(t: NDArray[np.float64], **vectors: NDArray[np.float64]) -> Signals:

@@ -13,8 +13,8 @@ import forcegp
 from forcegp.errors import DataError, MappingError
 from forcegp.logs import contact, import_log, parse_mapping
 from forcegp.logs.mapping import ContactStateSection
-from forcegp.logs.signals import ImportReport, Signals
 from forcegp.logs.surface_fit import fit_surface
+from forcegp.logs.table import ImportReport, Signals
 from forcegp.simulate import simulate
 
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)

@@ -11,8 +11,8 @@ import torch
 import forcegp
 from forcegp.errors import MappingError
 from forcegp.logs import Mapping, guess, parse_mapping, read_log
-from forcegp.logs.draft import Draft
 from forcegp.logs.headings import declared_unit
+from forcegp.logs.mapping import Draft
 from log_files import REAL, WRITERS, motion, real_logs
 from robots import ARMS
 

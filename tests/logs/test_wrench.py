@@ -13,7 +13,7 @@ from forcegp.errors import MappingError
 from forcegp.logs import parse_mapping, read_log
 from forcegp.logs.contact import per_contact
 from forcegp.logs.mapping import WrenchSection
-from forcegp.logs.signals import Signals
+from forcegp.logs.table import Signals
 
 FRAME = "lbr_iiwa_link_7"
 EXAMPLES = Path(__file__).parents[2] / "examples/data"

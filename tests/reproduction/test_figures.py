@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 import matplotlib
 import pytest
 
+from forcegp.report.page import COLOURS, INK, KINDS, LABELS, OTHER, Picture, colour, label
 from forcegp.report.rollouts import rollout_pictures
-from forcegp.report.style import COLOURS, INK, KINDS, LABELS, OTHER, Picture, colour, label
 from forcegp.report.window import draw_errors, draw_predictions
 from report_samples import MODELS, figures, identification, multiplier, results, rollouts, window
 from reproduction.covariance import covariance_block

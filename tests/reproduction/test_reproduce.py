@@ -13,7 +13,7 @@ from forcegp.errors import DataError
 from forcegp.models.load import load_model
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.report.animation import animation_source
-from forcegp.report.rollout_data import RolloutData
+from forcegp.report.rollouts import RolloutData
 from forcegp.report.window import WindowData
 from reproduction.covariance import CovarianceData
 from reproduction.multiplier import MultiplierData

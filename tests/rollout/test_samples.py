@@ -20,8 +20,7 @@ from forcegp.models.registry import create
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.report.animation import animation_source
-from forcegp.report.rollout_data import RolloutData, rollout_data
-from forcegp.report.rollouts import PAGE, write_rollouts
+from forcegp.report.rollouts import PAGE, RolloutData, rollout_data, write_rollouts
 from forcegp.rollout import (
     Comparison,
     ForceLaw,

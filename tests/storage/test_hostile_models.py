@@ -15,9 +15,10 @@ import safetensors.torch
 import torch
 
 import forcegp
+from forcegp.destination import check_destination
 from forcegp.errors import DestinationError, ForceGPError, ModelError
 from forcegp.storage import model_file as module
-from forcegp.storage.model_file import HEADER, check_model_destination, model_path
+from forcegp.storage.model_file import HEADER, model_path
 from model_files import header_of, rewritten
 from random_data import random_data, table_system
 from slow import slow_except
@@ -216,11 +217,11 @@ def test_a_folder_of_an_earlier_release_says_what_to_do(tmp_path: Path) -> None:
 def test_the_destination_of_a_model_is_checked_before_the_work(
     saved: dict[str, Path], tmp_path: Path
 ) -> None:
-    check_model_destination(tmp_path / "new")
-    check_model_destination(saved["gp"])
+    check_destination(model_path(tmp_path / "new"))
+    check_destination(model_path(saved["gp"]))
     (tmp_path / "thesis").write_text("years of work")
     with pytest.raises(DestinationError, match="cannot be written"):
-        check_model_destination(tmp_path / "thesis" / "model")
+        check_destination(model_path(tmp_path / "thesis" / "model"))
     (tmp_path / "folder.safetensors").mkdir()
     with pytest.raises(DestinationError, match="is a folder"):
-        check_model_destination(tmp_path / "folder")
+        check_destination(model_path(tmp_path / "folder"))

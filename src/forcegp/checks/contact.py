@@ -154,10 +154,7 @@ def _placement(
 
 
 def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
-    """Offset in the middle of the path [m], slope along the surface `(3,)`, distance they make `(n,)`.
-
-    Rows that stay off the fit, such as those labelled too early, are trimmed round by round.
-    """
+    """Offset in mid-path [m], slope `(3,)` and distance by both `(n,)`; rows that stay off it are trimmed."""
     offset = float(np.median(path.c[closed]))
     if not isinstance(contact.surface, Plane):
         return offset, np.zeros(3), np.full(len(path.c), offset)
@@ -203,10 +200,7 @@ def _labels(
 def _runs_off(
     approach: Array, closed: np.ndarray, c: Array, touch: float, slow: float, log: Log
 ) -> dict[str, list[tuple[int, int]]]:
-    """Runs of rows labelled closed off the surface, by kind of finding.
-
-    A run reaches to the row at which the tip moves along the normal as slowly as in the rest of the contact.
-    """
+    """Runs of rows labelled closed off the surface, by kind of finding, up to where the tip settles."""
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     off = closed & (np.abs(c) > touch)
@@ -236,10 +230,7 @@ def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
 def _missed(
     contact: SurfaceContact, path: Path, open_: np.ndarray, c: Array, touch: float, log: Log
 ) -> list[Finding]:
-    """Rows labelled open in which the tip slides along the surface.
-
-    A tip that takes off gently is near for a while, but soon moves along the normal faster than in contact.
-    """
+    """Rows labelled open in which the tip slides on the surface, longer than when it takes off gently."""
     if not np.isfinite(log.dt):
         return []
     near, speed = open_ & (np.abs(c) <= touch), np.linalg.norm(path.along, axis=1)
@@ -283,10 +274,7 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) -> Array:
-    """Force `(n, 3)` at the touching point that explains the torque best, r = Jᵀ F.
-
-    With three torques or fewer, which any force would explain, it is the best one along the normal, r = Aᵀ λ.
-    """
+    """Force `(n, 3)` that explains the torque best, r = Jᵀ F; along the normal for up to three torques."""
     r, J = residual(system, log, rows)
     if log.nq <= 3:
         A = J[:, 0]

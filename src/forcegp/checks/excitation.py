@@ -51,25 +51,18 @@ def still_joints(log: Log) -> np.ndarray:
 
 def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     """Joints that do not move, or hardly ever change direction."""
-    still, findings = still_joints(log), []
-    if still.any():
-        joints = log.named(still)
-        unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
-        text = f"range of {', '.join(joints)} below {STILL} {unit}: friction and inertia are not seen"
-        findings.append(log.finding("joint-still", text, joints))
+    still = still_joints(log)
+    unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
+    text = f"range of {{}} below {STILL} {unit}: friction and inertia are not seen"
+    findings = log.on_joints("joint-still", still, text)
     if not log.header.ordered:
         return findings, log
     turns = np.zeros(log.nq, int)
     fast = HYSTERESIS * np.percentile(np.abs(log.qd[log.usable]), 99, axis=0)
     for j, x in ((j, log.qd[s, j]) for s in log.stretches for j in range(log.nq)):
         turns[j] += np.count_nonzero(np.diff(np.sign(x[np.abs(x) > fast[j]])))
-    few = (turns < REVERSALS) & ~still
-    if few.any():
-        joints = log.named(few)
-        few_turns = f"fewer than {REVERSALS} changes of direction"
-        text = f"{', '.join(joints)}: {few_turns}: friction looks like an offset"
-        findings.append(log.finding("few-reversals", text, joints))
-    return findings, log
+    text = f"{{}}: fewer than {REVERSALS} changes of direction: friction looks like an offset"
+    return findings + log.on_joints("few-reversals", (turns < REVERSALS) & ~still, text), log
 
 
 def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -85,18 +78,21 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
     listed = ", ".join(names[k] for k in np.flatnonzero(weak)[:6])
     more = f" and {weak.sum() - 6} more" if weak.sum() > 6 else ""
     count = f"{weak.sum()} of {len(weak)} base parameters are not identified"
-    text = f"{count}: {listed}{more}; missing: {_missing(log, joints)}"
+    # The motion that would show the parameters of these links.
+    reach, push = np.ptp(log.q[log.usable], axis=0), np.sqrt((log.qdd[log.usable] ** 2).mean(axis=0))
+    narrow = [log.joint_names[j] for j in joints if reach[j] < 0.5]
+    slow = [log.joint_names[j] for j in joints if push[j] < 1.0]
+    parts = [f"larger range of {', '.join(narrow[:3])}"] if narrow else []
+    parts += [f"faster changes of speed of {', '.join(slow[:3])}"] if slow else []
+    missing = "; ".join(parts) or "other poses of the whole arm, fast and slow"
+    text = f"{count}: {listed}{more}; missing: {missing}"
     concerned = tuple(log.joint_names[j] for j in joints)
     numbers = {"identified": int((~weak).sum()), "base_parameters": len(weak)}
     return [log.finding("poor-excitation", text, concerned, **numbers)], log
 
 
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
-    """Standard deviation of each base parameter after the log over that before it.
-
-    Before: the robot file, with masses known to 30 % and centres of mass to 0.1 m. After: that and the
-    torques of the rows, with noise of a hundredth of each joint's torque.
-    """
+    """Deviation of each base parameter after the log, with torque noise of 1 %, over that before it."""
     robot = system.robot
     base = base_parameters(robot)
     columns = np.array(base.columns)
@@ -110,17 +106,6 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     gram = A.T @ A * (looks / len(rows))
     after = np.linalg.inv(gram + np.eye(len(columns)))
     return np.sqrt(np.diag(after)), base.names, columns
-
-
-def _missing(log: Log, joints: list[int]) -> str:
-    """The motion that would show the parameters of some links, in words."""
-    q, qdd = log.q[log.usable], log.qdd[log.usable]
-    reach, push = np.ptp(q, axis=0), np.sqrt((qdd**2).mean(axis=0))
-    slow = [log.joint_names[j] for j in joints if push[j] < 1.0]
-    narrow = [log.joint_names[j] for j in joints if reach[j] < 0.5]
-    parts = [f"larger range of {', '.join(narrow[:3])}"] if narrow else []
-    parts += [f"faster changes of speed of {', '.join(slow[:3])}"] if slow else []
-    return "; ".join(parts) or "other poses of the whole arm, fast and slow"
 
 
 LEAST_TOUCHING = 20
@@ -216,7 +201,9 @@ def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[F
         assert column is not None
         yield Fault("encoder-offset", joint, column[..., 0], 1)
     if log.header.ordered:  # rows in order of selection have no neighbours in time
-        yield Fault("torque-delay", "", _rate(system, log, rows), log.nq)
+        # The torque that the motion needs; the measured one has more noise.
+        ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
+        yield Fault("torque-delay", "", (ahead - behind) / (2.0 * SPAN * log.dt), log.nq)
     # Per degree of a tilt, about the horizontal axis that shows it better.
     gravity, columns = system.robot.gravity.numpy(), robot_columns(system, log, rows, "gravity")[0]
     axes = np.linalg.svd(gravity[None])[2][1:] * np.linalg.norm(gravity) * np.pi / 180.0
@@ -225,9 +212,3 @@ def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[F
     # The inertial parameters of every other link are taken as wrong by the same share.
     wrong = -np.repeat((-1.0) ** np.arange(log.nq), 10) * parameter_vector(system.robot).numpy()
     yield Fault("masses-mismatch", "", robot_columns(system, log, rows, "masses")[0] @ wrong, log.nq)
-
-
-def _rate(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """`(n, nq)` rate of change of the torque that the motion needs; the measured one has more noise."""
-    ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
-    return (ahead - behind) / (2.0 * SPAN * log.dt)

@@ -40,14 +40,11 @@ Tried = tuple[Hypothesis, TorqueFit]
 
 @dataclass(frozen=True)
 class Explanation:
-    """What explains the torque: faults of the log, which are undone, and of the robot file.
+    """What explains the torque: faults of the log, which are undone in `log`, and of the robot file.
 
-    Attributes:
-        system, log, rows: robot and contacts, the log without the faults, and the rows that are looked at.
-        problem: the torques that remain, over `rows`.
-        columns, prior, robot: of the accepted hypotheses on the robot, which stay in the model, with names.
-        findings, repairs: faults found, and what takes them out of a log, in order.
-        taken: names and joints of the accepted hypotheses.
+    `problem` has the torques that remain over `rows`; `columns`, `prior` and the names `robot` are those of
+    the accepted hypotheses on the robot, which stay in the model; `repairs` take the faults out of a log, in
+    order.
     """
 
     system: ConstrainedSystem
@@ -207,10 +204,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:
-    """Whether a drop of the score matters for the number of joints concerned, and is not due to chance.
-
-    The errors are shares of the torque `(blocks, nq)`.
-    """
+    """Whether a drop of the score of shares `(blocks, nq)` matters for the joints and is not chance."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
     # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.
@@ -244,10 +238,7 @@ TESTS = {
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
-    """The hypotheses that the held-out blocks cannot distinguish from the chosen one, the best first.
-
-    Each lowers the error as much as it, to within one standard error of the difference over blocks.
-    """
+    """The hypotheses that held-out blocks cannot tell from the chosen one to a standard error, best first."""
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
         if _says_the_same(chosen[0], hypothesis):
             continue

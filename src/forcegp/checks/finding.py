@@ -212,14 +212,7 @@ class NotJudgedError(Exception):
 
 @dataclass(frozen=True)
 class Report:
-    """All findings on a log, the gravest first.
-
-    Attributes:
-        findings: what was found.
-        samples: number of rows of the log.
-        joint_names: its joints.
-        skipped: checks that could not be made, with the reason.
-    """
+    """All findings on a log, the gravest first, and the checks that could not be made, with the reason."""
 
     findings: tuple[Finding, ...]
     samples: int

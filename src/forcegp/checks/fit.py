@@ -27,10 +27,7 @@ def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
 
 
 def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, Array]:
-    """The unexplained torque at some rows, r `(n, nq)` [N m, N], and J `(n, k, nq)` of the touching points.
-
-    J is zero where they do not touch. The robot must be in double precision on the CPU.
-    """
+    """Unexplained torque r `(n, nq)` [N m, N], and J `(n, k, nq)` of the points, 0 where they are off."""
     robot, r, J = system.robot, [], []
     with torch.no_grad():
         for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
@@ -87,12 +84,9 @@ FLOOR = 0.03
 
 @dataclass(frozen=True)
 class TorqueProblem:
-    """Torques to be explained by known columns and by those of a hypothesis.
-
-    Attributes:
-        r, J: `(n, nq)` unexplained torque [N m, N], and Jacobian of the touching points `(n, k, nq)`.
-        nuisance: `(n, nq, p)` columns that every hypothesis may use: friction and offset.
-        size, scale: `(nq,)` of the logged torque, for comparison, and of its noise, which weighs the joints.
+    """Unexplained torque r `(n, nq)` [N m, N], Jacobian J of the touching points `(n, k, nq)`, columns that
+    every hypothesis may use `(n, nq, p)`, size of the logged torque, and scale of its noise, which weighs the
+    joints.
     """
 
     r: Array
@@ -111,11 +105,8 @@ class TorqueProblem:
 class TorqueFit:
     """A hypothesis fitted to a log, and tested on its blocks.
 
-    Attributes:
-        error, shares: `(blocks, nq)` root mean square of the held-out residual, over `scale` and over `size`.
-        theta, spread: `(p,)` parameters of the hypothesis, and their deviation by the jackknife over blocks.
-        nuisance, nuisance_spread: the same of the nuisance columns.
-        score: `(blocks,)` Σ_j log of the shares, with a floor where errors do not matter.
+    `error` and `shares` `(blocks, nq)` are the root mean square of the held-out residual over `scale` and
+    over `size`; `theta` and `nuisance` `(p,)` are parameters, with deviations by the jackknife over blocks.
     """
 
     error: Array
@@ -148,7 +139,11 @@ def cross_validate(
     """
     p = columns.shape[-1] if columns is not None else 0
     A, y, unit, weight = _equations(problem, columns, prior)
-    Z = None if instruments is None else _with_instruments(A, problem, instruments)
+    Z = None
+    if instruments is not None:  # in place of the leading columns, in the same units
+        Z = problem.without_contact(instruments)
+        size = np.sqrt((Z**2).sum(axis=(0, 1)))
+        Z = np.concatenate([Z / np.where(size > 0.0, size, np.inf), A[..., Z.shape[-1] :]], axis=-1)
     rest, thetas, whole = _held_out(A, y, weight, Z)
     block = blocks_of(len(y))
     error = np.stack([np.sqrt((rest[block == k] ** 2).mean(axis=0)) for k in range(BLOCKS)])
@@ -180,19 +175,8 @@ def _equations(
     return A / unit, y, unit, weight
 
 
-def _with_instruments(A: Array, problem: TorqueProblem, instruments: Array) -> Array:
-    """The columns, the leading ones replaced by their instruments, in the same units."""
-    Z = problem.without_contact(instruments)
-    size = np.sqrt((Z**2).sum(axis=(0, 1)))
-    Z = Z / np.where(size > 0.0, size, np.inf)
-    return np.concatenate([Z, A[..., Z.shape[-1] :]], axis=-1)
-
-
 def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
-    """Parameters of the columns and of the nuisance that rows with a large residual hardly move.
-
-    Huber's weights, min(1, k/|r|) with k twice the median residual (*Robust Statistics*, 1981, ch. 7).
-    """
+    """Parameters by Huber's weights min(1, k/|r|), k twice the median (*Robust Statistics*, 1981, ch. 7)."""
     A, y, unit, weight = _equations(problem, columns, prior)
     w, theta = np.ones(len(y)), np.zeros(A.shape[-1])
     for _ in range(REWEIGHTED):
@@ -245,11 +229,10 @@ def gain_of(better: Array, worse: Array) -> tuple[float, float]:
 
 
 def pooled_gain_of(better: Array, worse: Array) -> tuple[float, float]:
-    """Drop of Σ_j log of the error over all blocks, and its standard error by the jackknife.
+    """Drop of Σ_j log of errors `(blocks, nq)` over all blocks, and its standard error by the jackknife.
 
-    Errors are shares of the torque `(blocks, nq)`. Where blocks differ in what they show, as touching and
-    free ones do, the mean drop over blocks scatters with that; the ratio of errors over all blocks does not
-    (Cochran, *Sampling Techniques*, 1977, ch. 6).
+    Unlike the mean over blocks it does not scatter with what they show (Cochran, *Sampling Techniques*, ch.
+    6).
     """
 
     def drop(rows: Array) -> float:

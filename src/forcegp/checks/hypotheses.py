@@ -39,16 +39,12 @@ SLOW, GRAVITY = 0.01, 10.0
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One explanation.
+    """One explanation, named by a kind of finding, or a family of kinds.
 
-    Attributes:
-        name: what is wrong: a kind of finding, or a family of kinds.
-        size: number of parameters, discrete choices counted as none.
-        change: makes the log as it would be, were the hypothesis right; parameters come on top.
-        columns, prior: `(n, nq, p)` torque that the parameters add to r, and how large these may be `(p,)`.
-        joints: indices of the joints concerned.
-        shift: delay of the torque in samples.
-        instruments: `(n, nq, p)` in place of least squares on columns that hold errors.
+    `size` counts parameters, discrete choices as none; `change` makes the log as it would be, were the
+    hypothesis right, parameters aside. `columns` `(n, nq, p)` are the torque that parameters of size `prior`
+    `(p,)` add to r, `instruments` of the same shape replace least squares on columns that hold errors, and
+    `shift` is a delay of the torque in samples.
     """
 
     name: str
@@ -168,10 +164,7 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
 def current_hypothesis(
     log: Log, rows: np.ndarray, problem: TorqueProblem, joints: tuple[int, ...]
 ) -> Hypothesis:
-    """Gains of joints by instrumental variables; the instrument is the torque that the motion needs.
-
-    Errors in a logged torque, mostly friction of a light joint, would bias its gain towards zero.
-    """
+    """Gains with the torque that the motion needs as instrument: errors of the logged one would bias them."""
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)
 

@@ -47,12 +47,8 @@ UNIT_TOLERANCE = 0.1
 
 @dataclass(frozen=True)
 class Match:
-    """Changes and integrals of one level, and the slopes between them.
-
-    Attributes:
-        change, integral: `(w, nq)` over windows, zero where an impact crosses one; `whole`, both as they are.
-        low, high, correlation: `(nq,)` bounds of the slope, and correlation.
-        moving: `(nq,)` bool, joints whose change stands out from noise.
+    """Changes and integrals of one level `(w, nq)` over windows, zero where an impact crosses one (`whole`:
+    as they are), bounds of the slopes between them `(nq,)`, and joints whose change stands out from noise.
     """
 
     change: Array
@@ -83,8 +79,13 @@ def match(log: Log, value: str, rate: str) -> Match | None:
         integrals.append(np.diff(total[::width], axis=0))
     if sum(map(len, changes)) < 20:
         return None
-    whole = np.concatenate(changes), np.concatenate(integrals)
-    change, integral = _without_jumps(*whole)
+    whole = change, integral = np.concatenate(changes), np.concatenate(integrals)
+    # Windows that an impact crosses, `JUMPS` of them at most, are left out.
+    scale = np.sqrt((change**2).sum(axis=0) / np.maximum((integral**2).sum(axis=0), 1e-300))
+    misfit = change - scale * integral
+    outlier = np.abs(misfit) > 8.0 * robust_std(misfit) + 1e-12
+    jumps = outlier & (np.abs(misfit) > np.quantile(np.abs(misfit), 1.0 - JUMPS, axis=0))
+    change, integral = (np.where(jumps, 0.0, x) for x in whole)
     cross = (change * integral).sum(axis=0)
     integral_square, change_square = (integral**2).sum(axis=0), (change**2).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -94,15 +95,6 @@ def match(log: Log, value: str, rate: str) -> Match | None:
     moving = speed > 1e-3 * speed.max()
     low, high, correlation = np.nan_to_num((low, high, correlation))
     return Match(change, integral, whole, low, high, correlation, moving)
-
-
-def _without_jumps(change: Array, integral: Array) -> tuple[Array, Array]:
-    """Zero in the windows of each joint that an impact crosses, `JUMPS` of them at most."""
-    scale = np.sqrt((change**2).sum(axis=0) / np.maximum((integral**2).sum(axis=0), 1e-300))
-    misfit = change - scale * integral
-    outlier = np.abs(misfit) > 8.0 * robust_std(misfit) + 1e-12
-    jumps = outlier & (np.abs(misfit) > np.quantile(np.abs(misfit), 1.0 - JUMPS, axis=0))
-    return np.where(jumps, 0.0, change), np.where(jumps, 0.0, integral)
 
 
 def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -163,16 +155,16 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
     if not wrong.any():
         return [], log
     if "qd" in log.header.derived:
-        return [_mismatch("filter-wide", log, level, wrong, "qd", "q")], log
+        return _mismatch("filter-wide", log, level, wrong, "qd", "q"), log
     permutation = _permutation(level)
     if permutation is not None:
-        names = log.named(permutation != np.arange(log.nq))
-        text = f"the velocities of {', '.join(names)} belong to each other's positions"
-        finding = log.finding("velocity-order", text, names)
         rates, moved = match(log, "qd", "qdd"), permutation != np.arange(log.nq)
+        findings = log.on_joints(
+            "velocity-order", moved, "the velocities of {} belong to each other's positions"
+        )
         follows = rates is not None and np.median(rates.correlation[moved]) > RELATED
         qdd = log.qdd[:, permutation] if follows else log.qdd  # where they had the order of the wrong ones
-        return [finding], log.replace(qd=log.qd[:, permutation], qdd=qdd)
+        return findings, log.replace(qd=log.qd[:, permutation], qdd=qdd)
     findings, factor = _velocity_findings(log, level, wrong)
     return findings, log.replace(qd=log.qd * factor)
 
@@ -188,23 +180,23 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
     for kind, slope, what in causes:
         hit = unexplained & level.right(slope) & (np.abs(level.correlation) >= RELATED)
         if hit.any():
-            joints, slopes = log.named(hit), level.low[hit]
-            text = f"qd of {', '.join(joints)} {what} the rate of change of q"
-            findings.append(log.finding(kind, text, joints, slope=float(np.median(slopes))))
+            text, median = f"qd of {{}} {what} the rate of change of q", float(np.median(level.low[hit]))
+            findings += log.on_joints(kind, hit, text, slope=median)
             factor[hit], unexplained = slope, unexplained & ~hit
     if unexplained.any():
-        findings.append(_mismatch("velocity-mismatch", log, level, unexplained, "qd", "q"))
+        findings += _mismatch("velocity-mismatch", log, level, unexplained, "qd", "q")
     return findings, factor
 
 
-def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, value: str) -> Finding:
+def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, value: str) -> list[Finding]:
     """A rate without relation to its value."""
-    joints, j = log.named(wrong), int(np.flatnonzero(wrong)[0])
-    slope, correlation = level.low[j], level.correlation[j]
-    shown = f"slope {slope:.3g}, correlation {correlation:.3g}"
+    j = int(np.flatnonzero(wrong)[0])
+    numbers = {"slope": level.low[j], "correlation": level.correlation[j]}
+    shown = ", ".join(f"{name} {number:.3g}" for name, number in numbers.items())
     is_not = "was computed by a filter and has not" if kind == "filter-wide" else "is not"
-    text = f"{rate} of {', '.join(joints)} {is_not} the rate of change of {value}: {shown}"
-    return log.finding(kind, text, joints, slope=slope, correlation=correlation)
+    return log.on_joints(
+        kind, wrong, f"{rate} of {{}} {is_not} the rate of change of {value}: {shown}", **numbers
+    )
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
@@ -272,11 +264,10 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     if not wrong.any():
         return [], log
     kind = "filter-wide" if "qdd" in log.header.derived else "acceleration-mismatch"
-    finding = _mismatch(kind, log, level, wrong, "qdd", "qd")
-    qdd = log.qdd.copy()
+    findings, qdd = _mismatch(kind, log, level, wrong, "qdd", "qd"), log.qdd.copy()
     for s in log.stretches:
         qdd[s, wrong] = np.gradient(log.qd[s][:, wrong], log.t[s], axis=0)
-    return [finding], log.replace(qdd=qdd, derived=log.derived | {"qdd"})
+    return findings, log.replace(qdd=qdd, derived=log.derived | {"qdd"})
 
 
 DEPARTURE, DEPARTURE_STRIDE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, 3
@@ -329,10 +320,9 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
     kinds = [("noise-understated", top > NOISE_FACTOR * stated, np.max)]
     if not log.header.filtered:  # the highest frequencies show little of what a filter lets through
         kinds.append(("noise-overstated", top < stated / NOISE_FACTOR, np.min))
-    result = []
+    findings = []
     for kind, wrong, worst in (one for one in kinds if one[1].any()):
-        joints = log.named(wrong)
-        place = f"{worst(top[wrong]):.3g} rad/s² at {', '.join(joints)}"
+        place = f"{worst(top[wrong]):.3g} rad/s² at {{}}"
         text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
-        result.append(log.finding(kind, text, joints, **evidence))
-    return result, log
+        findings += log.on_joints(kind, wrong, text, **evidence)
+    return findings, log

@@ -41,10 +41,7 @@ def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
 
 
 def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Angles that leave the joint's range often, and would stay within it if they were in degrees.
-
-    A joint that turns more than once also leaves its range, so that the torque has to fit degrees better.
-    """
+    """Angles that often leave the joint's range, stay within it in degrees, and then fit the torque."""
     low, high = _limits(system)["q"]
     turning = system.robot.revolute.cpu().numpy() > 0.0
     low, high = np.where(np.isfinite(low), low, -TURN), np.where(np.isfinite(high), high, TURN)

@@ -85,11 +85,8 @@ SMOOTHING = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Columns of a log, named as in a `Dataset`, unchecked.
-
-    Attributes:
-        derived: the columns among `qd`, `qdd` that were computed here, not logged.
-        masked: `(n,)` bool, rows that a check excludes from those after it.
+    """Columns of a log, named as in a `Dataset`, unchecked; `qd` and `qdd` may be `derived` here, and a check
+    has rows `masked` `(n,)` for those after it.
     """
 
     t: Array
@@ -121,6 +118,11 @@ class Log:
     def finding(self, kind: str, text: str, joints: tuple[str, ...] = (), **evidence: Any) -> Finding:
         """A finding on the whole log."""
         return Finding(kind, text, self.all_rows, joints, evidence=evidence)
+
+    def on_joints(self, kind: str, mask: Array, text: str, **evidence: Any) -> list[Finding]:
+        """A finding on the joints that a mask picks, listed at the `{}` of its text; none without a joint."""
+        joints = self.named(mask)
+        return [self.finding(kind, text.format(", ".join(joints)), joints, **evidence)] if joints else []
 
     def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
         """Names of the joints that a mask picks."""
@@ -250,11 +252,7 @@ SMOOTHED_SECONDS, SMOOTHED_ORDER = 0.1, 3
 
 
 def smoothed(log: Log) -> Log:
-    """The log after a Savitzky-Golay filter on each stretch without a contact switch.
-
-    Rows within half a window of an end, a gap or a switch are masked. A log in order of selection, and one
-    sampled too slowly for a filter, is left as it is.
-    """
+    """The log after a Savitzky-Golay filter between contact switches, ends masked, if it is in order."""
     from scipy.signal import savgol_filter
 
     half = round(SMOOTHED_SECONDS / log.dt / 2.0) if np.isfinite(log.dt) and log.header.ordered else 0

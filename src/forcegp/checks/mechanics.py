@@ -84,14 +84,10 @@ def _without_torque(log: Log) -> list[Finding]:
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
-    if not still.any():
-        return []
-    joints = log.named(still)
     word = "zero" if zero[still].all() else "constant"
+    findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")
     # One passive joint is a design; an arm without any torque is a missing column.
-    weight = "error" if still.all() else "warning"
-    text = f"the torque of {', '.join(joints)} is {word} throughout"
-    return [Finding("torque-zero", text, log.all_rows, joints, weight=weight)]
+    return [replace(finding, weight="error" if still.all() else "warning") for finding in findings]
 
 
 def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
@@ -114,10 +110,7 @@ def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) ->
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
-    """The explanation without friction that the log does not determine: it would drive, or is below its σ.
-
-    What is left out has the parameter and the spread 0.
-    """
+    """The explanation without friction that would drive, or is below its σ: parameter and spread become 0."""
     declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
     for _ in range(robot.nq):
         fit = explanation.fit
@@ -201,6 +194,8 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
     """Times at which far more torque is unexplained than usual, and the rows around them."""
+    from scipy.ndimage import minimum_filter1d
+
     log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
     trace = residual_trace(system, explanation, rows)
     scale = np.maximum(explanation.problem.scale, FLOOR * explanation.problem.size)
@@ -208,7 +203,10 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     width = max(1, round(DISTURBANCE_SECONDS / stride))
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
-    friction = _dry_friction(system.robot, explanation, rows, width)
+    # Dry friction of joints that rest or reverse within the window may be as large as this.
+    dry = system.robot.friction.numpy() - explanation.fit.nuisance[log.nq : 2 * log.nq]
+    slowest = minimum_filter1d(np.abs(log.qd[rows]), 2 * width + 1, axis=0)
+    friction = np.maximum(dry, 0.0) * (slowest < system.robot.friction_velocity.numpy())
     visible = np.asarray((np.abs(trace) > VISIBLE * explanation.problem.size + friction).any(axis=1))
     bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
@@ -248,23 +246,9 @@ def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
 
 
 def _upper_spread(level: Array) -> float:
-    """Standard deviation of the level, from its upper side alone where that is narrower.
-
-    If a contact leaves one free torque, the level is the logarithm of a few squares. Its lower tail is twice
-    as long as its upper one and says nothing about how large a residual is usual.
-    """
+    """Deviation of the level, from its upper side where narrower: of few squares the lower tail is long."""
     middle, upper = np.percentile(level, [50.0, ONE_SIGMA])
     return float(min(robust_std(level), upper - middle))
-
-
-def _dry_friction(robot: RobotModel, explanation: Explanation, rows: np.ndarray, width: int) -> Array:
-    """Largest dry friction torque `(n, nq)` of joints that rest or reverse within the window, else zero."""
-    from scipy.ndimage import minimum_filter1d
-
-    log = explanation.log
-    size = np.maximum(robot.friction.numpy() - explanation.fit.nuisance[log.nq : 2 * log.nq], 0.0)
-    slowest = minimum_filter1d(np.abs(log.qd[rows]), 2 * width + 1, axis=0)
-    return size * (slowest < robot.friction_velocity.numpy())
 
 
 def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:

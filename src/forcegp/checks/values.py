@@ -45,9 +45,7 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
     """Steps that are so uneven that filters for even sampling do not apply."""
     with np.errstate(invalid="ignore"):
         regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
-    if len(regular) < 2:
-        return [], log
-    spread = float(robust_std(regular) / log.dt)
+    spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
     if spread <= UNIFORM_TOLERANCE:
         return [], log
     text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
@@ -163,13 +161,15 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     """Single values far off the curve through their neighbours."""
     bad, hit, joints, vectors = np.zeros(len(log), bool), [], [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
+    near = np.zeros(len(log), bool)
+    for label in log.contact.values():  # next to a contact switch values jump by nature
+        near[1:] |= label[1:] != label[:-1]
     for name in vectors:
         departure, around, scale = departures[name]
         reach = log.reach(name)
         least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
-        # Next to a contact switch values jump by nature.
         outlier = (
-            ~_switches(log)[:, None]
+            ~_within_two(near)[:, None]
             & (np.abs(departure) > np.maximum(SPIKE * scale, least))
             & (np.abs(departure) > SPIKE_ALONE * around)
             & _one_value(departure, scale)
@@ -199,10 +199,7 @@ def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
 
 
 def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
-    """`(n, nq)` bool, values that depart as others do, of which each is compared with its column's range.
-
-    A shock moves several joints, or shows in torque and acceleration, and never in the position.
-    """
+    """`(n, nq)` bool, values but positions that depart with others, each compared with its column's range."""
     departure = departures[name][0]
     if name == "q":
         return np.zeros(departure.shape, bool)
@@ -236,22 +233,11 @@ def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) ->
 
 
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
-    """`(n, d)` bool, departures that those of the neighbours follow from, as they do for one wrong value.
-
-    A value that is off by h departs by h, its neighbours by −4h/6 and h/6; a kink or a step has other shapes.
-    """
+    """`(n, d)` bool, departures h with −4h/6 and h/6 around: one wrong value makes them, a kink does not."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
     shape = departure[..., None] * np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
     misfit = np.abs(around - shape).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
-
-
-def _switches(log: Log) -> np.ndarray:
-    """`(n,)` bool, rows within two of a contact switch."""
-    near = np.zeros(len(log), bool)
-    for label in log.contact.values():
-        near[1:] |= label[1:] != label[:-1]
-    return _within_two(near)
 
 
 def _within_two(x: Array) -> Array:

@@ -67,7 +67,7 @@ def main(program: typer.Typer = app) -> None:
     """
     _end_when_interrupted()
     with warnings.catch_warnings():
-        warnings.showwarning = _show_warning
+        warnings.showwarning = lambda message, *_, **__: warn(message)
         try:
             program()
         except ForceGPError as error:
@@ -112,7 +112,3 @@ def _fail(message: str) -> None:
     typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
     typer.echo(printable(message), err=True)
     sys.exit(USER_ERROR)
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    warn(message)

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import typer
 
+import forcegp
+from forcegp.errors import DataError, DestinationError, ForceGPError
+
 if TYPE_CHECKING:
-    from forcegp.constraints import ConstrainedSystem
-    from forcegp.data import Dataset, SavitzkyGolay
     from forcegp.models.base import FittedModel, Predictor
     from forcegp.models.configured import Configured
-    from forcegp.robot import RobotModel
     from forcegp.scene import ModelTable
 
 
@@ -75,11 +75,17 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
 def check_output(out: Path, *inputs: Path) -> None:
     """Check, before long work, that a file can be written and is none that the result is made from."""
     from forcegp.destination import check_destination
-    from forcegp.errors import DestinationError
 
     check_destination(out)
     if out.resolve() in (path.resolve() for path in inputs):
         raise DestinationError(f"{out} would be overwritten", hint="name another file for the result")
+
+
+def save(write: Callable[[Path], object], out: Path) -> None:
+    """Write a result by `write(out)`; if that fails, to another place, which the error names."""
+    from forcegp.destination import write_or_keep
+
+    write_or_keep(write, out)
 
 
 def check_data_destination(path: Path, *inputs: Path) -> None:
@@ -90,18 +96,16 @@ def check_data_destination(path: Path, *inputs: Path) -> None:
     check_output(path, *inputs)
 
 
-def derivatives(window: int | None) -> SavitzkyGolay | None:
+def derivatives(window: int | None) -> forcegp.SavitzkyGolay | None:
     """The filter of a window, if there is one."""
-    from forcegp.data import SavitzkyGolay
-
-    return None if window is None else SavitzkyGolay(window=window)
+    return None if window is None else forcegp.SavitzkyGolay(window=window)
 
 
-def read_data(path: Path, robot: RobotModel | None = None, differentiate: int | None = None) -> Dataset:
+def read_data(
+    path: Path, robot: forcegp.RobotModel | None = None, differentiate: int | None = None
+) -> forcegp.Dataset:
     """Read a data set with the joints of a robot in its order, computing derivatives if a window is given."""
-    from forcegp.data import Dataset
-
-    data = Dataset.read(path, differentiate=derivatives(differentiate))
+    data = forcegp.Dataset.read(path, differentiate=derivatives(differentiate))
     if robot is not None and set(robot.joint_names) <= set(data.joint_names):
         data = data.select(robot.joint_names)
     if robot is not None:
@@ -109,10 +113,8 @@ def read_data(path: Path, robot: RobotModel | None = None, differentiate: int | 
     return data
 
 
-def trajectory_from(data: Dataset, start: int, purpose: str) -> Dataset:
+def trajectory_from(data: forcegp.Dataset, start: int, purpose: str) -> forcegp.Dataset:
     """The rows from `start` to the end of their trajectory."""
-    from forcegp.errors import DataError
-
     if not data.header.ordered:
         raise DataError(
             f"a {purpose} needs a log in order of time",
@@ -138,33 +140,29 @@ def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
 
 def check_robot_named(scene: str | None, robot: str | None) -> None:
     """Check that either a scene or a robot was given."""
-    from forcegp.errors import ForceGPError
-
     if (scene is None) == (robot is None):
         problems = "nothing says which robot moved", "both --scene and --robot name a robot"
         raise ForceGPError(problems[scene is not None], hint="give either --scene or --robot")
 
 
-def system_of(scene: str | None, robot: str | None) -> ConstrainedSystem:
+def system_of(scene: str | None, robot: str | None) -> forcegp.ConstrainedSystem:
     """The robot of a scene with its contacts, or a robot without any."""
-    from forcegp.constraints import ConstrainedSystem
-    from forcegp.robot import load_robot
-    from forcegp.scene import load_scene
-
     check_robot_named(scene, robot)
-    return load_scene(scene).system() if scene is not None else ConstrainedSystem(load_robot(str(robot)))
+    if scene is not None:
+        return forcegp.load_scene(scene).system()
+    return forcegp.ConstrainedSystem(forcegp.load_robot(str(robot)))
 
 
 def model_table(config: Path | None, scene: str | None) -> ModelTable:
     """The table [model] of a file of its own if one is given, else that of the scene, if there is one."""
-    from forcegp.scene import default_model_table, load_model_table, load_scene
+    from forcegp.scene import default_model_table, load_model_table
 
     if config is not None:
         return load_model_table(config)
-    return default_model_table() if scene is None else load_scene(scene).model
+    return default_model_table() if scene is None else forcegp.load_scene(scene).model
 
 
-def warn_beyond(model: Predictor, data: Dataset, doubts: Iterable[str] = ()) -> None:
+def warn_beyond(model: Predictor, data: forcegp.Dataset, doubts: Iterable[str] = ()) -> None:
     """Print doubts about predictions, and whether states are far from those that the model was trained on."""
     from forcegp.forces.noise import warnings_beyond
     from forcegp.models.structured_fit import StructuredFit

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import fitted, model_table, progress_bar, read_data, show, warn_beyond
+import forcegp
+from forcegp.cli.common import fitted, model_table, progress_bar, read_data, save, show, warn_beyond
 from forcegp.cli.options import AsJson, Config, DataFile
+from forcegp.errors import ForceGPError
 
 if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.evaluation import Evaluation
     from forcegp.models.base import Predictor
 
 WINDOW_SECONDS = 3.0
@@ -56,7 +56,6 @@ def evaluate(
     forcegp evaluate --scene my_scene.toml --config model.toml --train train.parquet --data test.parquet
     """
     from forcegp.destination import check_destination
-    from forcegp.evaluation import evaluate as run
 
     if out is not None:
         check_destination(out, folder=True, own_files=["*.json", "*.html", "*.svg", "*.png"])
@@ -65,7 +64,7 @@ def evaluate(
     test = read_data(data, robot)
     training = None if train is None else read_data(train, robot)
     with progress_bar("evaluating", len(test)) as progress:
-        evaluation = run(regression, test, train=training, progress=progress)
+        evaluation = forcegp.evaluate(regression, test, train=training, progress=progress)
     warn_beyond(regression, test)
     result: dict[str, object] = {"verdict": evaluation.verdict or "too few samples"}
     result |= {
@@ -80,10 +79,13 @@ def evaluate(
 
 
 def _written(
-    out: Path, scores: Evaluation, model: Predictor, test: Dataset, names: tuple[str, str, str | None]
+    out: Path,
+    scores: forcegp.Evaluation,
+    model: Predictor,
+    test: forcegp.Dataset,
+    names: tuple[str, str, str | None],
 ) -> dict[str, object]:
     """Write the page and its data, and say where they are; `names` are of the files in the title."""
-    from forcegp.destination import write_or_keep
     from forcegp.files import write_json, written_folder
     from forcegp.report.evaluation import PAGE, write_evaluation
     from forcegp.report.window import opening, predicted_window
@@ -96,26 +98,23 @@ def _written(
             write_json(temporary / "evaluation.json", scores.to_dict())
             write_evaluation(temporary, *names, scores, window, comparison)
 
-    write_or_keep(write, out)
+    save(write, out)
     return {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}
 
 
 def _model(model: Path | None, scene: str | None, config: Path | None, train: Path | None) -> Predictor:
     """The fitted model in a file, or one that is fitted to the training data now."""
-    from forcegp.errors import ForceGPError
     from forcegp.models.configured import configured
-    from forcegp.models.load import load_model
-    from forcegp.scene import load_scene
 
     if model is not None:
         if scene is not None or config is not None:
             raise ForceGPError("a fitted model has its scene and settings", hint="give --model alone")
-        return load_model(model)
+        return forcegp.load_model(model)
     if scene is None or train is None:
         raise ForceGPError(
             "nothing says which model to evaluate",
             expected="--model FOLDER, or --scene and --train to fit one",
         )
-    system = load_scene(scene).system()
+    system = forcegp.load_scene(scene).system()
     regression = configured(model_table(config, scene), system)
     return fitted(regression, read_data(train, system.robot))

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import forcegp
 from forcegp.cli.common import show
 from forcegp.cli.options import AsJson, ModelFile
+from forcegp.errors import ModelError, RobotFileError, check_name
 
 if TYPE_CHECKING:
     from forcegp.models.structured_fit import StructuredFit
@@ -54,12 +56,10 @@ def export(
 
     forcegp export -m model --to urdf --robot my.urdf --samples 100 -o calibrated.urdf
     """
-    from forcegp.errors import ModelError, check_name
-    from forcegp.models.load import load_model
     from forcegp.models.structured_fit import StructuredFit
 
     check_name("format to export to", to, TARGETS)
-    fit = load_model(model)
+    fit = forcegp.load_model(model)
     if not isinstance(fit, StructuredFit):
         raise ModelError("only a structured Gaussian process can be exported", expected="sgp", got=fit.kind)
     if to != "c":
@@ -74,7 +74,6 @@ def _written_back(
     fit: StructuredFit, to: str, robot: str | None, out: Path, samples: int, seed: int
 ) -> dict[str, object]:
     """Write the robot file, and say what changed."""
-    from forcegp.errors import ModelError, RobotFileError
     from forcegp.models.calibrated import write_calibrated
     from forcegp.robot.write_back import is_mjcf
 

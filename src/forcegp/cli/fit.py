@@ -8,43 +8,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import (
-    check_output,
-    derivatives,
-    fitted,
-    model_table,
-    progress_bar,
-    read_data,
-    show,
-    system_of,
-    warn,
-)
-from forcegp.cli.options import (
-    AsJson,
-    Config,
-    DataFiles,
-    Differentiate,
-    RobotName,
-    SceneOrNone,
-    SimulatedTime,
-)
+import forcegp
+from forcegp.cli import common, options
+from forcegp.cli.common import progress_bar, show
 
 if TYPE_CHECKING:
-    from forcegp.data import Dataset, StreamedDataset
     from forcegp.models.base import Model
     from forcegp.models.fit_result import FitResult
-    from forcegp.robot import RobotModel
-
 
 STREAM_ROWS = 100_000
 """Rows of a log from which it is read piece by piece."""
 
 
 def fit(
-    data: DataFiles,
+    data: options.DataFiles,
     out: Annotated[Path, typer.Option("--out", "-o", help="File for the fitted model (.safetensors).")],
-    scene: SceneOrNone = None,
-    robot: RobotName = None,
+    scene: options.SceneOrNone = None,
+    robot: options.RobotName = None,
     model: Annotated[
         str | None,
         typer.Option(
@@ -54,18 +34,18 @@ def fit(
             "kernel sgp-zero-se, sgp-mean-se or sgp-contact-se. Default: the file's, else sgp.",
         ),
     ] = None,
-    config: Config = None,
+    config: options.Config = None,
     noise_std: Annotated[
         float | None,
         typer.Option(help="Noise on accelerations in rad/s²; default: the file's or the data's."),
     ] = None,
-    differentiate: Differentiate = None,
+    differentiate: options.Differentiate = None,
     checkpoint: Annotated[
         Path | None,
         typer.Option(help="File that records a long fit; a fit that finds it resumes there."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of random initial values.")] = None,
-    as_json: AsJson = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Fit a model of the forward dynamics to logged motion.
 
@@ -82,19 +62,20 @@ def fit(
 
     forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model
     """
-    from forcegp.destination import write_or_keep
+    from forcegp.destination import check_destination
     from forcegp.models.configured import configured
     from forcegp.storage.checkpoint import beside
-    from forcegp.storage.model_file import check_model_destination, model_path
+    from forcegp.storage.model_file import model_path
 
-    check_model_destination(out)
+    check_destination(model_path(out))
     if checkpoint is not None:
-        check_output(checkpoint, model_path(out), *data)
-    system = system_of(scene, robot)
-    regression = configured(model_table(config, scene), system, name=model, noise_std=noise_std, seed=seed)
+        common.check_output(checkpoint, model_path(out), *data)
+    system = common.system_of(scene, robot)
+    table = common.model_table(config, scene)
+    regression = configured(table, system, name=model, noise_std=noise_std, seed=seed)
     training = _training(regression.model, data, differentiate, system.robot)
-    learned = fitted(regression, training, checkpoint=checkpoint)
-    write_or_keep(learned.save, out)
+    learned = common.fitted(regression, training, checkpoint=checkpoint)
+    common.save(learned.save, out)
     if checkpoint is not None:
         for file in (checkpoint, beside(checkpoint)):
             file.unlink(missing_ok=True)
@@ -113,25 +94,23 @@ def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
 
 
 def _training(
-    regression: Model, files: list[Path], differentiate: int | None, robot: RobotModel
-) -> Dataset | StreamedDataset:
+    regression: Model, files: list[Path], differentiate: int | None, robot: forcegp.RobotModel
+) -> forcegp.Dataset | forcegp.StreamedDataset:
     """The data that a model is fitted to: read piece by piece where they are long and the model can."""
-    from forcegp.data import Dataset, StreamedDataset
-    from forcegp.models.structured_gp import StructuredGP
-
-    if isinstance(regression, StructuredGP) and all(file.suffix.lower() == ".parquet" for file in files):
-        log = StreamedDataset(tuple(files), derivatives(differentiate), robot.joint_names)
+    parquet = all(file.suffix.lower() == ".parquet" for file in files)
+    if parquet and isinstance(regression, forcegp.StructuredGP):
+        log = forcegp.StreamedDataset(tuple(files), common.derivatives(differentiate), robot.joint_names)
         if len(files) > 1 or len(log) > STREAM_ROWS:
             return log
-    parts = [read_data(file, robot, differentiate) for file in files]
-    return parts[0] if len(parts) == 1 else Dataset.concatenate(parts)
+    parts = [common.read_data(file, robot, differentiate) for file in files]
+    return parts[0] if len(parts) == 1 else forcegp.Dataset.concatenate(parts)
 
 
 def _warn(result: FitResult) -> None:
     """Print what is doubtful about a fit."""
     doubts = () if result.converged else (f"the fit did not converge: {result.message}",)
     for doubt in (*doubts, *result.warnings):
-        warn(doubt)
+        common.warn(doubt)
 
 
 def sweep(
@@ -139,12 +118,12 @@ def sweep(
     model: Annotated[list[str], typer.Option("--model", "-m", help="Model; may be given several times.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fits.")],
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0 on.")] = 1,
-    duration: SimulatedTime = None,
+    duration: options.SimulatedTime = None,
     processes: Annotated[int, typer.Option(min=1, help="Workers on this machine, of one thread each.")] = 2,
     address: Annotated[
         str | None, typer.Option(help="Scheduler of a running cluster, in place of workers here.")
     ] = None,
-    as_json: AsJson = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Simulate, fit and score several models on several robots, with several seeds.
 

@@ -9,22 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from forcegp.cli.common import (
-    check_data_destination,
-    check_output,
-    check_robot_named,
-    printable,
-    progress_bar,
-    read_data,
-    show,
-    system_of,
-)
+import forcegp
+from forcegp.cli import common
+from forcegp.cli.common import printable, progress_bar, save, show
 from forcegp.cli.options import AsJson, Differentiate, RobotName, SceneOrNone
+from forcegp.errors import ForceGPError
 
 if TYPE_CHECKING:
     from forcegp.checks import Report
-    from forcegp.constraints import ConstrainedSystem
-    from forcegp.data import Dataset
     from forcegp.data.selection import Split
     from forcegp.logs import Imported
 
@@ -67,36 +59,33 @@ def import_(
 
     forcegp import run.bag --robot ur3.urdf --mapping ur3_bag --out log.parquet
     """
-    from forcegp.destination import write_or_keep
-    from forcegp.errors import ForceGPError
     from forcegp.logs import import_log
 
-    check_robot_named(scene, robot)
+    common.check_robot_named(scene, robot)
     place = guess or out
     if place is None or (guess is None and place.suffix.lower() != ".parquet"):
         raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
-    check_output(place, log)
-    system = system_of(scene, robot)
+    common.check_output(place, log)
+    system = common.system_of(scene, robot)
     if guess is not None:
         show(_guess(log, system, guess), as_json)
         return
     with progress_bar(f"reading {log.name}", 1) as advance:
         imported = import_log(log, system, mapping, advance, displaced=fit_surface is not None)
-    write_or_keep(imported.data.write, place)
+    save(imported.data.write, place)
     result = _json(imported) if as_json else _summary(imported)
     if fit_surface is not None:
         result |= _surfaces(imported, system, fit_surface, _tip_radius(tip_radius))
     show(result | {"file": str(place)}, as_json)
 
 
-def _guess(log: Path, system: ConstrainedSystem, out: Path) -> dict[str, object]:
-    from forcegp.destination import write_or_keep
+def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str, object]:
     from forcegp.files import write_text
     from forcegp.logs.guess import guess_mapping
 
     with progress_bar(f"looking at {log.name}", 1) as advance:
         guessed = guess_mapping(log, system, progress=advance)
-    write_or_keep(lambda path: write_text(path, guessed.toml()), out)
+    save(lambda path: write_text(path, guessed.toml()), out)
     doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
     return {"mapping": str(out), **doubts, "next": f"check {out}, then import with --mapping {out}"}
 
@@ -112,8 +101,6 @@ def _summary(imported: Imported) -> dict[str, object]:
 
 def _tip_radius(text: str | None) -> float | Literal["fit"] | None:
     """The radius of the tip as it was given."""
-    from forcegp.errors import ForceGPError
-
     if text is None or text == "fit":
         return text
     with suppress(ValueError):
@@ -124,7 +111,7 @@ def _tip_radius(text: str | None) -> float | Literal["fit"] | None:
 
 def _surfaces(
     imported: Imported,
-    system: ConstrainedSystem,
+    system: forcegp.ConstrainedSystem,
     kind: Literal["plane", "sphere"],
     tip_radius: float | Literal["fit"] | None,
 ) -> dict[str, object]:
@@ -182,22 +169,20 @@ def check(
     """
     from threadpoolctl import threadpool_limits
 
-    from forcegp.checks import check as run
-    from forcegp.checks import read_log
-    from forcegp.destination import write_or_keep
+    from forcegp import checks
 
     if out is not None:
-        check_output(out, data)
-    system = system_of(scene, robot)
-    log = read_log(data)
+        common.check_output(out, data)
+    system = common.system_of(scene, robot)
+    log = checks.read_log(data)
     # Matrices are small: threads of BLAS cost more than they save, and two checks at once would fight.
     with progress_bar("checking", 1) as progress, threadpool_limits(1, user_api="blas"):
-        report = run(system, log, progress=progress)
+        report = checks.check(system, log, progress=progress)
     if out is not None:
         from forcegp.report.check import write_check
 
         title = f"{data} on {scene or robot}"
-        write_or_keep(lambda path: write_check(path, title, report, system, log), out)
+        save(lambda path: write_check(path, title, report, system, log), out)
     if as_json:
         show({**report.to_dict(), "page": str(out) if out else None}, as_json)
     else:
@@ -269,10 +254,10 @@ def select(
     """
     from forcegp.data import split_by_selection, split_by_stretches, without_marked_impacts
 
-    check_data_destination(out, log)
+    common.check_data_destination(out, log)
     if rest is not None:
-        check_data_destination(rest, log, out)
-    whole = read_data(log, differentiate=differentiate)
+        common.check_data_destination(rest, log, out)
+    whole = common.read_data(log, differentiate=differentiate)
     data = whole if keep_impacts else without_marked_impacts(whole)
     held_out = {"stretch": stretch, "fraction": fraction, "margin": margin}
     with progress_bar("selecting points", count) as progress:
@@ -287,16 +272,16 @@ def select(
     show(result, as_json)
 
 
-def _written(data: Dataset, parts: Split, how: str, out: Path, rest: Path | None) -> dict[str, object]:
+def _written(
+    data: forcegp.Dataset, parts: Split, how: str, out: Path, rest: Path | None
+) -> dict[str, object]:
     """Write training and test points, and say what was written."""
-    from forcegp.destination import write_or_keep
-
     result: dict[str, object] = {}
     files = ("selected", "training", parts.train, out), ("kept", "test", parts.test, rest)
     for done, kind, rows, path in files:
         if path is not None:
             step = f"{done} {len(rows)} {kind} points {how}"
-            write_or_keep(data[rows].with_step(step).write, path)
+            save(data[rows].with_step(step).write, path)
             result |= {f"{kind}_points": len(rows), f"{kind}_file": str(path)}
     if parts.stretches:
         result["held_out_rows"] = [list(rows) for rows in parts.stretches]

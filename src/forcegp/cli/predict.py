@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import check_data_destination, progress_bar, read_data, show, warn_beyond
+import forcegp
+from forcegp.cli.common import check_data_destination, progress_bar, read_data, save, show, warn_beyond
 from forcegp.cli.options import AsJson, DataFile, ModelFile
+from forcegp.errors import ModelError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from forcegp.constraints import ConstrainedSystem
-    from forcegp.data import Dataset
     from forcegp.evaluation.predicted import Moments
     from forcegp.models.base import Predictor
 
@@ -76,17 +76,14 @@ def predict(
 
     forcegp predict -m model -d test.parquet -q external_wrench --frame tool -o wrench.parquet
     """
-    from forcegp.destination import write_or_keep
-    from forcegp.errors import ModelError
     from forcegp.evaluation.predicted import in_chunks
-    from forcegp.models.load import load_model
 
     check_data_destination(out, data)
-    regression = load_model(model)
+    regression = forcegp.load_model(model)
     test = read_data(data, regression.specified.robot)
     if quantity == WRENCH:
         test, result = _with_wrench(regression, test, frame, reference, momentum)
-        write_or_keep(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
+        save(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
         show({"quantity": quantity, "samples": len(test), **result, "file": str(out)}, as_json)
         return
     if sensor and quantity != "multiplier":
@@ -99,16 +96,15 @@ def predict(
     test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", mean)
     if std is not None:
         test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}_std", std)
-    write_or_keep(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
+    save(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
     result = {"quantity": quantity, "samples": len(test), "uncertainty": std is not None}
     show({**result, "file": str(out)}, as_json)
 
 
 def _predicted(
-    model: Predictor, doubts: dict[str, None], part: Dataset, quantity: str, noise: bool, sensor: bool
+    model: Predictor, doubts: dict[str, None], part: forcegp.Dataset, quantity: str, noise: bool, sensor: bool
 ) -> Moments:
     """Mean and standard deviation of a quantity at some states; `doubts` gets what is not determined."""
-    from forcegp.errors import ModelError
     from forcegp.models.sensed import force_from_sensor
     from forcegp.models.structured_fit import StructuredFit
 
@@ -127,11 +123,10 @@ def _predicted(
 
 
 def _with_wrench(
-    model: Predictor, test: Dataset, frame: str | None, reference: str, momentum: bool
-) -> tuple[Dataset, dict[str, object]]:
+    model: Predictor, test: forcegp.Dataset, frame: str | None, reference: str, momentum: bool
+) -> tuple[forcegp.Dataset, dict[str, object]]:
     """The data set with the external wrench on a frame and whether a contact is detected, as if the frame
     were a contact; the share of the samples with a contact."""
-    from forcegp.errors import ModelError
     from forcegp.models.structured_fit import StructuredFit
 
     if not isinstance(model, StructuredFit):
@@ -152,17 +147,15 @@ def _with_wrench(
 
 
 def _with_columns(
-    data: Dataset, system: ConstrainedSystem, quantity: str, name: str, values: Tensor
-) -> Dataset:
+    data: forcegp.Dataset, system: forcegp.ConstrainedSystem, quantity: str, name: str, values: Tensor
+) -> forcegp.Dataset:
     """The data set with a predicted quantity among its logged ones."""
-    from forcegp.constraints import SurfaceContact
-
     if quantity not in PER_CONTACT:
         return data.replace(extras={**data.extras, name: values})
     if quantity == "multiplier":
         sizes = {contact.name: contact.rows for contact in system.contacts}
     else:
-        sizes = {contact.name: 3 for contact in system.contacts if isinstance(contact, SurfaceContact)}
+        sizes = {c.name: 3 for c in system.contacts if isinstance(c, forcegp.SurfaceContact)}
     parts = zip(sizes, values.split(list(sizes.values()), dim=-1), strict=True)
     named = {contact: part[:, 0] if part.shape[-1] == 1 else part for contact, part in parts}
     return data.replace(contact_extras={**data.contact_extras, name: named})

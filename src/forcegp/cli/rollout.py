@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from forcegp.cli.common import check_data_destination, progress_bar, read_data, show, trajectory_from
+import forcegp
+from forcegp.cli.common import check_data_destination, progress_bar, read_data, save, show, trajectory_from
 from forcegp.cli.options import AsJson, DataFile, ModelFile, SceneName, SimulatedTime
+from forcegp.errors import DataError
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from forcegp.data import Dataset
-    from forcegp.rollout import Rollout
 
 
 def rollout(
@@ -50,21 +49,19 @@ def rollout(
 
     forcegp rollout -m model -d run.parquet --start 2400 --samples 50 -o rollout/
     """
-    from forcegp.destination import check_destination, write_or_keep
+    from forcegp.destination import check_destination
     from forcegp.files import written_folder
-    from forcegp.models.load import load_model
-    from forcegp.report.rollout_data import rollout_data
-    from forcegp.report.rollouts import write_rollouts
-    from forcegp.rollout import RolloutOptions, beside_log
+    from forcegp.report.rollouts import rollout_data, write_rollouts
+    from forcegp.rollout import beside_log
     from forcegp.rollout.forward import replayed
     from forcegp.rollout.inputs import sampling_period
 
     check_destination(out, folder=True, own_files=["rollout*", "*.svg", "*.png"])
-    regression = load_model(model)
+    regression = forcegp.load_model(model)
     log = _stretch(read_data(data, regression.specified.robot), start, duration)
     _say_contact(log, unilateral)
     dt = sampling_period(log)
-    options = RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
+    options = forcegp.RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
     with progress_bar("rolling out", len(log) - 1) as progress:
         path = replayed(regression, log, samples, seed=seed, options=options, progress=progress)
     rolled = _as_data(path, log, dt)
@@ -76,12 +73,12 @@ def rollout(
             rolled.with_step(step).write(temporary / "rollout.parquet")
             write_rollouts(temporary, f"{regression.kind} rolled out on {data}", compared)
 
-    write_or_keep(write, out)
+    save(write, out)
     written = {"page": str(out / "rollout.html"), "file": str(out / "rollout.parquet")}
     show({**_figures(path, rolled, dt), **written}, as_json)
 
 
-def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:
+def _figures(path: forcegp.Rollout, rolled: forcegp.Dataset, dt: float) -> dict[str, object]:
     """What the command reports, up to where the prediction diverged."""
     error = (rolled.q - rolled.q_logged).abs()
     figures: dict[str, object] = {
@@ -99,7 +96,7 @@ def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:
     return figures
 
 
-def _say_contact(log: Dataset, unilateral: bool) -> None:
+def _say_contact(log: forcegp.Dataset, unilateral: bool) -> None:
     """Warn where the log opens or closes a contact that the rollout holds as it is at the start."""
     for name, closed in log.contact.items():
         changed = (closed != closed[0]).nonzero()
@@ -113,10 +110,9 @@ def _say_contact(log: Dataset, unilateral: bool) -> None:
             )
 
 
-def _stretch(data: Dataset, start: int, duration: float | None) -> Dataset:
+def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> forcegp.Dataset:
     """The rows from `start` on, to the end of their trajectory or of the duration."""
     from forcegp.data.derivative import UNIFORM_TOLERANCE
-    from forcegp.errors import DataError
 
     stretch = trajectory_from(data, start, "rollout")
     if duration is not None:
@@ -141,7 +137,7 @@ def _spread(q: Tensor) -> Tensor:
     return torch.from_numpy(np.nanstd(sound.numpy(), axis=0, ddof=1))
 
 
-def _as_data(path: Rollout, log: Dataset, dt: float) -> Dataset:
+def _as_data(path: forcegp.Rollout, log: forcegp.Dataset, dt: float) -> forcegp.Dataset:
     """The rolled-out motion as a data set beside the log that it started from, up to where it diverged."""
     length = len(path.t) if not path.diverged else round(path.diverged[0].t / dt) + 1
     extras = {"q_logged": log.q, "qd_logged": log.qd}
@@ -179,16 +175,14 @@ def simulate(
 
     forcegp simulate --scene ur5_wiping --engine mujoco --contact solver --out run.parquet
     """
-    from forcegp.destination import write_or_keep
-    from forcegp.scene import load_scene
     from forcegp.simulate import simulate as run
 
     check_data_destination(out)
-    read = load_scene(scene)
+    read = forcegp.load_scene(scene)
     changes = {"duration": duration, "seed": seed, "engine": engine, "contact": contact}
     config = replace(read.simulation, **{name: v for name, v in changes.items() if v is not None})
     system = read.system()
     with progress_bar("simulating", config.steps) as progress:
         result = run(system, config, progress=lambda done, _: progress(done))
-    write_or_keep(result.data.write, out)
+    save(result.data.write, out)
     show({**result.summary(), "file": str(out)}, as_json)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import forcegp
 from forcegp.cli.common import printable, progress_bar, read_data, show, trajectory_from
 from forcegp.cli.options import AsJson
+from forcegp.errors import ParameterError
 
 if TYPE_CHECKING:
-    from forcegp.constraints import ConstrainedSystem
-    from forcegp.data import Dataset
     from forcegp.models.base import FittedModel
     from forcegp.view.shapes import Shape
 
@@ -59,7 +59,6 @@ def view(
     forcegp view my_scene.toml --rollout rollout/rollout.parquet
     """
     from forcegp.destination import check_destination
-    from forcegp.errors import ParameterError
     from forcegp.view.motion import at_rest, of_log, sampled_rollout, with_rollout
     from forcegp.view.page import serve, view_page, write_view
 
@@ -87,24 +86,21 @@ def view(
     show({"pictures": len(motion.t), "paths": len(motion.paths), "page": str(out)}, as_json)
 
 
-def _target(target: str) -> tuple[ConstrainedSystem, FittedModel | None, list[Shape]]:
+def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None, list[Shape]]:
     """The system, the model if the target is one, and what the robot looks like."""
-    from forcegp.models.load import load_model
     from forcegp.robot.load import BUNDLED
     from forcegp.storage.model_file import model_path
     from forcegp.view.shapes import shapes_of
 
     if not target.endswith(".toml") and model_path(target).is_file():
-        model = load_model(target)
+        model = forcegp.load_model(target)
         return model.system, model, shapes_of(model.system.robot)
-    from forcegp.scene import load_scene
-
-    scene = load_scene(target)
+    scene = forcegp.load_scene(target)
     system, named = scene.system(), scene.sections.robot.model
     return system, None, shapes_of(system.robot, named if named in BUNDLED else scene.folder / named)
 
 
-def _stretch(log: Path, system: ConstrainedSystem, start: int, seconds: float) -> Dataset:
+def _stretch(log: Path, system: forcegp.ConstrainedSystem, start: int, seconds: float) -> forcegp.Dataset:
     """The rows of one trajectory from `start` on, up to its first gap, and as long as asked for."""
     stretch = trajectory_from(read_data(log, system.robot), start, "view")
     steps = stretch.t.diff()

@@ -69,9 +69,10 @@ class Constraint(ABC):
 class SurfaceContact(Constraint):
     """A point or a ball of the robot that slides on a surface, c(q) = c_surface(p(q)) − r.
 
-    A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force where |∇c| = 1. A rounded
-    tip is a ball of radius r around p. It touches in p − r n, whose material velocity is ṗ + ω × (−r n), so
-    J_E = J_p + r [n]ₓ J_ω: friction at a rounded tip has the lever arm −r n, the normal force has none.
+    A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force where |∇c| = 1. A
+    rounded tip is a ball of radius r around p. It touches in p − r n, whose material velocity is ṗ + ω × (−r
+    n), so J_E = J_p + r [n]ₓ J_ω: friction at a rounded tip has the lever arm −r n, the normal force has
+    none.
 
     A contact that may stick has two more rows, (t_1, t_2)ᵀ J_E q̇ = 0 with the tangent frame of the surface,
     which hold while the touching point moves along it by less than `stick_speed`. Their multipliers are

@@ -142,8 +142,8 @@ def project_state(
     """The state on the constraint manifold next to (q, q̇) `(*batch, nq)`, in the metric of M.
 
     Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces push;
-    q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy. For the contacts that are
-    `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0.
+    q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy. For the contacts that
+    are `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0.
 
     Raises:
         NumericalError: the iteration does not converge, as where the surface is out of reach.

@@ -1,38 +1,18 @@
 """Logged motion: the data set and its files, derivatives, noise, selection and splits."""
 
-from forcegp.data.checks import RobotMismatchWarning
-from forcegp.data.dataset import Dataset, NotLoggedError
-from forcegp.data.derivative import SavitzkyGolay
-from forcegp.data.fields import DataHeader
-from forcegp.data.selection import (
-    Split,
-    complement,
-    farthest_points,
-    select_points,
-    split_by_selection,
-    split_by_stretches,
-    standardized,
-    standardized_inputs,
-    with_noise,
-    without_marked_impacts,
-)
-from forcegp.data.stream import StreamedDataset
-
-__all__ = [
-    "DataHeader",
-    "Dataset",
-    "NotLoggedError",
-    "RobotMismatchWarning",
-    "SavitzkyGolay",
-    "Split",
-    "StreamedDataset",
-    "complement",
-    "farthest_points",
-    "select_points",
-    "split_by_selection",
-    "split_by_stretches",
-    "standardized",
-    "standardized_inputs",
-    "with_noise",
-    "without_marked_impacts",
-]
+from forcegp.data.checks import RobotMismatchWarning as RobotMismatchWarning
+from forcegp.data.dataset import Dataset as Dataset
+from forcegp.data.dataset import NotLoggedError as NotLoggedError
+from forcegp.data.derivative import SavitzkyGolay as SavitzkyGolay
+from forcegp.data.fields import DataHeader as DataHeader
+from forcegp.data.selection import Split as Split
+from forcegp.data.selection import complement as complement
+from forcegp.data.selection import farthest_points as farthest_points
+from forcegp.data.selection import select_points as select_points
+from forcegp.data.selection import split_by_selection as split_by_selection
+from forcegp.data.selection import split_by_stretches as split_by_stretches
+from forcegp.data.selection import standardized as standardized
+from forcegp.data.selection import standardized_inputs as standardized_inputs
+from forcegp.data.selection import with_noise as with_noise
+from forcegp.data.selection import without_marked_impacts as without_marked_impacts
+from forcegp.data.stream import StreamedDataset as StreamedDataset

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields, component_names, mapped, named_columns
+from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields, component_names, named_columns
 from forcegp.errors import DataError, near_names
 from forcegp.limits import LOGGED_VALUE
 from forcegp.robot.model import RobotModel
@@ -104,10 +103,7 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 
 
 def check_values(data: Fields) -> None:
-    """Check that every number is finite, and that time increases within each segment.
-
-    Predictions of what is not determined are NaN.
-    """
+    """Check that numbers, but for predictions of what is not determined, are finite, and time increases."""
     for name, value in (("t", data.t), *named_columns(data).items()):
         wrong = ~(value.abs() <= LOGGED_VALUE)
         if name.startswith("predicted_"):
@@ -126,11 +122,7 @@ def check_values(data: Fields) -> None:
 
 
 def check_time(data: Fields) -> None:
-    """Check that rows of a segment are together, and that time increases strictly within each.
-
-    Raises:
-        DataError: they are not; the message names the row.
-    """
+    """Check that a segment's rows are together, with strictly increasing time; `DataError` names the row."""
     t, segment = data.t, data.segment
     same = segment[1:] == segment[:-1]
     back = same & (t[1:] <= t[:-1])
@@ -153,11 +145,7 @@ def check_time(data: Fields) -> None:
 
 
 def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
-    """Row numbers `(k,)` of a slice, mask or list of indices, negative ones counted from the end.
-
-    Raises:
-        DataError: a mask of another length, or an index that does not exist.
-    """
+    """Row numbers `(k,)` of a slice, mask or list, negative from the end; `DataError` if there is none."""
     if isinstance(rows, slice):
         return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
     rule = "rows are selected by a slice, a mask or a list of row numbers"
@@ -284,16 +272,3 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     agreed["filtered"] = any(header.filtered for header in headers)
     agreed["filter_span"] = max((h.filter_span for h in headers if h.filter_span is not None), default=None)
     return DataHeader(**agreed)
-
-
-def concatenated(parts: Sequence[Fields]) -> dict[str, Any]:
-    """Fields of data sets one after another, each with segments of its own; errors as of `check_alike`."""
-    check_alike(parts)
-    segments, start = [], 0
-    for part in parts:
-        _, numbers = torch.unique_consecutive(part.segment, return_inverse=True)
-        segments.append(numbers + start)
-        start += int(numbers.max()) + 1 if len(part) else 0
-    header = common_header([part.header for part in parts])
-    own = {"joint_names": parts[0].joint_names, "segment": torch.cat(segments), "header": header}
-    return mapped(parts, torch.cat) | own

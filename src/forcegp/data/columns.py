@@ -33,11 +33,7 @@ def unparse(data: Fields) -> tuple[Columns, DataHeader]:
 
 
 def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Arrays:
-    """Arrays of a data set from the columns of a file.
-
-    Raises:
-        DataError: a column is missing, incomplete or of the wrong kind; the hint has the nearest name.
-    """
+    """Arrays of a data set from a file's columns; a `DataError` has the name nearest to a missing one."""
     joints = header.joint_names or tuple(name[2:] for name in raw if name.startswith("q."))
     if not joints:
         raise DataError(f"{source}: no column 'q.<joint>'", expected="one per joint", got=_listing(raw))

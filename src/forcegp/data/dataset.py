@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from forcegp.data.checks import (
-    check_layout,
-    check_robot,
-    check_tensors,
-    check_values,
-    concatenated,
-    contact_table,
-    row_indices,
-)
+from forcegp.data import checks
 from forcegp.data.columns import as_tensors, parse, unparse
 from forcegp.data.derivative import SavitzkyGolay
-from forcegp.data.fields import JOINT_VECTORS, DataHeader, Fields, mapped
+from forcegp.data.fields import JOINT_VECTORS, Fields, mapped
 from forcegp.data.table import check_ending, read_table, write_parquet
 from forcegp.errors import DataError, check_name
 from forcegp.notebook import html_table
@@ -32,19 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from forcegp.plots import Target
-
-
-def summary(data: Fields) -> str:
-    """What a data set logs, without the numbers: samples, joints, duration, contacts, further quantities."""
-    robot = f" of {data.header.robot!r}" if data.header.robot else ""
-    parts = [f"{len(data)} samples of {len(data.joint_names)} joints"]
-    if len(data):
-        closed = [f"{name} ({float(x.double().mean()):.0%} closed)" for name, x in data.contact.items()]
-        parts += [_time(data)] + ([f"contact {', '.join(closed)}"] if closed else [])
-    also = [*data.extras, *data.contact_extras]
-    parts += [f"also logged: {', '.join(also)}"] if also else []
-    kind = str(data.q.dtype).removeprefix("torch.")
-    return f"<Dataset{robot}: {'; '.join(parts)}; {kind} on {data.q.device}>"
 
 
 def _time(data: Fields) -> str:
@@ -57,23 +36,12 @@ def _time(data: Fields) -> str:
     return f"{float((data.t[last] - data.t[last - rows + 1]).sum()):.4g} s in {segments}"
 
 
-def summary_table(data: Fields) -> tuple[str, tuple[str, ...], list[tuple[object, ...]], list[str]]:
-    """Title, head, rows and notes of a table with the range of each joint's motion."""
-    names = {"q": "rad, m", "qd": "rad/s, m/s", "tau": "N m, N", "qdd": "rad/s², m/s²"}
-    head = ("joint", *(f"{name} [{unit}]" for name, unit in names.items()))
-    rows: list[tuple[object, ...]] = []
-    for j, joint in enumerate(data.joint_names if len(data) else ()):
-        columns = (getattr(data, name)[:, j] for name in names)
-        rows.append((joint, *(f"{float(x.min()):.3g} … {float(x.max()):.3g}" for x in columns)))
-    return summary(data).strip("<>"), head, rows, list(data.header.provenance)
-
-
 class NotLoggedError(DataError, AttributeError):
     """A quantity that the data set does not hold."""
 
 
 @dataclass(frozen=True, eq=False)
-class Dataset:
+class Dataset(Fields):
     """Logged motion of a robot with `nq` joints, `n` samples; SI units, radians.
 
     Args:
@@ -103,34 +71,26 @@ class Dataset:
         DataError: a shape, type, value or time does not fit; the message names column and row.
     """
 
-    t: Tensor
-    q: Tensor
-    qd: Tensor
-    tau: Tensor
-    qdd: Tensor
-    joint_names: tuple[str, ...]
-    contact: Mapping[str, Tensor] = field(default_factory=dict)
-    extras: Mapping[str, Tensor] = field(default_factory=dict)
-    contact_extras: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
-    segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
-    header: DataHeader = field(default_factory=DataHeader)
-
     def __post_init__(self) -> None:
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
-        check_tensors(self)
+        checks.check_tensors(self)
         if self.segment is None:
             zero = torch.zeros(self.t.shape, dtype=torch.int64, device=self.t.device)
             object.__setattr__(self, "segment", zero)
-        check_layout(self)
-        check_values(self)
-
-    def __len__(self) -> int:
-        """Number of samples."""
-        return self.t.shape[0]
+        checks.check_layout(self)
+        checks.check_values(self)
 
     def __repr__(self) -> str:
-        """One line that says what is logged, without the numbers."""
-        return summary(self)
+        """What is logged, without the numbers: samples, joints, duration, contacts, further quantities."""
+        robot = f" of {self.header.robot!r}" if self.header.robot else ""
+        parts = [f"{len(self)} samples of {self.nq} joints"]
+        if len(self):
+            closed = [f"{name} ({float(x.double().mean()):.0%} closed)" for name, x in self.contact.items()]
+            parts += [_time(self)] + ([f"contact {', '.join(closed)}"] if closed else [])
+        also = [*self.extras, *self.contact_extras]
+        parts += [f"also logged: {', '.join(also)}"] if also else []
+        kind = str(self.dtype).removeprefix("torch.")
+        return f"<Dataset{robot}: {'; '.join(parts)}; {kind} on {self.device}>"
 
     def __getattr__(self, name: str) -> Any:
         extras, contact_extras = self.__dict__.get("extras", {}), self.__dict__.get("contact_extras", {})
@@ -153,7 +113,7 @@ class Dataset:
         Raises:
             DataError: a mask of another length, or an index that does not exist.
         """
-        index = row_indices(rows, len(self), self.t.device)
+        index = checks.row_indices(rows, len(self), self.t.device)
         ordered = self.header.ordered and bool((index[1:] > index[:-1]).all())
         header = self.header.model_copy(update={"ordered": ordered})
         return self._map(lambda value: value[index], header=header)
@@ -184,7 +144,7 @@ class Dataset:
         Raises:
             DataError: the data do not say whether a contact is closed.
         """
-        return contact_table(self, contacts)
+        return checks.contact_table(self, contacts)
 
     def replace(self, **fields: object) -> Dataset:
         """A data set with some fields changed."""
@@ -221,7 +181,7 @@ class Dataset:
         Raises:
             DataError: joints are missing, unknown or in another order; the hint says what to call.
         """
-        check_robot(self, robot)
+        checks.check_robot(self, robot)
 
     def plot(
         self, quantity: str | None = None, *, joints: Sequence[str] | None = None, ax: Target = None
@@ -242,8 +202,14 @@ class Dataset:
         return plot(self, quantity, joints, ax)
 
     def _repr_html_(self) -> str:
-        """A table for notebooks."""
-        return html_table(*summary_table(self))
+        """A table for notebooks, with the range of each joint's motion."""
+        names = {"q": "rad, m", "qd": "rad/s, m/s", "tau": "N m, N", "qdd": "rad/s², m/s²"}
+        head = ("joint", *(f"{name} [{unit}]" for name, unit in names.items()))
+        rows: list[tuple[object, ...]] = []
+        for j, joint in enumerate(self.joint_names if len(self) else ()):
+            columns = (getattr(self, name)[:, j] for name in names)
+            rows.append((joint, *(f"{float(x.min()):.3g} … {float(x.max()):.3g}" for x in columns)))
+        return html_table(repr(self).strip("<>"), head, rows, self.header.provenance)
 
     def _map(self, change: Callable[[Tensor], Tensor], **fields: object) -> Dataset:
         """The data set with every column changed alike."""
@@ -256,7 +222,15 @@ class Dataset:
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
         """
-        return Dataset(**concatenated(parts))
+        checks.check_alike(parts)
+        segments, start = [], 0
+        for part in parts:
+            _, numbers = torch.unique_consecutive(part.segment, return_inverse=True)
+            segments.append(numbers + start)
+            start += int(numbers.max()) + 1 if len(part) else 0
+        header = checks.common_header([part.header for part in parts])
+        own = {"joint_names": parts[0].joint_names, "segment": torch.cat(segments), "header": header}
+        return Dataset(**mapped(parts, torch.cat) | own)
 
     @classmethod
     def read(

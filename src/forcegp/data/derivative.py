@@ -94,21 +94,12 @@ def differentiate(
     method: SavitzkyGolay,
     degree: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The `degree`-th time derivative of x, and the standard deviation of its noise.
+    """The `degree`-th time derivative of x, and the standard deviation of its noise, `(n, d)` each.
 
     The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x becomes σ |w|. The median
     absolute residual of the fit gives σ of each column: residuals scatter by σ √(1 − h), with h the weight of
-    a sample in its own fit. The outermost fits give the ends of each segment, with larger noise.
-
-    Args:
-        t: `(n,)` time [s], evenly spaced within each segment.
-        x: `(n, d)` logged values.
-        segment: `(n,)` trajectory of each row; no window reaches across two.
-        method: the filter.
-        degree: 1 or 2.
-
-    Returns:
-        Derivative and standard deviation, `(n, d)` each.
+    a sample in its own fit. The outermost fits give the ends of each segment, with larger noise. Time t
+    `(n,)` [s] is evenly spaced within each segment, and no window reaches across two.
 
     Raises:
         DataError: a segment is shorter than the window, or its time steps are uneven.

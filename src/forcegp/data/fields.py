@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
@@ -60,27 +61,25 @@ AXES = ("x", "y", "z")
 """Components of a Cartesian vector logged of a contact."""
 
 
-@runtime_checkable
-class Fields(Protocol):
+@dataclass(frozen=True, eq=False)
+class Fields:
     """What a data set holds; `Dataset` documents each field."""
 
-    @property
-    def t(self) -> Tensor: ...
-    @property
-    def q(self) -> Tensor: ...
-    @property
-    def joint_names(self) -> tuple[str, ...]: ...
-    @property
-    def contact(self) -> Mapping[str, Tensor]: ...
-    @property
-    def extras(self) -> Mapping[str, Tensor]: ...
-    @property
-    def contact_extras(self) -> Mapping[str, Mapping[str, Tensor]]: ...
-    @property
-    def segment(self) -> Tensor: ...
-    @property
-    def header(self) -> DataHeader: ...
-    def __len__(self) -> int: ...
+    t: Tensor
+    q: Tensor
+    qd: Tensor
+    tau: Tensor
+    qdd: Tensor
+    joint_names: tuple[str, ...]
+    contact: Mapping[str, Tensor] = field(default_factory=dict)
+    extras: Mapping[str, Tensor] = field(default_factory=dict)
+    contact_extras: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
+    segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in by the data set
+    header: DataHeader = field(default_factory=DataHeader)
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return self.t.shape[0]
 
 
 def component_names(name: str, value: Tensor, joint_names: Sequence[str]) -> list[str]:

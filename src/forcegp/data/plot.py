@@ -31,7 +31,9 @@ def plot(
     elif quantity in data.contact_extras:
         panels = _by_contact(data, quantity)
     elif quantity in (*JOINT_VECTORS, *data.extras):
-        panels = _by_joint(data, quantity, wanted)
+        values, label = getattr(data, quantity), _named(quantity)
+        curves = ((j, Curve(values[:, j], "logged", MEASURED, width=0.8)) for j in wanted)
+        panels = [Panel(data.joint_names[j], label, [curve]) for j, curve in curves]
     else:
         names = (*JOINT_VECTORS, *data.extras, *data.contact_extras)
         raise UnknownNameError("quantity of the data set", quantity, names)
@@ -50,12 +52,6 @@ def _overview(data: Fields, joints: list[int]) -> list[Panel]:
         curves = [Curve(x, name, CYCLE[i % len(CYCLE)]) for i, (name, x) in enumerate(multipliers.items())]
         panels.append(Panel("", _named("multiplier"), curves))
     return panels
-
-
-def _by_joint(data: Fields, quantity: str, joints: list[int]) -> list[Panel]:
-    values, label = getattr(data, quantity), _named(quantity)
-    curves = ((j, Curve(values[:, j], "logged", MEASURED, width=0.8)) for j in joints)
-    return [Panel(data.joint_names[j], label, [curve]) for j, curve in curves]
 
 
 def _by_contact(data: Fields, quantity: str) -> list[Panel]:

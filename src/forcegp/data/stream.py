@@ -26,7 +26,6 @@ from forcegp.errors import DataError
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
 
 @dataclass(frozen=True)
@@ -54,17 +53,16 @@ def shape_of(path: Path) -> tuple[int, DataHeader]:
 
 
 def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece]:
-    """The pieces of a file, of `size` rows each but for the last; `number` is that of its first trajectory.
-
-    A piece is read with `window` rows before and after it, within its trajectories.
-
-    Raises:
-        DataError: the file is damaged, a value is missing, or rows of a trajectory are not together.
+    """The pieces of a file, `size` rows each, with `window` rows around them within their trajectories, which
+    are numbered from `number`; `DataError` if it is damaged, or rows of a trajectory are not together.
     """
+    import pyarrow as pa
+
     file, first, seen = existing(path), 0, _Trajectories(str(path), number)
     with opened_parquet(file) as (parquet, usable, header):
         before: Columns = {}
-        tables = _tables(parquet, usable, size)
+        batches = parquet.iter_batches(size, columns=usable, use_threads=False)
+        tables = (pa.Table.from_batches([batch]).select(usable) for batch in batches if len(batch))
         following = next(tables, None)
         while following is not None:
             columns, following = _columns(file, following), next(tables, None)
@@ -77,20 +75,6 @@ def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece
             yield Piece(whole, header, first, context, rows, int(columns["segment"][-1]))
             before = {name: x[max(0, rows - window) :] for name, x in columns.items()} if window else {}
             first += rows
-
-
-def _tables(parquet: pq.ParquetFile, usable: list[str], size: int) -> Iterator[pa.Table]:
-    """Tables of `size` rows each, but for the last, whatever the row groups of the file."""
-    import pyarrow as pa
-
-    held = parquet.schema_arrow.empty_table().select(usable)
-    for batch in parquet.iter_batches(batch_size=size, columns=usable, use_threads=False):
-        held = pa.concat_tables([held, pa.Table.from_batches([batch]).select(usable)])
-        while held.num_rows >= size:
-            yield held.slice(0, size)
-            held = held.slice(size)
-    if held.num_rows:
-        yield held
 
 
 def _columns(file: Path, table: pa.Table) -> Columns:
@@ -276,15 +260,8 @@ class StreamedDataset:
 
 
 def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = None) -> tuple[Dataset, int]:
-    """Evenly spaced rows of a log of unknown length, in one pass, and the number of all rows that count.
-
-    Args:
-        pieces: the log.
-        count: how many rows to keep at least, if there are so many; fewer than twice as many are kept.
-        keep: which rows of a piece count; all by default.
-
-    Raises:
-        DataError: there are no pieces.
+    """Evenly spaced rows of a log of unknown length, `count` to twice as many if there are so many, in one
+    pass, and the number of all rows that count by `keep`; `DataError` without any piece.
     """
     kept: list[tuple[Tensor, Dataset]] = []
     step, total = 1, 0

@@ -45,11 +45,7 @@ def check_ending(path: str | Path) -> None:
 
 
 def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> None:
-    """Write columns and header to a Parquet file, whole or not at all.
-
-    Raises:
-        OSError: the place cannot be written.
-    """
+    """Write columns and header to a Parquet file, whole or not at all; `OSError` where that fails."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -68,12 +64,8 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
 def read_table(
     path: str | Path, *, missing: Literal["refuse", "nan"] = "refuse"
 ) -> tuple[Columns, DataHeader]:
-    """Read the numeric columns of a Parquet or CSV file, and its header (defaults where it has none).
-
-    An empty value is an error, or a NaN where `missing` is `"nan"`.
-
-    Raises:
-        DataError: no such file, a kind of file that is not read, or one that is damaged or too large.
+    """Numeric columns of a Parquet or CSV file, and its header (defaults where it has none); an empty value
+    is an error, or NaN where `missing` is `"nan"`. A `DataError` says why a file cannot be read.
     """
     file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}
@@ -99,18 +91,24 @@ def existing(path: str | Path) -> Path:
 
 
 def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
+    """The columns, whose size in memory is checked before: a small file can claim to hold more than fits."""
     with opened_parquet(file) as (parquet, usable, header):
-        _check_size(file, parquet.metadata.num_rows, len(usable))
+        rows, columns = parquet.metadata.num_rows, len(usable)
+        allowed = min(allowed_bytes(file.stat().st_size), limits.TABLE_BYTES)
+        if 8 * rows * columns > allowed:
+            raise DataError(
+                f"{file}: the file claims to be larger than what is read at once",
+                expected=f"at most {allowed // 8:,} numbers in a file of this size",
+                got=f"{rows:,} rows × {columns} columns",
+                hint="split the log into several files",
+            )
+        announce_memory(COPIES * 8 * rows * columns, f"reading {file}")
         return parquet.read(columns=usable, use_threads=False), header
 
 
 @contextmanager
 def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], DataHeader]]:
-    """A Parquet file, its numeric columns and its header; errors of the format become a `DataError`.
-
-    Raises:
-        DataError: the file is damaged, or is not a log.
-    """
+    """A Parquet file, its numeric columns and its header; `DataError` if it is damaged or not a log."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -119,7 +117,8 @@ def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], Data
         with pq.ParquetFile(file.absolute()) as parquet:  # Arrow expands a leading ~
             shape = parquet.metadata
             _check_count(file, shape.num_columns)
-            header = _header(file, parquet.schema_arrow.metadata or {})
+            text = (parquet.schema_arrow.metadata or {}).get(HEADER_KEY)
+            header = DataHeader() if text is None else DataHeader.from_json(text, str(file), DataError)
             usable = _usable(file, parquet.schema_arrow)
             _check_flat(file, usable, [parquet.schema.column(i).path for i in range(shape.num_columns)])
             yield parquet, usable, header
@@ -141,25 +140,6 @@ def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
         outer = next((prefix for prefix in prefixes if prefix in names), None)
         if outer is not None:
             raise DataError(f"{file}: {path!r} lies inside column {outer!r}", hint="rename one of them")
-
-
-def _check_size(file: Path, rows: int, columns: int) -> None:
-    """Check the size in memory before anything is unpacked: a small file can claim to hold more than fits."""
-    size = rows * columns * 8
-    allowed = min(allowed_bytes(file.stat().st_size), limits.TABLE_BYTES)
-    if size > allowed:
-        raise DataError(
-            f"{file}: the file claims to be larger than what is read at once",
-            expected=f"at most {allowed // 8:,} numbers in a file of this size",
-            got=f"{rows:,} rows × {columns} columns",
-            hint="split the log into several files",
-        )
-    announce_memory(COPIES * size, f"reading {file}")
-
-
-def _header(file: Path, metadata: dict[bytes, bytes]) -> DataHeader:
-    text = metadata.get(HEADER_KEY)
-    return DataHeader() if text is None else DataHeader.from_json(text, str(file), DataError)
 
 
 def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:

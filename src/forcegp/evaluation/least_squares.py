@@ -38,10 +38,7 @@ POINT = 1e-4
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """An identified rigid robot, and its friction beyond the robot file's.
-
-    `friction` `(3 nq,)` holds viscous friction, Coulomb friction and offset of every joint.
-    """
+    """An identified robot; `friction` `(3 nq,)`: viscous, Coulomb and offsets beyond the file, by joint."""
 
     system: ConstrainedSystem
     friction: Tensor
@@ -65,10 +62,7 @@ def data_chunks(data: Dataset) -> Iterator[Dataset]:
 
 
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
-    """Identify inertial parameters, friction and offsets from measured torques and accelerations.
-
-    What the motion does not excite stays as in the robot file.
-    """
+    """Identify inertial parameters, friction, offsets; what is not excited stays as in the robot file."""
     rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
     train, robot = train[rows.unique()], system.robot
     prior = _prior_std(robot, train)

@@ -126,10 +126,7 @@ class MultiplierScore:
 
 @torch.no_grad()
 def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Compare λ with what a simulator or a sensor logged (`logged_forces`), each normal force.
-
-    There is one score per contact with a logged force and at least two samples in contact.
-    """
+    """Compare λ with what a simulator or a sensor logged, by contact with two samples in contact or more."""
     if not logged_forces(model, data):
         return ()
     return _scores(model, data, *in_chunks(lambda part: predicted_forces(model, part), data))

@@ -1,12 +1,12 @@
 """Dry friction with memory, in what a fit leaves of its training torques.
 
 Friction that is a function of the velocity jumps where a joint reverses. Real friction develops over a
-distance δ: in Dahl's model it is proportional to z, dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction damping
-of mechanical vibrations*). Force priors depend on the state alone, so around each reversal they are wrong by
-up to the whole friction, and what else they learn is less certain. In a log in order of time z follows from
-the velocities. A ridge regression, of the torque that a fit leaves, on z for some δ, on functions of the
-velocity, and on the weight of the links corrects that. A joint is corrected only if that explains stretches
-of the training log that the regression has not seen.
+distance δ: in Dahl's model it is proportional to z, dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction
+damping of mechanical vibrations*). Force priors depend on the state alone, so around each reversal they are
+wrong by up to the whole friction, and what else they learn is less certain. In a log in order of time z
+follows from the velocities. A ridge regression, of the torque that a fit leaves, on z for some δ, on
+functions of the velocity, and on the weight of the links corrects that. A joint is corrected only if that
+explains stretches of the training log that the regression has not seen.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Measured quantities at states: from the columns of a log to all that a posterior is conditioned on.
 
 In contact A q̈ = b. Where a measurement departs from it by far more than the usual noise (an impact, a wrong
-flag), the multiplier is not that of a contact that persists, and the other directions of q̈ are wrong with it.
+flag), the multiplier is not that of a contact that persists, and the other directions of q̈ are wrong with
+it.
 """
 
 from __future__ import annotations

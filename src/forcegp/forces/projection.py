@@ -232,7 +232,8 @@ def _log_scale(std: Tensor, weight: Tensor | None) -> Tensor:
 
 
 def _fixed(A: Tensor, rank: int, violated: Tensor, weight: Tensor) -> Tensor:
-    """Negative log likelihood of the directions that the constraint fixes `()`, where A q̈ − b is violated."""
+    """Negative log likelihood of the directions that the constraint fixes `()`, where A q̈ − b is
+    violated."""
     # ½ w |(A σ)⁺ (A q̈ − b)|² + ½ rank A log 2π
     rows, C = _independent(A, rank)
     pinv = torch.linalg.pinv(rows) if C is None else torch.linalg.pinv(rows) @ C

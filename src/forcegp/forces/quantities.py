@@ -133,11 +133,9 @@ def states_at(
 class AffineMap(NamedTuple):
     """z = B_Q Q + B_z Q_z + o at each state.
 
-    Attributes:
-        B_Q: `(n, d, nq)` operator on the joint force Q.
-        B_z: `(n, d, nq)` operator on the contact's dissipative force Q_z.
-        B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ: B_Q, but `None` for q̈, since H Aᵀ = 0.
-        o: `(n, d)` offset.
+    Attributes: B_Q: `(n, d, nq)` operator on the joint force Q. B_z: `(n, d, nq)` operator on the contact's
+    dissipative force Q_z. B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ: B_Q, but `None` for
+    q̈, since H Aᵀ = 0. o: `(n, d)` offset.
     """
 
     B_Q: Tensor

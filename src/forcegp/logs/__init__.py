@@ -20,8 +20,8 @@ from forcegp.logs.clock import even_clock, usual_step
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
-from forcegp.logs.signals import Array, ImportFinding, ImportReport, Signals
 from forcegp.logs.smoothing import add_derivatives, impact_mask
+from forcegp.logs.table import Array, ImportFinding, ImportReport, Signals
 from forcegp.resources import announce_memory
 from forcegp.robot import RobotModel
 from forcegp.scene import Scene, load_scene
@@ -98,10 +98,7 @@ def import_log(
     progress: Callable[[int, int], None] | None = None,
     displaced: bool = False,
 ) -> Imported:
-    """Read a log as `read_log` does, and say what was found and done; `progress` gets work done and total.
-
-    With `displaced`, a contact by distance whose tip slides beside the surface of the scene is closed there.
-    """
+    """Read a log as `read_log` does, with a report; `displaced` lets a tip slide beside its surface."""
     system = system_of(scene)
     robot = system.robot
     if mapping is None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from forcegp import limits
 from forcegp.errors import DataError
 from forcegp.guards import check_count
-from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.rows import describe, numbered
 
 RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
@@ -57,10 +57,8 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
 
 
 def split_trajectories(signals: Signals, gap: float | None, report: ImportReport) -> None:
-    """Number the trajectories: a new one begins where the clock restarts and after a gap.
-
-    A step longer than `gap` [s], by default `GAP_STEPS` usual ones, is a gap. `signals.segment` holds the
-    numbers that the log itself gives.
+    """Number the trajectories: a new one where the log numbers another one, where the clock restarts, and
+    after a step longer than `gap` [s], by default `GAP_STEPS` usual ones.
 
     Raises:
         DataError: time steps back without restarting; the message has the rows.
@@ -93,10 +91,7 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
 
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
-    """Find, and if asked drop, rows with the positions and torques of the row before, to the last bit.
-
-    A logger that is faster than its source writes them; they flatten derivatives. At rest the torque changes.
-    """
+    """Find, and if asked drop, rows that repeat positions and torques, of a logger faster than its source."""
     held = np.zeros(len(signals), dtype=bool)
     held[1:] = signals.segment[1:] == signals.segment[:-1]
     for name in ("q", "tau"):
@@ -113,11 +108,7 @@ def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
 def join_stream(
     signals: Signals, name: str, t: Array, values: Array, gap: float | None, report: ImportReport
 ) -> None:
-    """Add a vector of a stream with a clock of its own, interpolated at the times of the log.
-
-    Rows of the log that the stream, with stamps t `(k,)`, does not cover are dropped: before its first stamp,
-    after its last, and within its gaps.
-    """
+    """Add a vector of a stream with stamps t `(k,)`, interpolated; rows it does not cover are dropped."""
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
         raise DataError(
@@ -159,10 +150,7 @@ def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
 
 
 def even_clock(signals: Signals, period: float | None, report: ImportReport) -> None:
-    """Put every trajectory on an evenly spaced clock of its own start, if its own is uneven.
-
-    The step is `period` [s], by default the log's usual one.
-    """
+    """Put uneven trajectories on clocks of their own with the step `period` [s], by default the usual one."""
     stretches = [rows for rows in signals.runs() if rows.stop - rows.start > 1]
     if not stretches:
         raise DataError("the log has no trajectory of two rows or more")

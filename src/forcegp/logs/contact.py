@@ -25,7 +25,7 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
 from forcegp.logs.mapping import GROUND, ContactStateSection, Mapping
-from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.robot import RobotModel
 from forcegp.robust import level_of, robust_std
 from forcegp.rows import runs
@@ -51,10 +51,7 @@ def _tip(system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor) ->
 def _wrench(
     robot: RobotModel, mapping: Mapping, q: torch.Tensor, reading: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Force, moment about the sensor and its position, `(n, 3)` each, in the world, less the tool's weight.
-
-    The reading `(n, 6)` is in the sensor's axes or the world's [N], [N m].
-    """
+    """Force, moment about the sensor and its position `(n, 3)` in the world, less the tool [N, N m]."""
     section = mapping.sections.wrench
     assert section is not None
     if section.frame == GROUND:
@@ -75,10 +72,7 @@ def _wrench(
 
 
 def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
-    """The sensor's force and moment at each contact with a surface: `F_sensor` and `M_sensor`.
-
-    A load cell has the normal force alone, which is the `multiplier`.
-    """
+    """`F_sensor` and `M_sensor` at each contact with a surface, or of a load cell the `multiplier`."""
     touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
     section = mapping.sections.wrench
     if section is not None and len(section.force) == 1:
@@ -97,11 +91,7 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
 
 
 def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
-    """λ `(n,)` of the rigid-body model at one contact [N], zero in free motion where the model is right.
-
-    M q̈ − Q is the generalized force that the known forces do not explain, and
-    λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) the part of it along the surface's normal.
-    """
+    """λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` of the rigid body at one contact [N], about zero in free motion."""
     alone = ConstrainedSystem(system.robot, [contact])
 
     def value(q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
@@ -149,11 +139,9 @@ BINS = 512
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a contact's state was read from: `wrench`, `multiplier` or `distance`, in N or m.
-
-    Closed from `threshold` on, and then up to `release` on either side; median and deviation of the evidence
-    in each state, NaN where it does not occur; first and last time of each closed interval [s]; and how many
-    intervals were too short and got their neighbours' state.
+    """What a contact's state was read from [N, m]: closed from `threshold` on, and then up to `release` on
+    either side; median and deviation in each state, NaN where it does not occur; first and last time of each
+    closed interval [s]; and how many intervals were too short and got their neighbours' state.
     """
 
     contact: str
@@ -170,15 +158,10 @@ class Evidence:
     def sentence(self) -> str:
         """The evidence in one sentence."""
         unit, scale = ("mm", 1e3) if self.source == "distance" else ("N", 1.0)
-        states = (
-            (self.closed_level, self.closed_spread, "closed"),
-            (self.open_level, self.open_spread, "open"),
-        )
-        listing = "".join(
-            f", {scale * level:.3g} ± {scale * spread:.2g} {unit} {state}"
-            for level, spread, state in states
-            if np.isfinite(level)
-        )
+        listing = ""
+        for state in ("closed", "open"):
+            level, spread = (scale * getattr(self, f"{state}_{name}") for name in ("level", "spread"))
+            listing += f", {level:.3g} ± {spread:.2g} {unit} {state}" if np.isfinite(level) else ""
         return (
             f"contact {self.contact!r} by {self.source}: {len(self.intervals)} closed intervals{listing}, "
             f"threshold {scale * self.threshold:.3g} {unit}"
@@ -240,11 +223,7 @@ def _misplaced(
     displaced: bool,
     report: ImportReport,
 ) -> float:
-    """Distance from the scene's surface at which the tip slides [m], 0 where it touches.
-
-    Raises:
-        DataError: the tip never touches: the surface lies elsewhere, or two joints are exchanged.
-    """
+    """Distance from the scene's surface at which the tip slides [m], 0 where it touches; else `DataError`."""
     if len(c) < 2 or (np.abs(c) <= TOUCHING).mean() > TOUCHED:
         return 0.0
     p, name = _rowwise(signals, ("q",), lambda q: _tip(system, contact, q)), contact.name

@@ -18,8 +18,7 @@ from forcegp.logs import units
 from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
 from forcegp.logs.mapping import Mapping
 from forcegp.logs.readers import read
-from forcegp.logs.signals import Array, ImportReport, Signals
-from forcegp.logs.table import LogTable, Progress, Stream
+from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
 from forcegp.rows import describe, numbered
 
 SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
@@ -35,24 +34,19 @@ def gather(
     rows: int | None = None,
 ) -> Signals:
     """Read the mapped columns of a log onto one clock, at most `rows` rows where the format allows it."""
-    needed = _needed(mapping, joints)
+    sections = mapping.sections
+    needed = {sections.time.column, sections.time.segment or sections.time.column}
+    for name in SYMBOLS:
+        if mapping.quantity(name) is not None:
+            needed |= set(mapping.columns_of(name, joints))
+    if sections.wrench is not None:
+        needed |= {*sections.wrench.force, *(sections.wrench.torque or ())}
+    needed |= {contact.column for contact in sections.contact.values() if contact.column is not None}
     table = read(path, wanted=needed.__contains__, rows=rows, progress=progress)
     report.format = table.format
     for remark in table.remarks:
         report.find("reader", remark)
     return _Gathering(table, mapping, tuple(joints), report).run()
-
-
-def _needed(mapping: Mapping, joints: Sequence[str]) -> set[str]:
-    """Names of the columns that the mapping speaks of."""
-    sections = mapping.sections
-    names = {sections.time.column, *([sections.time.segment] if sections.time.segment else [])}
-    for name in SYMBOLS:
-        if mapping.quantity(name) is not None:
-            names |= set(mapping.columns_of(name, joints))
-    if sections.wrench is not None:
-        names |= {*sections.wrench.force, *(sections.wrench.torque or ())}
-    return names | {c.column for c in sections.contact.values() if c.column is not None}
 
 
 class _Gathering:
@@ -115,10 +109,7 @@ class _Gathering:
         return stream, result
 
     def _wrench(self) -> tuple[Stream, Array]:
-        """Force and moment as the sensor gives them, in SI units, offsets taken off; no moment is zero.
-
-        The one column of a load cell is a force along its axis.
-        """
+        """Force and moment `(n, 6)` in SI units, offsets taken off; zero where the sensor measures none."""
         section = self.mapping.sections.wrench
         assert section is not None
         stream = self.table.stream_of(section.force[0], section.stream)

@@ -23,14 +23,12 @@ from forcegp.guards import foreign
 from forcegp.logs import units
 from forcegp.logs.clock import even_clock
 from forcegp.logs.contact import force_levels, level_and_spread, multiplier
-from forcegp.logs.draft import Draft, quoted
 from forcegp.logs.gather import gather
 from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
-from forcegp.logs.mapping import ContactStateSection, parse_mapping
+from forcegp.logs.mapping import ContactStateSection, Draft, parse_mapping, quoted
 from forcegp.logs.readers import read
-from forcegp.logs.signals import Array, ImportReport, Signals
 from forcegp.logs.smoothing import add_derivatives
-from forcegp.logs.table import LogTable, Progress, Stream
+from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals
 from forcegp.rows import runs
 
 ROWS, TRIED_ROWS = 100_000, 3000
@@ -55,19 +53,18 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
         stream = find_time(table, draft)
         find_families(stream, system.robot, draft)
         find_wrench(table, system.robot, draft)
-        _try(path, draft, system, _possible_units(draft, stream))
+        family = draft.families["position"]
+        if family.declared and family.unit is not None:
+            possible = [family.unit]
+        else:
+            reach = max(float(np.nanmax(np.abs(stream.columns[c]))) for c in family.columns.values())
+            draft.say("position", f"values up to {reach:.4g}")
+            possible = (
+                ["deg"] if reach > MOST_RADIANS else ["rad"] if reach < LEAST_DEGREES else ["rad", "deg"]
+            )
+        _try(path, draft, system, possible)
         propose_contacts(table, draft, system, cache(lambda: _signals(path, draft, system)))
     return draft
-
-
-def _possible_units(draft: Draft, stream: Stream) -> list[str]:
-    """Units that the range of the positions allows."""
-    family = draft.families["position"]
-    if family.declared and family.unit is not None:
-        return [family.unit]
-    reach = max(float(np.nanmax(np.abs(stream.columns[c]))) for c in family.columns.values())
-    draft.say("position", f"values up to {reach:.4g}")
-    return ["deg"] if reach > MOST_RADIANS else ["rad"] if reach < LEAST_DEGREES else ["rad", "deg"]
 
 
 def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from forcegp.errors import MappingError
 from forcegp.logs import units
-from forcegp.logs.draft import Draft, Family
+from forcegp.logs.mapping import Draft, Family
 from forcegp.logs.table import LogTable, Stream
 from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
@@ -246,10 +246,7 @@ RELATED = 0.95
 
 
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
-    """Propose families of a log whose columns have numbers for names, in blocks of one per joint.
-
-    Positions and velocities are blocks of which one is the rate of the other; the one left is the torque.
-    """
+    """Propose families without headings: blocks of a column per joint, of which one is another's rate."""
     nq = len(joints)
     names = [name for name in stream.columns if name != draft.time["column"]]
     blocks = [names[k : k + nq] for k in range(0, len(names) - nq + 1, nq)]

@@ -1,16 +1,18 @@
 """Mapping files: which column of a log is which quantity of which joint, in TOML (docs/import.md).
 
 `[joints]` says what the log calls each joint of the robot, and a column such as `"q_{joint}"` is filled in
-with that name. A data set, and ROS joint states with the robot's names, need no file.
+with that name. A data set, and ROS joint states with the robot's names, need no file. A draft is a mapping
+that is proposed to the user: its tables, and a comment on each thing that is not certain.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +23,91 @@ from forcegp.data.checks import lock_hint
 from forcegp.errors import MappingError, did_you_mean
 from forcegp.guards import is_file
 from forcegp.logs import units
-from forcegp.logs.draft import CHECK, Draft, Family, quoted
 from forcegp.logs.readers import read
 from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
+
+CHECK = "# CHECK: "
+"""Start of a comment on what the user must check."""
+CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
+"""What a current needs beside its unit."""
+
+
+@dataclass
+class Family:
+    """Columns of one quantity by what stands for `{joint}` in the common pattern, or `by_joint` of the robot
+    where that does not name the joints as the positions do; `declared`, if the log says their unit.
+    """
+
+    pattern: str
+    columns: dict[str, str]
+    stream: str = ""
+    unit: str | None = None
+    declared: bool = False
+    sign: float | dict[str, float] = 1.0
+    by_joint: dict[str, str] = field(default_factory=dict)
+
+    def table(self) -> dict[str, Any]:
+        """Keys of the mapping."""
+        columns = {"columns": self.by_joint} if self.by_joint else {"column": self.pattern}
+        sign = None if self.sign == 1.0 else self.sign
+        current = CURRENT if self.unit in ("A", "mA") else {}
+        return {**columns, "stream": self.stream or None, "unit": self.unit, "sign": sign, **current}
+
+
+@dataclass
+class Draft:
+    """A proposed mapping: tables, in which a key that is `None` is left out, families of columns by quantity,
+    comments above each table, what the user must check, and the window of the derivatives."""
+
+    source: str
+    time: dict[str, Any] = field(default_factory=dict)
+    joints: dict[str, str] = field(default_factory=dict)
+    families: dict[str, Family] = field(default_factory=dict)
+    further: dict[str, dict[str, Any]] = field(default_factory=dict)
+    comments: dict[str, list[str]] = field(default_factory=dict)
+    doubts: list[str] = field(default_factory=list)
+    window: int = 11
+
+    def say(self, table: str, sentence: str, doubt: bool = False) -> None:
+        """Comment on a table; a doubt is also listed at the top."""
+        self.comments.setdefault(table, []).append((CHECK[2:] if doubt else "") + sentence)
+        if doubt:
+            self.doubts.append(sentence)
+
+    def toml(self) -> str:
+        """The mapping file."""
+        lines = [f"# Mapping of {_plain(self.source)}, proposed from its headings and values."]
+        lines += ["# Check it, above all the lines marked CHECK, and import with --mapping.", ""]
+        quantities = {name: family.table() for name, family in self.families.items()}
+        tables = {"time": self.time, "joints": self.joints, **quantities, **self.further}
+        for name, table in tables.items():
+            body = [f"{quoted(k)} = {_value(value)}" for k, value in table.items() if value is not None]
+            above = [f"# {_plain(sentence)}" for sentence in self.comments.get(name, [])]
+            lines += [*above, f"[{name}]", *body, ""] if body else []
+        lines += [
+            *(f"# {_plain(sentence)}" for sentence in self.comments.get("derivatives", [])),
+            "[derivatives]",
+            'method = "savitzky_golay"   # or "smoother", with error bars from a model',
+        ]
+        return "\n".join([*lines, f"window = {self.window}", "order = 3", "filter_torque = true", ""])
+
+
+def _plain(text: str) -> str:
+    """One line without control characters, as TOML's comments demand."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def quoted(name: str) -> str:
+    """A name as a key of TOML."""
+    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)
+
+
+def _value(value: object) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{quoted(k)} = {_value(v)}" for k, v in value.items()) + " }"
+    return json.dumps(value)
+
 
 PerJoint = float | dict[str, float]
 """One number for all joints, or one for each by name."""
@@ -202,10 +285,7 @@ class Mapping:
 
 
 def load_mapping(source: str | Path) -> Mapping:
-    """Read a mapping file.
-
-    Args:
-        source: a path, or the name of a mapping that comes with the library.
+    """Read a mapping file by its path, or the name of one that comes with the library.
 
     Raises:
         MappingError: no such mapping, or it is not valid; the message names file, line and key.
@@ -225,11 +305,7 @@ def load_mapping(source: str | Path) -> Mapping:
 
 
 def parse_mapping(content: bytes, source: str) -> Mapping:
-    """A mapping from the bytes of its file.
-
-    Raises:
-        MappingError: it is not valid; the message names file, line and key.
-    """
+    """A mapping from the bytes of its file; a `MappingError` names file, line and key."""
     document = Document(content, source, MappingError)
     lines = content.decode().splitlines()
     doubts = tuple(line[len(CHECK) :] for line in lines if line.startswith(CHECK))

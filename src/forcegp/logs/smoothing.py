@@ -2,10 +2,10 @@
 
 The Kalman smoother of a joint gives position, velocity and acceleration with error bars. Its model is a
 constant jerk disturbed by white snap of intensity s, seen in white noise of deviation σ: x = (q, q̇, q̈, q⃛),
-dx = F x dt + e₄ √s dw, y = q + ε. In the scaled state z = (q, h q̇, h² q̈, h³ q⃛), h the time step, transition
-and noise are constant matrices: z⁺ = A z + w, A_ij = 1/(j−i)!, Cov(w)_ij = ρ σ² W_ij with ρ = s h⁷/σ² and
-W_ij = 1/((3−i)! (3−j)! (7−i−j)), i, j from 0. ρ is learned by evidence, σ in closed form (Rauch, Tung and
-Striebel 1965; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 8 and 12).
+dx = F x dt + e₄ √s dw, y = q + ε. In the scaled state z = (q, h q̇, h² q̈, h³ q⃛), h the time step,
+transition and noise are constant matrices: z⁺ = A z + w, A_ij = 1/(j−i)!, Cov(w)_ij = ρ σ² W_ij with ρ = s
+h⁷/σ² and W_ij = 1/((3−i)! (3−j)! (7−i−j)), i, j from 0. ρ is learned by evidence, σ in closed form (Rauch,
+Tung and Striebel 1965; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 8 and 12).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 from forcegp.data.derivative import SavitzkyGolay, differentiate
 from forcegp.errors import DataError
 from forcegp.logs.mapping import DerivativesSection
-from forcegp.logs.signals import Array, ImportReport, Signals
+from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.rows import runs
 
 STATES, SHORTEST = 4, 8
@@ -43,10 +43,8 @@ W = np.outer(TAYLOR, TAYLOR) / (7.0 - np.add.outer(np.arange(STATES), np.arange(
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Estimates of one joint, `(n,)` each, the standard deviation of q̈ and σ of the measured position.
-
-    `also` is another column through the same filter, as if it were a position.
-    """
+    """Estimates of one joint `(n,)`, another column through the same filter, and σ of the measured
+    position."""
 
     position: Array
     velocity: Array
@@ -163,12 +161,8 @@ def _run(y: Array, gain: Array, back: Array) -> Array:
 
 
 def add_derivatives(signals: Signals, settings: DerivativesSection, report: ImportReport) -> Array | None:
-    """Compute `qd` and `qdd` where the log has none, and pass the torque through the same filter.
-
-    The clock is even; contact switches cut the log into pieces, and pieces that are too short are dropped.
-
-    Returns:
-        `(n, nq)` standard deviation of the computed q̈, or `None` where q̈ is logged.
+    """Compute `qd` and `qdd` where the log has none, piece by piece between contact switches, and pass the
+    torque through the same filter; returns σ of the computed q̈ `(n, nq)`, or `None` where it is logged.
     """
     logged = [name for name in ("qd", "qdd") if name in signals.vectors]
     if len(logged) == 2:

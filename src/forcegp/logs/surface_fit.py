@@ -17,7 +17,7 @@ from forcegp.constraints import ConstrainedSystem, Plane, Sphere, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
 from forcegp.forces.calibration import autocorrelation_time
-from forcegp.logs.signals import Array
+from forcegp.logs.table import Array
 from forcegp.robust import robust_std
 
 LEAST_POINTS, ROUNDING = 20, 1e-9
@@ -63,10 +63,8 @@ LEAST_RADIUS_STD = 4.0
 
 @dataclass(frozen=True)
 class Tip:
-    """A ball of radius r [m], to be fitted if `None`, that ends at the path's points or has its centre there.
-
-    `axes` are unit vectors `(n, 3)` from its centre to the path's points; zero where these are centres.
-    """
+    """A ball of radius r [m], to be fitted if `None`, with unit vectors `(n, 3)` to the path's points, or
+    zero."""
 
     axes: Array
     radius: float | None
@@ -120,13 +118,10 @@ LEAST_WIDTH, LARGEST_TILT = 10.0, 0.2
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """A fitted surface of a contact.
+    """A fitted surface, with the radius of the tip that touched [m] and standard deviations.
 
-    Attributes:
-        std: standard deviations: `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane;
-            `center` [m] (the largest of its three) and `radius` [m] of a sphere; `tip_radius` [m] if fitted.
-        solution: the least squares that it comes from.
-        tip_radius: of the tip that touched [m].
+    These are `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane, `center` [m] (the largest
+    of three) and `radius` [m] of a sphere, and `tip_radius` [m] if fitted.
     """
 
     contact: str
@@ -161,15 +156,8 @@ def fit_surface(
     """Fit a surface to the path of the touching point while a contact is closed.
 
     Least squares of the signed distances, without the rows that a robust fit finds off the surface. The error
-    bars count residuals that are correlated in time as fewer independent ones.
-
-    Args:
-        data: a log with the contact's state.
-        system: the robot with its contacts; the point and the side of the surface are the scene's.
-        contact: which contact.
-        kind: the kind of surface.
-        tip_radius: of a ball that ends at the scene's point, on the line from the frame's origin to it
-            [m], or `"fit"`; by default the scene's tip.
+    bars count residuals that are correlated in time as fewer independent ones. The ball that touches, of
+    `tip_radius` [m] or `"fit"`, ends at the scene's point; by default the tip is the scene's.
 
     Raises:
         DataError: the scene has another tip, the contact is closed in too few rows, or the path is too

@@ -1,4 +1,7 @@
-"""What every reader returns: named columns of numbers by the clock that they share."""
+"""What readers return, named columns of numbers by the clock that they share, and what the steps of an import
+hand on: quantities in SI units and in the robot's joint order on one clock, and a report of what was found
+and done.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from forcegp import limits
 from forcegp.errors import DataError, did_you_mean
 from forcegp.guards import check_count, check_expansion
 from forcegp.resources import announce_memory
+from forcegp.rows import numbered, runs
 
 
 def check_values(source: str, rows: int, columns: int) -> None:
@@ -22,7 +26,7 @@ def check_values(source: str, rows: int, columns: int) -> None:
     announce_memory(2 * 8 * rows * columns, f"reading {source}")  # as in the file, and as float64
 
 
-Column = NDArray[np.float64]
+Column = Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 """Called with the work done and the total, in bytes or messages."""
 Wanted = Callable[[str], bool]
@@ -31,10 +35,7 @@ Wanted = Callable[[str], bool]
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Columns `(n,)` with a common clock: a table, a topic of a bag, arrays of one length.
-
-    A missing value is NaN. The name is empty for the only table of a file; units are those it declares.
-    """
+    """Columns `(n,)` with a common clock, NaN where a value is missing, and units that the log declares."""
 
     name: str
     columns: Mapping[str, Column]
@@ -130,3 +131,68 @@ def table_of_arrays(
     for rows, columns in groups.items():
         check_values(source, rows, len(columns))
     return LogTable(source, kind, streams_by_length(groups, common), tuple(remarks))
+
+
+@dataclass
+class Signals:
+    """Quantities of a log: time [s], number in the log and trajectory of each row, `(n,)`; `q`, `qd`, `qdd`,
+    `tau` as far as they are logged, `(n, nq)` each, and `wrench` `(n, 6)`; name of each contact → `(n,)`
+    bool.
+    """
+
+    joint_names: tuple[str, ...]
+    t: Array
+    row: NDArray[np.int64]
+    segment: NDArray[np.int64]
+    vectors: dict[str, Array]
+    contact: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.t)
+
+    def keep(self, mask: NDArray[np.bool_], split: bool = False) -> None:
+        """Keep some rows `(n,)`, column by column to save memory; with `split`, gaps part trajectories."""
+        if mask.all():
+            return
+        if split:
+            self.segment = self.segment + np.cumsum(np.concatenate([[False], mask[1:] & ~mask[:-1]]))
+        self.t, self.row, self.segment = self.t[mask], self.row[mask], self.segment[mask]
+        for name in list(self.vectors):
+            self.vectors[name] = self.vectors.pop(name)[mask]
+        self.contact = {name: value[mask] for name, value in self.contact.items()}
+
+    def runs(self, *keys: NDArray[np.generic]) -> list[slice]:
+        """Stretches of rows within one segment on which further keys do not change."""
+        return runs(self.segment, *keys)
+
+
+MOST_INTERVALS = 20
+"""Intervals of rows that a finding lists; its count covers all."""
+
+
+@dataclass(frozen=True)
+class ImportFinding:
+    """A kind in a word and a sentence with what was done; `rows` has the first of the intervals concerned."""
+
+    kind: str
+    message: str
+    count: int = 0
+    rows: tuple[tuple[int, int], ...] = ()
+
+
+@dataclass
+class ImportReport:
+    """What was found and done, in order; `rows_read` are those of the stream that sets the clock."""
+
+    source: str
+    format: str = ""
+    rows_read: int = 0
+    findings: list[ImportFinding] = field(default_factory=list)
+    steps: list[str] = field(default_factory=list)
+
+    def find(self, kind: str, message: str, rows: NDArray[np.int64] | None = None) -> None:
+        """Add a finding on some rows, given by their numbers in the log, increasing."""
+        numbers = np.zeros(0, np.int64) if rows is None else rows
+        first = tuple((a, b - 1) for a, b in numbered(numbers)[:MOST_INTERVALS])
+        self.findings.append(ImportFinding(kind, message, len(numbers), first))

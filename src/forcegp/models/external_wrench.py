@@ -144,8 +144,8 @@ def external_wrench(
 
 
 class JointForces(NamedTuple):
-    """At n states: mean of Q̄ `(n, nq)`, its covariance with noise of the torques `(n, nq, nq)`, the equations
-    of motion, J `(n, k, nq)` of the wrench and of multipliers, and their priors `(k,)`."""
+    """At n states: mean of Q̄ `(n, nq)`, its covariance with noise of the torques `(n, nq, nq)`, the
+    equations of motion, J `(n, k, nq)` of the wrench and of multipliers, and their priors `(k,)`."""
 
     mean: Tensor
     covariance: Tensor

@@ -1,20 +1,24 @@
 """HTML pages and their plots; other programs make their own pages from the names exported here."""
 
 from forcegp.report.check import write_check
-from forcegp.report.html import (
+from forcegp.report.page import (
+    AXES,
+    INK,
     NONE,
+    Picture,
     PictureBlock,
     Series,
     Table,
     as_tensor,
     cell,
+    colour,
     columns,
+    draw,
+    label,
     render,
     series,
 )
-from forcegp.report.rollout_data import ModelPath, RolloutData, rollout_data
-from forcegp.report.rollouts import rollout_section, rollout_table
-from forcegp.report.style import AXES, INK, Picture, colour, draw, label
+from forcegp.report.rollouts import ModelPath, RolloutData, rollout_data, rollout_section, rollout_table
 from forcegp.report.window import WindowData, draw_errors, draw_predictions, predicted_window
 
 __all__ = [

@@ -17,8 +17,7 @@ from forcegp.checks.log import Array, of_robot
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.files import write_text
 from forcegp.plots import unit
-from forcegp.report.html import render
-from forcegp.report.style import INK, OTHER, Picture, draw
+from forcegp.report.page import INK, OTHER, Picture, draw, render
 from forcegp.rows import describe
 
 COLOURS = {"error": "#a1121f", "warning": "#d08c00", "note": "#0072b2"}

@@ -12,8 +12,7 @@ from forcegp.evaluation import Evaluation
 from forcegp.evaluation.scores import JointErrors
 from forcegp.files import write_text
 from forcegp.models.fit_result import Compared
-from forcegp.report.html import PictureBlock, Table, cell, render
-from forcegp.report.style import INK, Picture, colour, draw, label
+from forcegp.report.page import INK, Picture, PictureBlock, Table, cell, colour, draw, label, render
 from forcegp.report.window import WindowData, draw_errors, draw_forces, draw_predictions
 
 PAGE, WINDOW = "evaluation.html", "window.json"
@@ -45,13 +44,8 @@ def write_evaluation(
 ) -> Path:
     """Write the page on one model, with its plots and their data, and return its path.
 
-    Args:
-        folder: where the files go.
-        model, data: the model file and the data file, as the page names them.
-        fitted_to: the file that the trivial predictors were fitted to, if not halves of the data.
-        scores: of the model.
-        window: predictions over a few seconds of the data.
-        comparison: sets of force priors that the training log chose between.
+    `model`, `data` and `fitted_to` are files as the page names them; without the last, the trivial predictors
+    were fitted to halves of the data. `comparison` has the sets of force priors that the log chose between.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
@@ -123,10 +117,7 @@ def draw_calibration(evaluation: Evaluation) -> Picture:
 
 
 def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Torque and acceleration errors by joint, beside the trivial predictors; worse ones in red.
-
-    nRMSE is the error over all samples divided by the standard deviation of the measured quantity.
-    """
+    """Torque and acceleration errors by joint beside trivial predictors; red ones are worse."""
     units = {"torque": "[N m, N]", "acceleration": "[rad/s², m/s²]"}
     tables = []
     for unit, names in units.items() if evaluation.predictors else ():

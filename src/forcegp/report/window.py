@@ -14,8 +14,7 @@ from forcegp.evaluation.predicted import logged_forces, predicted_forces
 from forcegp.files import Header, Record
 from forcegp.models.base import Predictor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.report.html import Series, as_tensor, columns, series
-from forcegp.report.style import INK, Picture, colour, draw, label
+from forcegp.report.page import INK, Picture, Series, as_tensor, colour, columns, draw, label, series
 
 WIDTH, WIDE, ROW, MARGIN = 4.1, 12.0, 0.92, 0.75
 """Widths of a plot by joint and of one across the page, height of a row and of the rest [inch]."""
@@ -156,13 +155,7 @@ def draw_predictions(window: WindowData) -> Picture:
 
 
 def draw_errors(window: WindowData, limit: float | None = None) -> Picture:
-    """Errors of the predictions: noise-free and measured acceleration less the predicted mean.
-
-    Args:
-        window: the predictions.
-        limit: half height of every row [rad/s²], to compare models at one scale; each row has its own
-            scale by default.
-    """
+    """Errors of the predictions by joint, within ±`limit` [rad/s²], or each row at its own scale."""
     error = window.error.abs()
     alt = (
         f"error of the predicted accelerations of {{}}, mean magnitude {error.mean():.2g}, "

@@ -21,17 +21,9 @@ _TAG_NAME = re.compile(rb"<[^\s/>]+")
 
 @dataclass(eq=False)
 class Span:
-    """An element of the text.
-
-    Attributes:
-        tag: its name.
-        attributes: values by name.
-        values: start and end of each value with its quotes, and of the whole attribute with the space
-            before it.
-        head: end of the name in the start tag; `close`: end of the start tag.
-        empty: whether it is `<tag/>`.
-        indent: white space at the start of the line.
-        children: in order.
+    """An element of the text: the end of its name (`head`) and of its start tag (`close`), whether it is
+    `<tag/>`, the white space at the start of its line, and of each attribute the start and end of its value
+    with quotes and the start of the whole with the space before it.
     """
 
     tag: str

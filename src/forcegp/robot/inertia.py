@@ -61,11 +61,7 @@ def from_log_cholesky(theta: InertialParameters) -> PseudoInertia:
 
 
 def log_cholesky(J: PseudoInertia) -> InertialParameters:
-    """θ of a pseudo-inertia (inverse of `from_log_cholesky`), `(*batch, 10)`.
-
-    Raises:
-        InertiaError: J is not positive definite.
-    """
+    """θ `(*batch, 10)` of a pseudo-inertia (inverse of `from_log_cholesky`); `InertiaError` unless J > 0."""
     # An upper factor is the lower factor of the matrix with rows and columns reversed.
     lower, info = torch.linalg.cholesky_ex(J.flip(-1, -2))
     if bool((info != 0).any()):

@@ -25,7 +25,7 @@ from forcegp.errors import (
 )
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import Inertial, Joint, Site, Tree, checked, joint_motion, lock_joints
+from forcegp.robot.tree import Inertial, Joint, Tree, checked, joint_motion, lock_joints
 from forcegp.robot.urdf import read_urdf
 
 FRICTION_VELOCITY = 0.1
@@ -50,12 +50,7 @@ class _Placed:
 
 
 def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
-    """The robot that a tree describes, in double precision, with pose of the base and gravity as given.
-
-    Raises:
-        UnsupportedRobotError: the name of a frame is ambiguous.
-        InertiaError: the robot can move without inertia.
-    """
+    """The robot of a tree in a world; typed errors for ambiguous frames and motion without inertia."""
     remarks, placed = list(tree.remarks), _place(tree.joints)
     bodies = _merge(tree, placed)
     remarks += _held_base(tree, placed)
@@ -188,22 +183,16 @@ def _frames(tree: Tree, placed: _Placed, remarks: list[str]) -> list[tuple[str, 
     frames = [(link.name, *placed.links[link.name]) for link in tree.links if link.frame]
     taken = {name for name, _, _ in frames}
     for site in tree.sites:
-        name = _free_name(tree, site, taken, remarks)
-        index, T = placed.links[site.link]
+        name, (index, T) = site.name, placed.links[site.link]
+        if name in taken:  # in MJCF, a site and a body may share a name
+            doubt = f"{tree.label}: site {name!r} shares its name with a body"
+            name = f"site/{name}"
+            if name in taken:
+                raise UnsupportedRobotError(doubt, expected="different names")
+            remarks.append(f"{doubt}; its frame is {name!r}")
         frames.append((name, index, T @ site.placement))
         taken.add(name)
     return frames
-
-
-def _free_name(tree: Tree, site: Site, taken: set[str], remarks: list[str]) -> str:
-    """A unique frame name: in MJCF, a site and a body may share a name."""
-    if site.name not in taken:
-        return site.name
-    name, doubt = f"site/{site.name}", f"{tree.label}: site {site.name!r} shares its name with a body"
-    if name in taken:
-        raise UnsupportedRobotError(doubt, expected="different names")
-    remarks.append(f"{doubt}; its frame is {name!r}")
-    return name
 
 
 BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa", "kuka_iiwa14", "ur5")
@@ -259,11 +248,7 @@ def load_robot(
 
 
 def robot_path(source: str | Path) -> Path:
-    """The file of a bundled name or a path.
-
-    Raises:
-        UnknownNameError: neither a bundled robot nor a path.
-    """
+    """The file of a bundled name or a path; `UnknownNameError` if it is neither."""
     path = Path(os.path.expanduser(source))  # an unknown user is left as it is
     if str(source) in BUNDLED:
         return Path(__file__).parent / "bundled" / f"{source}.urdf"
@@ -278,11 +263,7 @@ def _read(source: str | Path) -> Tree:
 
 
 def read_tree(data: bytes, path: Path) -> Tree:
-    """Links and joints of a URDF or MJCF document; `path` names it, and files that it includes are beside it.
-
-    Raises:
-        RobotFileError: the document is neither, or not valid.
-    """
+    """Links and joints of a URDF or MJCF document of a `path`; `RobotFileError` if it is not valid."""
     root = parse_xml(data, str(path))
     if root.tag == "robot":
         return read_urdf(root, str(path))

@@ -29,14 +29,9 @@ _KINDS: dict[int, JointKind] = {
 
 
 def read_mjcf(root: Element, path: Path) -> Tree:
-    """Links and joints of the `<mujoco>` document of a file: bodies are links, bodies and sites are frames.
-
-    A body with several joints gets a massless link between each two of them.
-
-    Raises:
-        RobotFileError: the document is not valid; errors of MuJoCo's compiler are quoted.
-        UnsupportedRobotError: the document uses an unsupported feature; the message names it.
-        InertiaError: a mass or an inertia is not physical.
+    """Links and joints of the `<mujoco>` document of a file: bodies are links, bodies and sites are frames,
+    and massless links lie between several joints of a body. Typed errors quote MuJoCo's compiler, or name
+    what is not supported or not physical.
     """
     document, coupled, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):
@@ -169,14 +164,12 @@ def _effort(model: Any, j: int) -> float:
     """Largest force that the joint and its actuators allow; the control range of a motor limits it too."""
     effort = float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
     of_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
-    drives = np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == j))
-    return min(effort, sum(_drive_effort(model, a) for a in drives.tolist())) if len(drives) else effort
-
-
-def _drive_effort(model: Any, a: int) -> float:
-    gear, limit = abs(float(model.actuator_gear[a, 0])), np.inf
-    if model.actuator_forcelimited[a]:
-        limit = float(np.abs(model.actuator_forcerange[a]).max())
-    if model.actuator_ctrllimited[a] and model.actuator(a).name.startswith("motor"):
-        limit = min(limit, float(np.abs(model.actuator_ctrlrange[a]).max()))
-    return gear * limit if limit < np.inf else np.inf
+    efforts = []
+    for a in np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == j)).tolist():
+        gear, limit = abs(float(model.actuator_gear[a, 0])), np.inf
+        if model.actuator_forcelimited[a]:
+            limit = float(np.abs(model.actuator_forcerange[a]).max())
+        if model.actuator_ctrllimited[a] and model.actuator(a).name.startswith("motor"):
+            limit = min(limit, float(np.abs(model.actuator_ctrlrange[a]).max()))
+        efforts.append(gear * limit if limit < np.inf else np.inf)
+    return min(effort, sum(efforts)) if efforts else effort

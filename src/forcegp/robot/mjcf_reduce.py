@@ -40,13 +40,8 @@ class Coupling(NamedTuple):
 
 
 def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling], list[str]]:
-    """The reduced document of a file, coupling by name of the joint that an equality constrains, and remarks.
-
-    Included files are looked for beside `path`.
-
-    Raises:
-        RobotFileError: an include or a number is not valid.
-        UnsupportedRobotError: the document uses an unsupported feature.
+    """The reduced document of a file, with what it includes from its folder, coupling by name of the joint
+    that an equality constrains, and remarks; typed errors name what is not valid or not supported.
     """
     _expand_includes(root, path)
     document = Element("mujoco", model=root.get("model", path.stem))

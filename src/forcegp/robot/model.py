@@ -161,20 +161,12 @@ class RobotModel:
         return {name: value for name, value in values if isinstance(value, Tensor)}
 
     def frame_index(self, frame: str) -> int:
-        """Index of a named frame.
-
-        Raises:
-            UnknownNameError: no such frame; the message lists the frames and the nearest one.
-        """
+        """Index of a named frame; an `UnknownNameError` lists the frames and the nearest one."""
         check_name(f"frame of robot {self.name!r}", frame, self.frame_names)
         return self.frame_names.index(frame)
 
     def joint_index(self, joint: str) -> int:
-        """Index of a named joint.
-
-        Raises:
-            UnknownNameError: no such joint; the message lists the joints and the nearest one.
-        """
+        """Index of a named joint; an `UnknownNameError` lists the joints and the nearest one."""
         check_name(f"joint of robot {self.name!r}", joint, self.joint_names)
         return self.joint_names.index(joint)
 
@@ -202,11 +194,7 @@ class RobotModel:
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
 
     def check_state(self, **states: Tensor) -> None:
-        """Check that joint-space arguments end in `nq` and share the robot's dtype and device.
-
-        Raises:
-            ShapeError: one does not; the message names the argument.
-        """
+        """Check that arguments end in `nq` and share the robot's dtype and device; `ShapeError` names one."""
         for name, value in states.items():
             if not isinstance(value, Tensor):
                 raise ShapeError(

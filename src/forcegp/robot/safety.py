@@ -69,11 +69,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def parse_xml(data: bytes, label: str) -> Element:
-    """The element tree of an XML document without DTD, entities or external references.
-
-    Raises:
-        RobotFileError: the document is malformed, hostile, too large or too deep; names `label`.
-    """
+    """The tree of an XML document; `RobotFileError` if it is malformed, hostile, too large or too deep."""
     parser = DefusedXMLParser(
         target=_BoundedBuilder(label), forbid_dtd=True, forbid_entities=True, forbid_external=True
     )
@@ -117,11 +113,7 @@ def xacro_error(label: str, got: str) -> RobotFileError:
 def parse_numbers(
     text: str, where: str, count: int, *, infinite: bool = False, error: type[RobotFileError] = RobotFileError
 ) -> list[float]:
-    """`count` finite numbers from the text of an attribute; `infinite` allows ±∞ (limits).
-
-    Raises:
-        RobotFileError: (or `error`) too many, too few, not finite or above `MAX_NUMBER`; names `where`.
-    """
+    """`count` finite numbers of an attribute, or also ±∞ if `infinite`; an `error` names `where`."""
     expected = f"{count} finite number{'s' if count > 1 else ''}"
     try:
         values = [float(word) for word in text.split()]

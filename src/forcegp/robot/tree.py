@@ -96,12 +96,7 @@ def joint_motion(kind: JointKind, axis: np.ndarray, q: float) -> np.ndarray:
 
 
 def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
-    """The tree with some joints, and those that follow them, fixed at positions [rad, m].
-
-    Raises:
-        UnknownNameError: a joint does not exist.
-        RobotFileError: a position is not finite.
-    """
+    """The tree with joints, and those that follow them, fixed [rad, m]; typed errors for wrong ones."""
     names = [joint.name for joint in tree.joints if joint.kind != "fixed"]
     for name, q in locked.items():
         check_name(f"joint of {tree.label} to lock", name, names)
@@ -130,11 +125,7 @@ ROUNDING = 1e-6
 
 
 def checked(tree: Tree) -> Tree:
-    """The tree, checked, with its joints in depth-first order, siblings in the order of the file.
-
-    Raises:
-        RobotFileError, UnsupportedRobotError, InertiaError: not a tree, a joint, or an inertia is refused.
-    """
+    """The tree, joints depth first and siblings as in the file; typed errors name what is refused."""
     _check_names(tree)
     root = _root(tree)
     children: dict[str, list[Joint]] = {}

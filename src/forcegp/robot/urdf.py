@@ -40,14 +40,11 @@ WORLD = "world"
 
 
 def read_urdf(root: Element, label: str) -> Tree:
-    """Links and joints of a URDF document from its `<robot>` element; `label` names the file in messages.
-
-    Raises:
-        RobotFileError: an element or a number is missing or not valid; the message names it.
-        UnsupportedRobotError: a joint is of an unsupported type.
-        InertiaError: a mass or an inertia is not a finite number.
-    """
-    _refuse_xacro(root, label)
+    """Links and joints of a `<robot>` element; typed errors name what is not valid or not supported."""
+    for element in root.iter():
+        macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
+        if macros or "xacro" in element.tag:
+            raise xacro_error(label, macros[0][:80] if macros else f"<{element.tag.rpartition('}')[2]}>")
     links = tuple(_link(element, label) for element in root.findall("link"))
     joints = tuple(_joint(element, label) for element in root.findall("joint"))
     remarks: tuple[str, ...] = ()
@@ -57,13 +54,6 @@ def read_urdf(root: Element, label: str) -> Tree:
         links = (Link(WORLD), *links)
         remarks = (f"{label}: link {WORLD!r} is used but not declared; it is taken as the base",)
     return Tree(root.get("name") or "robot", label, links, joints, remarks=remarks)
-
-
-def _refuse_xacro(root: Element, label: str) -> None:
-    for element in root.iter():
-        macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
-        if macros or "xacro" in element.tag:
-            raise xacro_error(label, macros[0][:80] if macros else f"<{element.tag.rpartition('}')[2]}>")
 
 
 def _name(element: Element, label: str) -> str:

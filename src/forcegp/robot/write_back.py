@@ -44,13 +44,7 @@ ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
 
 
 class Change(NamedTuple):
-    """A figure of the file that changed.
-
-    Attributes:
-        element: link or joint.
-        figure: attribute, such as `mass` or `damping`.
-        before, after: values in SI units.
-    """
+    """A figure that changed, such as `mass` or `damping`, of a link or joint, with its values in SI units."""
 
     element: str
     figure: str
@@ -60,12 +54,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenRobot:
-    """What was written.
-
-    Attributes:
-        changes: figures that changed.
-        losses: figures of the robot that the format has no place for, one sentence each.
-    """
+    """Figures that changed, and sentences on figures of the robot that the format has no place for."""
 
     changes: tuple[Change, ...]
     losses: tuple[str, ...]
@@ -160,7 +149,13 @@ def _link_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: Ro
             continue
         for name, body in _shared(_parts(file, i, old), J_old[i], J_new[i], joint).items():
             writer.set_inertial(name, body)
-            changes += _listed(name, old[name] or NOTHING, body)
+            before = old[name] or NOTHING
+            changes.append(Change(name, "mass", before.mass, body.mass))
+            for axis, *pair in zip("xyz", before.com, body.com, strict=True):
+                changes.append(Change(name, f"com {axis}", *map(float, pair)))
+            for axes, *place in zip(_MOMENTS, *_PLACES, strict=True):
+                pair = (float(x.inertia[tuple(place)]) for x in (before, body))
+                changes.append(Change(name, f"inertia {axes}", *pair))
     return changes
 
 
@@ -170,25 +165,9 @@ _MOMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 _PLACES = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 
 
-def _listed(name: str, old: Inertial, new: Inertial) -> list[Change]:
-    """The ten parameters of a link before and after."""
-    changes = [Change(name, "mass", old.mass, new.mass)]
-    for axis, before, after in zip("xyz", old.com, new.com, strict=True):
-        changes.append(Change(name, f"com {axis}", float(before), float(after)))
-    for axes, row, column in zip(_MOMENTS, *_PLACES, strict=True):
-        before, after = (float(x.inertia[row, column]) for x in (old, new))
-        changes.append(Change(name, f"inertia {axes}", before, after))
-    return changes
-
-
 class _Part(NamedTuple):
-    """A link of the file that is fixed to a link of the robot.
-
-    Attributes:
-        name: of the link.
-        pose: T `(4, 4)` of its frame in the link of the robot.
-        J: its pseudo-inertia `(4, 4)` there.
-        sound: whether some body has its figures.
+    """A link of the file that is fixed to a link of the robot: pose T and pseudo-inertia J `(4, 4)` of it
+    there, and whether some body has its figures.
     """
 
     name: str
@@ -257,11 +236,7 @@ def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
-    """Compare a robot with what the written text gives.
-
-    Raises:
-        RobotFileError: they differ.
-    """
+    """Compare a robot with what the written text gives; `RobotFileError` where they differ."""
     for figure in ("mass", "com", "inertia", *writer.figures):
         wanted, got = getattr(robot, figure), getattr(read, figure)
         error = (wanted - got).abs().flatten(1).amax(-1) if wanted.ndim > 1 else (wanted - got).abs()

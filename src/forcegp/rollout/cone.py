@@ -2,8 +2,8 @@
 
 A contact that sticks holds with the tangential force λ_t that it takes, within its friction cone. The cone is
 that of the model: the contact slides away along d = −λ_t/|λ_t| if the friction that the model gives at a
-velocity v d does not stop it, dᵀ(A_t q̈ − b_t) > 0, with v above `stick_speed` and above the speeds over which
-the friction is smooth. Within a step, friction stops a contact that slides instead of turning it round.
+velocity v d does not stop it, dᵀ(A_t q̈ − b_t) > 0, with v above `stick_speed` and above the speeds over
+which the friction is smooth. Within a step, friction stops a contact that slides instead of turning it round.
 """
 
 from __future__ import annotations

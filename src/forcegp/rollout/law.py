@@ -1,8 +1,8 @@
 """The right-hand side of a rollout: states, the law that gives the acceleration, and joints that stick.
 
-Dry friction is a force within ±F where a joint is at rest and −F sign(q̇) where it slides. Equations of motion
-smooth it to −F tanh(q̇/v₀), so that it can be learned and differentiated; a rollout takes it as it is. With
-Q(s) the force where each joint's dry friction has the direction s in place of tanh(q̇/v₀),
+Dry friction is a force within ±F where a joint is at rest and −F sign(q̇) where it slides. Equations of
+motion smooth it to −F tanh(q̇/v₀), so that it can be learned and differentiated; a rollout takes it as it is.
+With Q(s) the force where each joint's dry friction has the direction s in place of tanh(q̇/v₀),
 
     Q = ½ (Q(1) + Q(−1)) − F s,   F = ½ (Q(−1) − Q(1)).
 
@@ -16,8 +16,8 @@ large-scale strictly monotone linear complementarity problems*, 1994): guess whi
 their friction, exchange those that contradict the guess.
 
 Where h G_ii D_i > 1 for a light joint with viscous friction D, an explicit step turns its motion round, and
-above 2 it grows without end. There viscous friction is that at the end of the step, q̈ = q̈₀ + G (p − h D q̈),
-as in MuJoCo's Euler integrator; elsewhere it is that of the start.
+above 2 it grows without end. There viscous friction is that at the end of the step, q̈ = q̈₀ + G (p − h D
+q̈), as in MuJoCo's Euler integrator; elsewhere it is that of the start.
 """
 
 from __future__ import annotations

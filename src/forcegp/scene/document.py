@@ -35,13 +35,7 @@ _TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
 
 
 class Document:
-    """A parsed TOML file that knows the line of each key.
-
-    Args:
-        content: the bytes of the file.
-        source: its name, for messages.
-        error: the class of error to raise, also by the methods.
-    """
+    """A parsed TOML file that knows the line of each key; errors are of class `error` and name `source`."""
 
     def __init__(self, content: bytes, source: str, error: type[ForceGPError] = SceneError) -> None:
         self.source, self.error = source, error
@@ -64,11 +58,7 @@ class Document:
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
-        """The content as an instance of a pydantic model.
-
-        Raises:
-            ForceGPError: the first error in the content, with its line and key.
-        """
+        """The content as an instance of a pydantic model; the first error is raised with its line and key."""
         # In JSON mode, strict validation accepts a list for a tuple and an integer for a float.
         try:
             return schema.model_validate_json(json.dumps(self.data, default=str))
@@ -114,7 +104,9 @@ class Document:
         if kind == "missing":
             return self.error(f"{place}: key {last!r} is missing", expected=f"{last} = …")
         if kind in ("union_tag_invalid", "union_tag_not_found"):
-            tags = re.findall(r"'(\w+)'", context.get("expected_tags", "")) or _tags(schema, key)
+            tags = re.findall(r"'(\w+)'", context.get("expected_tags", ""))
+            tables = () if tags else _tables_at(schema, key)
+            tags += [tag for table in tables for tag in get_args(_hints(table).get("type"))]
             if kind == "union_tag_not_found":
                 return self.error(f"{place}: key 'type' is missing", expected=_one_of(tags))
             tag = str(context["tag"])
@@ -154,11 +146,6 @@ def _check_keys(text: str, source: str, error: type[ForceGPError]) -> None:
 
 def _one_of(names: list[str]) -> str:
     return f"one of {', '.join(names)}"
-
-
-def _tags(schema: type, key: Key) -> list[str]:
-    """The values of `type` that a table may have."""
-    return [tag for table in _tables_at(schema, key) for tag in get_args(_hints(table).get("type"))]
 
 
 def _tables_at(schema: type, key: Key) -> list[type]:

@@ -110,11 +110,7 @@ def default_model_table() -> ModelTable:
 
 
 def load_model_table(path: str | Path) -> ModelTable:
-    """Read a TOML file with the table `[model]` alone.
-
-    Raises:
-        SceneError: the file does not exist or is not valid; the message names file, line and key.
-    """
+    """Read a TOML file with the table `[model]` alone; a `SceneError` names file, line and key."""
     if not is_file(Path(path)):
         raise SceneError(f"{path}: no such model file", expected="a TOML file with a table [model]")
     document = Document(Path(path).read_bytes(), str(path))

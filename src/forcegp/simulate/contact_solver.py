@@ -77,7 +77,8 @@ class ContactSolverEngine(MuJoCoWorld):
         """Acceleration and forces at the present state under a motor torque `(nq,)` [N m].
 
         The engine's step takes viscous friction at its end, (M + h D) q̈ = Q(q, q̇), which for light joints
-        differs much from M⁻¹Q: q̈ and the friction are those of the step, so that the velocity changes by h q̈.
+        differs much from M⁻¹Q: q̈ and the friction are those of the step, so that the velocity changes by h
+        q̈.
         """
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque

@@ -47,7 +47,13 @@ class Checkpoint:
         """A short digest of settings and tensors, and of the release of this library."""
         digest = hashlib.sha256(version("forcegp").encode())
         for value in values:
-            digest.update(_bytes_of(value))
+            if isinstance(value, Tensor):
+                # Type and shape of a tensor tell it from another with the same bytes.
+                digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
+                flat = value.detach().cpu().contiguous().flatten().view(torch.uint8)
+                digest.update(flat.numpy().tobytes())
+            else:
+                digest.update(repr(value).encode())
         return digest.hexdigest()[:16]
 
     def read(self, like: Mapping[str, Tensor], growing: Container[str] = ()) -> dict[str, Tensor]:
@@ -85,11 +91,7 @@ class Checkpoint:
             self.write(tensors())
 
     def write(self, tensors: Mapping[str, Tensor]) -> None:
-        """Write tensors, whole or not at all.
-
-        Raises:
-            DestinationError: the place cannot be written.
-        """
+        """Write tensors, whole or not at all; `DestinationError` where the place cannot be written."""
         copies = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
         with atomic_file(self.path) as temporary:
             temporary.write_bytes(safetensors.torch.save(copies, {"key": self.key}))
@@ -114,16 +116,7 @@ class Evaluations:
 
     @classmethod
     def resumed(cls, path: str | Path | None, start: Mapping[str, Tensor], *key: object) -> Evaluations:
-        """The evaluations in a file, if there is one.
-
-        Args:
-            path: the file; `None` to keep nothing.
-            start: initial tensors of what is learned.
-            key: settings and tensors that identify what is learned.
-
-        Raises:
-            ModelError: see `read`.
-        """
+        """The evaluations in a file, if any; `key` identifies what is learned from `start`."""
         if path is None:
             return cls(None)
         result = cls(Checkpoint(Path(path), Checkpoint.key_of(*key)))
@@ -181,16 +174,12 @@ class Evaluations:
 
     def _finite(self) -> list[tuple[Tensor, Tensor, Tensor]]:
         """The evaluations before the first that is not finite."""
-        bad = (i for i, entry in enumerate(self._record) if not all(map(_is_finite, entry)))
-        return self._record[: next(bad, None)]
+        limits = ([bool((x.abs() <= LOGGED_VALUE).all()) for x in entry] for entry in self._record)
+        return self._record[: next((i for i, finite in enumerate(limits) if not all(finite)), None)]
 
     def _tensors(self) -> dict[str, Tensor]:
         columns = zip(*self._finite(), strict=True)
         return dict(zip(NAMES, (torch.stack(column) for column in columns), strict=True))
-
-
-def _is_finite(value: Tensor) -> bool:
-    return bool((value.abs() <= LOGGED_VALUE).all())
 
 
 def _layout(tensors: Mapping[str, Tensor], growing: Container[str]) -> dict[str, tuple[object, ...]]:
@@ -226,14 +215,6 @@ class _StoredGradient(torch.autograd.Function):
     def backward(ctx: Any, outer: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         parts = ctx.gradient.split([shape.numel() for shape in ctx.shapes])
         return None, None, *(outer * x.reshape(s) for x, s in zip(parts, ctx.shapes, strict=True))
-
-
-def _bytes_of(value: object) -> bytes:
-    """What a digest sees of a value; type and shape of a tensor tell it from another with the same bytes."""
-    if not isinstance(value, Tensor):
-        return repr(value).encode()
-    flat = value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy()
-    return f"{value.dtype}{tuple(value.shape)}".encode() + flat.tobytes()
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], str | None]:

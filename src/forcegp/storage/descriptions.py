@@ -23,11 +23,7 @@ _CHECK = ConfigDict(arbitrary_types_allowed=True, strict=True, allow_inf_nan=Fal
 
 
 def encode(value: Any, classes: Classes) -> Any:
-    """A description as what JSON can hold.
-
-    Raises:
-        ModelError: the description, or a part of it, is of a class that has no JSON form.
-    """
+    """A description as what JSON can hold; `ModelError` for a class that has no JSON form."""
     names = {kind: name for name, kind in classes.items()}
     if type(value) in names:
         members = {field.name: encode(getattr(value, field.name), classes) for field in _written(value)}
@@ -42,14 +38,7 @@ def encode(value: Any, classes: Classes) -> Any:
 
 
 def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bool = True) -> Any:
-    """The description that `encode` wrote.
-
-    Args:
-        json: what was read.
-        classes: as given to `encode`.
-        place: file and field, for messages.
-        depth: level of nesting.
-        whole: whether every field must be there; otherwise fields that are left out have their defaults.
+    """The description that `encode` wrote, with all fields if `whole`, else with defaults for those left out.
 
     Raises:
         ForceGPError: a field is missing, unknown or of another type, or a class is unknown; names the place.

@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.destination import check_destination
 from forcegp.errors import ModelError
 from forcegp.files import Header, M, Record, atomic_file, validated
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
@@ -36,12 +35,7 @@ _POSITIVE = re.compile(r"(data\.\d+|training)\.noise_std|std\.[^.]+|scale\..+\.s
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
-    """Check the number, types and values of tensors that were read; their shapes the loader checks.
-
-    Raises:
-        ModelError: a tensor is of another type, NaN, infinite but no joint limit, or a standard deviation
-            that is not positive.
-    """
+    """Check number, types and values of tensors; deviations are positive. The loader checks shapes."""
     if len(tensors) > TENSORS:
         raise ModelError(f"{source}: too many tensors", expected=f"at most {TENSORS}", got=len(tensors))
     for name, value in tensors.items():
@@ -80,11 +74,7 @@ class ModelHeader(Header):
     system: dict[str, Any]
 
     def settings_as(self, kind: type[M], source: str) -> M:
-        """The settings of a saved model, checked.
-
-        Raises:
-            ModelError: a field is missing, unknown or not valid; names file and field.
-        """
+        """The settings of a saved model, checked; a `ModelError` names file and field."""
         return validated(kind, self.settings, source, ModelError, ("settings",))
 
 
@@ -114,22 +104,14 @@ def write_model(
     settings: Record,
     tensors: Mapping[str, Tensor],
 ) -> None:
-    """Write the file of a model, whole or not at all; see `model_bytes`.
-
-    Raises:
-        DestinationError: the place cannot be written.
-    """
+    """Write the file of a model, whole or not at all; `DestinationError` where it cannot be written."""
     data = model_bytes(kind, system, settings, tensors)
     with atomic_file(model_path(path)) as temporary:
         temporary.write_bytes(data)
 
 
 def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
-    """Header and tensors of a saved model, those of its system among them.
-
-    Raises:
-        ModelError: no model is there, or it is damaged; names the file.
-    """
+    """Header and tensors of a saved model, its system's too; `ModelError` if it is missing or damaged."""
     file = model_path(path)
     try:
         if not file.is_file():
@@ -148,11 +130,7 @@ def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
 
 
 def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor]]:
-    """Header and tensors of the content of a model's file.
-
-    Raises:
-        ModelError: it is damaged, or not a model.
-    """
+    """Header and tensors of the content of a model's file; `ModelError` if it is damaged, or not a model."""
     stated, _, text = _metadata(data, source).partition("\n")
     digest = _digest(data, stated)
     if digest != stated:
@@ -203,11 +181,6 @@ def _digest(data: bytes, stated: str) -> str:
 def _entry(digest: str) -> bytes:
     """The hash in the header; within the text of another entry its quotes would be escaped."""
     return f'"{HEADER}":"{digest}'.encode()
-
-
-def check_model_destination(path: str | Path, needed_bytes: int = 0) -> None:
-    """Check, before a long fit, that `write_model` will be able to write a model."""
-    check_destination(model_path(path), needed_bytes=needed_bytes)
 
 
 def model_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

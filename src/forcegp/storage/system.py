@@ -162,12 +162,7 @@ def unpack_system(
     source: str,
     fallback: ConstrainedSystem | None = None,
 ) -> ConstrainedSystem:
-    """The system that `pack_system` wrote, from its JSON object and the tensors named `system.<field>`.
-
-    Args:
-        json, tensors: what was read.
-        source: name of the file, for messages.
-        fallback: system that provides the constraints that cannot be saved.
+    """The system that `pack_system` wrote; constraints that cannot be saved are those of `fallback`.
 
     Raises:
         ModelError: a field or tensor is missing or not valid, or a constraint that was not saved is needed.
@@ -226,11 +221,7 @@ def take(
     *,
     finite: bool = True,
 ) -> Tensor:
-    """A named tensor of a saved model, checked; a shape of `None` is any.
-
-    Raises:
-        ModelError: it is missing, of another shape or type, or not finite where it must be.
-    """
+    """A named tensor of a saved model, of any shape for `None`; `ModelError` unless it fits and is finite."""
     if name not in tensors:
         raise ModelError(f"{source}: tensor {name!r} is missing")
     value = tensors[name]

@@ -67,11 +67,7 @@ def at_rest(system: ConstrainedSystem) -> Motion:
 
 
 def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = None) -> Motion:
-    """The logged motion of one trajectory, with the force of a model or else the logged multiplier.
-
-    Raises:
-        DataError: no rows, or they do not fit the robot.
-    """
+    """The logged motion, with a model's force or the logged one; `DataError` unless it fits the robot."""
     data = data.select(system.robot.joint_names)
     if not len(data):
         raise DataError("there is no motion to look at", expected="one row or more", got="none")
@@ -90,11 +86,10 @@ def with_rollout(motion: Motion, path: Rollout) -> Motion:
     return replace(motion, paths=[*motion.paths, *paths])
 
 
-def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float, seed: int = 0) -> Rollout:
+def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float) -> Rollout:
     """A model rolled out under the logged torques from the first state of a trajectory."""
     options = RolloutOptions(sampling_period(data), on_divergence="keep")
-    drawn = samples if model.has_function_samples else 0
-    return replayed(model, data, drawn, seconds, seed=seed, options=options)
+    return replayed(model, data, samples if model.has_function_samples else 0, seconds, options=options)
 
 
 def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:

@@ -17,8 +17,7 @@ from forcegp.constraints import Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.constraints.surface import Surface
 from forcegp.files import write_text
 from forcegp.report.animation import animation, animation_source, arm_points, rounded
-from forcegp.report.html import render
-from forcegp.report.style import INK
+from forcegp.report.page import INK, render
 from forcegp.rollout.comparison import tip_of
 from forcegp.view.motion import LOGGED, MEAN, Force, Motion
 from forcegp.view.shapes import Array, Shape, box, cylinder, sphere, turn_z

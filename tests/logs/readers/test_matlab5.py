@@ -14,7 +14,7 @@ from scipy import sparse
 
 from forcegp import limits
 from forcegp.errors import DataError
-from forcegp.logs.readers.matlab5 import DTYPES, HEADER_BYTES, MATRIX, Variable, variables
+from forcegp.logs.readers.arrays import DTYPES, HEADER_BYTES, MATRIX, Variable, variables
 
 CONTENT = {
     "eye": np.eye(3),

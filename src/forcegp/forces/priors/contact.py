@@ -154,8 +154,8 @@ class SlidingFrictionPrior(SurfaceForcePrior):
 
     λ = max(λ_K, 0) / (1 + μ̂ g) with the multiplier λ_K of the analytical forces Q_K + τ without friction and
     g = −Lᵀ J_Eᵀ s(v). This is exact for one contact whose friction is −μ̂ λ s(v). Otherwise it misses terms
-    of second order: μ (μ − μ̂), μ times any other friction of the contact, and μ times unknown joint forces or
-    the friction of other contacts. Where unknown joint forces are large, prefer `dry`, or learn them as
+    of second order: μ (μ − μ̂), μ times any other friction of the contact, and μ times unknown joint forces
+    or the friction of other contacts. Where unknown joint forces are large, prefer `dry`, or learn them as
     analytical parameters, which λ_K follows.
 
     Args:

@@ -47,13 +47,10 @@ def read(
     rows: int | None = None,
     progress: Progress | None = None,
 ) -> LogTable:
-    """Read a log of any format that is known.
+    """Read a log, a file or a folder, of any format that is known.
 
-    Args:
-        path: file or folder.
-        wanted: which columns to read; default all.
-        rows: read no more rows than this, where the format allows to stop early.
-        progress: called with the work done and the total.
+    Columns are read if `wanted`, rows up to `rows` where the format allows it; `progress` gets done and
+    total.
 
     Raises:
         DataError: no such file, a format that is not read or not safe, damage, or a size beyond the limits.

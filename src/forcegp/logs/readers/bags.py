@@ -105,7 +105,11 @@ class Collector:
         """Take one message; `DataError` if it is too large, or its arrays do not fit its joint names."""
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
-        values = _joint_state(self.source, topic, message) if kind == JOINT_STATE else _wrench(message)
+        if kind == JOINT_STATE:
+            values = _joint_state(self.source, topic, message)
+        else:
+            parts = {"force": message.wrench.force, "torque": message.wrench.torque}
+            values = {f"{part}.{axis}": getattr(x, axis) for part, x in parts.items() for axis in "xyz"}
         stream = self._streams.setdefault((topic, frozenset(values)), Messages(topic, tuple(values)))
         stamp = message.header.stamp
         stream.rows.append([values[column] for column in stream.columns])
@@ -159,11 +163,6 @@ def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
         numbers = numbers if len(numbers) else [np.nan] * len(names)
         values |= {f"{quantity}.{name}": float(x) for name, x in zip(names, numbers, strict=True)}
     return values
-
-
-def _wrench(message: Any) -> dict[str, float]:
-    parts = {"force": message.wrench.force, "torque": message.wrench.torque}
-    return {f"{part}.{axis}": getattr(vector, axis) for part, vector in parts.items() for axis in "xyz"}
 
 
 def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:

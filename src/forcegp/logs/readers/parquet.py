@@ -36,10 +36,7 @@ def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 def read_columns(
     paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
 ) -> dict[str, Column]:
-    """The columns of one or more files one after another; `remarks` gets a sentence for each one left out.
-
-    A list column is wanted by its name, or by `name[i]`.
-    """
+    """Columns of files one after another, of lists by name or `name[i]`; `remarks` gets what is left out."""
     import pyarrow.parquet as pq
 
     chunks: dict[str, list[Column]] = {}
@@ -139,44 +136,34 @@ MAX_INFO_BYTES = 4 << 20
 
 
 def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the columns of numbers of all episodes; `observation.state` of six motors becomes six columns.
-
-    The columns are named as in `meta/info.json`: `observation.state.<motor>`, or `observation.state[i]`
-    where the motors have no names. Images and videos are not read.
-    """
+    """Read the numbers of all episodes, with the names in `meta/info.json`: `observation.state.<motor>`."""
     description, *files = within(
         path, [path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))]
     )
-    features = _features(description)
+    guards.check_count(str(description), "bytes", description.stat().st_size, MAX_INFO_BYTES)
+    try:
+        features = json.loads(description.read_text(encoding="utf-8"))["features"]
+        if not isinstance(features, dict):
+            raise TypeError("features is not a table")
+    except (ValueError, KeyError, TypeError, RecursionError) as cause:
+        raise DataError(
+            f"{description}: not the description of a LeRobot data set",
+            expected="JSON with 'features'",
+            got=str(cause)[:200],
+        ) from cause
     guards.check_count(str(path), "files", len(files), limits.LOG_FILES)
     if not files:
         raise DataError(f"{path}: no episodes", expected=f"Parquet files below {path / 'data'}")
     names = {
         f"{feature}[{i}]": f"{feature}.{motor}"[: limits.LOG_NAME]
-        for feature, description in features.items()
-        for i, motor in enumerate(_motors(description))
+        for feature, columns in features.items()
+        for i, motor in enumerate(_motors(columns))
     }
     remarks: list[str] = []
     with guards.foreign(str(path), "a LeRobot data set"):
         columns = read_columns(files, lambda n: wanted(names.get(n, n)), rows, remarks, progress)
     renamed = {names.get(name, name): values for name, values in columns.items()}
     return LogTable(str(path), "lerobot", (Stream("", renamed),), tuple(remarks))
-
-
-def _features(file: Path) -> dict[str, Any]:
-    guards.check_count(str(file), "bytes", file.stat().st_size, MAX_INFO_BYTES)
-    try:
-        info = json.loads(file.read_text(encoding="utf-8"))
-        features = info["features"]
-        if not isinstance(features, dict):
-            raise TypeError("features is not a table")
-    except (ValueError, KeyError, TypeError, RecursionError) as cause:
-        raise DataError(
-            f"{file}: not the description of a LeRobot data set",
-            expected="JSON with 'features'",
-            got=str(cause)[:200],
-        ) from cause
-    return features
 
 
 def _motors(description: Any) -> list[str]:

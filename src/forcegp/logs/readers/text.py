@@ -41,10 +41,8 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a text table is written, after `first_line` lines without numbers.
-
-    Each column is a `number`, `bool`, `date`, `text` or `empty`; a line below the heading may declare units.
-    """
+    """How a text table is written from `first_line` on: columns are `number`, `bool`, `date`, `text` or
+    `empty`."""
 
     encoding: str
     separator: str
@@ -277,10 +275,7 @@ ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".asc")
 
 
 def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the tables of a folder; a column is `file[i]`, or `file.heading` where the file has headings.
-
-    Files with the same number of rows share a clock and make one stream.
-    """
+    """Read the tables of a folder as `file[i]` or `file.heading`; those of as many rows make one stream."""
 
     def in_file(file: Path, column: str) -> str:
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"
