@@ -34,7 +34,7 @@ from forcegp.gp.exact import ExactPosterior, require_exact_fits
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
 from forcegp.gp.kernels import sub
-from forcegp.gp.likelihood import bound_of, negative_bound, negative_log_likelihood
+from forcegp.gp.likelihood import negative_log_likelihood, negative_log_likelihood_of_weights
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sums import Sums, accumulate, add_over_processes, reduce_sums
 
@@ -252,10 +252,10 @@ class Problem:
         return torch.cat(squares).mean(0).sqrt()
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
-        """Of the rows, exact or as the collapsed bound, with their constant."""
-        if self.inducing is not None:
-            return negative_bound(self.priors, params, rows.blocks, self.inducing) + rows.constant
-        return negative_log_likelihood(self.priors, params, rows.blocks) + rows.constant
+        """Of the rows, with their constant; of the weights of features where inference is sparse."""
+        exact = self.inducing is None
+        of = negative_log_likelihood if exact else negative_log_likelihood_of_weights
+        return of(self.priors, params, rows.blocks) + rows.constant
 
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
         """The rows at learned and held tensors; computed once where they are those as given."""
@@ -466,8 +466,7 @@ def log_likelihood(posterior: ForcePosterior) -> float:
     latent = posterior.latent
     if isinstance(latent, ExactPosterior):
         return float(latent.log_likelihood())
-    assert isinstance(latent, SparsePosterior)
-    return -float(bound_of(latent.sums, latent))
+    return -latent.negative_bound
 
 
 def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[str, ...]]:

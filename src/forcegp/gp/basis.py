@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.factor import Spectrum
-from forcegp.gp.features import FeatureMap, Features, points
+from forcegp.gp.features import Block, FeatureMap, Features, points
 from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sides, sub
 
 EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
@@ -145,11 +145,6 @@ class ProcessBasis:
         device = next(iter(self.inducing.values())).device
         return self.used.reshape(-1).nonzero()[:, 0].to(device)
 
-    @cached_property
-    def owner(self) -> Tensor:
-        """The component of each basis function `(Σ sizes,)`."""
-        return self.used.nonzero()[:, 0].to(self.columns.device)
-
     def values(self, features: Features) -> tuple[Tensor, Tensor]:
         """V(x) filled up with zeros `(components, n, width)`; |V|² of inducing points `(components, n)`."""
         if self.to_inducing is None:
@@ -263,12 +258,6 @@ class LatentBasis:
         """Number of basis functions in all."""
         return self.columns[-1].stop
 
-    @cached_property
-    def owner(self) -> Tensor:
-        """The component of each basis function `(size,)`, of the components of all processes in order."""
-        pairs = zip(self.parts, self.components, strict=True)
-        return torch.cat([part.owner + among.start for part, among in pairs])
-
     def tensors(self) -> dict[str, Tensor]:
         """Inducing points and eigenvectors, by name.
 
@@ -308,6 +297,11 @@ class LatentBasis:
         """The basis functions of process p."""
         slices = self.columns[self.components[p]]
         return slice(slices[0].start, slices[-1].stop)
+
+    def rows(self, block: Block) -> Tensor:
+        """The rows of samples in terms of the basis functions, Φ `(n r, size)`."""
+        each = zip(self.parts, block.operators, block.features, strict=True)
+        return torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in each], dim=-1)
 
     def evaluate(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
         """Basis functions at n samples.

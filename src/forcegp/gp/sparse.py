@@ -15,6 +15,7 @@ information form, with A = I + G, v, the drifting weights p and the others o,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -185,6 +186,16 @@ class SparsePosterior:
     def weights(self) -> Tensor:
         """A⁻¹v, the posterior mean of the basis functions' weights `(size,)`."""
         return torch.cholesky_solve(self.moments.v[:, None], self.L)[:, 0]
+
+    @property
+    def negative_bound(self) -> float:
+        """The negative collapsed bound, no smaller than the exact negative log likelihood (Titsias 2009)."""
+        # −F = ½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ], log|A| = 2 Σ log L_ii
+        moments = self.moments
+        fit = moments.yy - moments.v @ self.weights
+        log_determinant = 2.0 * self.L.diagonal().abs().log().sum()
+        constant = moments.rows * math.log(2.0 * math.pi)
+        return float(0.5 * (fit + log_determinant + constant + moments.missed.sum()))
 
     @property
     def residual(self) -> float:

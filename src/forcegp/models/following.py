@@ -23,7 +23,6 @@ import torch
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.priors.inertial import PayloadPrior
-from forcegp.gp.likelihood import bound_of
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.structured_fit import StructuredFit
 
@@ -110,4 +109,4 @@ def _evidence(fit: StructuredFit) -> float:
     """log p of the rows, up to what both hypotheses share."""
     latent = fit.posterior.latent
     assert isinstance(latent, SparsePosterior)
-    return -float(bound_of(latent.moments, latent))
+    return -latent.negative_bound
