@@ -292,29 +292,14 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
     return torch.where(scale > 0.0, cross / scale.where(scale > 0.0, 1.0), 0.0).clamp(-1.0, 1.0)
 
 
-@dataclass(frozen=True)
-class Doubts:
-    """What a fit is doubtful about.
-
-    Attributes:
-        correlation: mean correlation of Q and Q_z over some of the training states, where both have priors.
-        warnings: each with a remedy.
-    """
-
-    correlation: float | None
-    warnings: tuple[str, ...]
-
-
 def doubts_of(
-    posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float = 1.0
-) -> Doubts:
-    """What a posterior is doubtful about, at some of its training states in contact and on the whole.
+    posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float
+) -> tuple[float | None, tuple[str, ...]]:
+    """Doubts about a posterior of rows to a power, at training states in contact and on the whole.
 
-    Args:
-        posterior: over latent forces.
-        system: robot and contacts.
-        training: what the posterior is conditioned on.
-        power: κ, by which the rows of the posterior are tempered.
+    Returns:
+        Mean correlation of Q and Q_z over some of these states, where both have priors; and warnings, each
+        with a remedy.
     """
     few = training.evenly(min(CORRELATION_STATES, training.samples)).measurements if training.samples else ()
     # Elsewhere Q_z is zero, and there is no multiplier.
@@ -357,7 +342,7 @@ def doubts_of(
             f"the covariance was factorised with a jitter of {jitter:.2g} times the noise variance: "
             "drop duplicated rows, or state a larger noise",
         )
-    return Doubts(correlation, warnings)
+    return correlation, warnings
 
 
 def _on_multiplier(mean: Tensor, variance: Tensor) -> tuple[str, ...]:

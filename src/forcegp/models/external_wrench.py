@@ -255,13 +255,7 @@ class Reading:
 
 
 def velocity_noise(data: Dataset) -> Tensor:
-    """Standard deviation of the white noise of each joint's velocity in a log, `(nq,)`.
-
-    From the departure of each sample from the cubic through its four neighbours, whose variance is 35/18 σ²;
-    its median absolute value does not see jumps.
-
-    Args:
-        data: a log in order of time, evenly sampled.
+    """`white_noise_std` of each joint's velocity in a log in order of time, evenly sampled, `(nq,)`.
 
     Raises:
         DataError: no five samples follow each other.
@@ -269,6 +263,16 @@ def velocity_noise(data: Dataset) -> Tensor:
     whole = data.segment[4:] == data.segment[:-4]
     if not bool(whole.any()):
         raise DataError("velocity noise cannot be estimated", expected="five samples of one trajectory")
-    a, b, middle, c, d = (data.qd[k : len(data) - 4 + k][whole] for k in range(5))
+    return white_noise_std(data.qd, whole).clamp(min=LEAST_NOISE)
+
+
+def white_noise_std(x: Tensor, whole: Tensor) -> Tensor:
+    """Standard deviation σ of the white noise of each column of a smooth signal `(n, d)`, `(d,)`.
+
+    x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6, the departure from the cubic through the neighbours,
+    has the variance 35/18 σ²; its median absolute value does not see jumps. `whole` `(n − 4,)` bool are the
+    first of five samples that follow each other.
+    """
+    a, b, middle, c, d = (x[k : len(x) - 4 + k][whole] for k in range(5))
     departure = middle - (4.0 * (b + c) - a - d) / 6.0
-    return (MAD_TO_STD * departure.abs().median(0).values / (35.0 / 18.0) ** 0.5).clamp(min=LEAST_NOISE)
+    return MAD_TO_STD * departure.abs().median(0).values / (35.0 / 18.0) ** 0.5

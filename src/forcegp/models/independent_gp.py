@@ -133,8 +133,7 @@ class IndependentGP(Model["IndependentFit"]):
             data: states and measured accelerations.
             options: optimiser and its limits, for each joint.
             progress: called after each evaluation, with those of all joints.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
-                Remove it once the fitted model is saved.
+            checkpoint: see `Model.fit`.
 
         Raises:
             ModelError, DataError: the data do not fit the model.

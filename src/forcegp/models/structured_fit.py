@@ -543,14 +543,14 @@ def conditioned(
     likelihood, jitter = log_likelihood(posterior) - float(constant), posterior.latent.jitter
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     training, system = problem.training, problem.system_at(hyperparameters)
-    doubts = doubts_of(posterior, system, training, problem.power)
+    correlation, doubts = doubts_of(posterior, system, training, problem.power)
     result = FitResult(
         **learned.outcome,
         log_marginal_likelihood=likelihood,
         jitter=jitter,
         constant_inputs=constant_inputs(problem),
-        force_correlation=doubts.correlation,
-        warnings=(*warnings, *learned.doubts, *doubts.warnings, *more_points),
+        force_correlation=correlation,
+        warnings=(*warnings, *learned.doubts, *doubts, *more_points),
         samples=training.all_samples,
         learned_on=learned_on,
         never_closed=training.never_closed(system),

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import UnknownNameError
-from forcegp.forces.calibration import calibrated_noise, likelihood_power, residual_times
+from forcegp.forces.calibration import calibrated_noise, residual_times
 from forcegp.forces.friction_memory import MEMORY, memory_of
 from forcegp.forces.inertia import Inertia, inertia_of, with_updated_robot
 from forcegp.forces.inverse_dynamics import LEAST
@@ -451,7 +451,8 @@ def solve(
     if spec.noise.degrees_of_freedom is not None:
         part, learned = with_learned_weights(part, search, learned, spec.noise.degrees_of_freedom, progress)
     if correlated:
-        part = dataclasses.replace(part, power=likelihood_power(part, search.values(learned)))
+        power, _ = residual_times(part, search.values(learned), part.training)
+        part = dataclasses.replace(part, power=power)
         learned = search.solve(part, progress, learned.tensors)
     values = search.values(learned)
     if calibrated and any(isinstance(prior, InertialPrior) for prior in part.priors):

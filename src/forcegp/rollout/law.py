@@ -44,7 +44,7 @@ from forcegp.forces.priors.contact import (
 )
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import ForceField, States, affine_map
-from forcegp.rollout.cone import accelerating, arrested, may_stick, sliding_away, sticking_contacts
+from forcegp.rollout.cone import accelerating, arrested, sliding_away, sticking_contacts
 from forcegp.rollout.inputs import ForwardModel, Inputs, Reached
 
 REGULARIZATION = 1e-10
@@ -377,7 +377,7 @@ class RolloutProblem:
     @cached_property
     def rough(self) -> Mapping[str, float]:
         """Contacts that may stick and have friction, with the speed from which it is that of sliding."""
-        speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in may_stick(self.system)}
+        speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in self.system.may_stick}
         known = self.law.rough if speeds else {}
         return {name: max(speeds[name], known[name]) for name in speeds if name in known}
 
@@ -392,8 +392,7 @@ class RolloutProblem:
         tau = self.inputs.torque(state.t, end, Reached(self.system, eom, state.q, state.qd))
         at, h = States(state.q, state.qd, tau, state.active, eom), end - state.t
         now, rough = self._instant(at, h), self.rough
-        sticks = sticking_contacts(self.system, at, rough)
-        if not bool(sticks.any()):
+        if not rough or not bool((sticks := sticking_contacts(self.system, at, rough)).any()):
             return now
         away = sliding_away(self.system, at, now.multiplier, sticks, rough)
         if not self._known:
