@@ -61,7 +61,6 @@ def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0
 
     Args:
         x: `(n, d)` in the order of time, with mean zero.
-        segment: `(n,)`.
         white: variance of white noise in x, which is not counted.
     """
     longest = int(segment.unique(return_counts=True)[1].max())
@@ -86,7 +85,6 @@ def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | f
 
     Args:
         x: `(n, d)` in the order of time, with mean zero.
-        segment: `(n,)`.
         length: L, several times the autocorrelation time.
         white: variance of white noise in x, which is not counted.
     """
@@ -206,8 +204,6 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
     mean(r_i² / (Σ_k P_ik² s_k² + Var r_i)) = 1 over all samples at which P_ii is more than a half.
 
     Args:
-        problem: what was learned.
-        hyperparameters: learned tensors.
         least: the learned standard deviation, which is kept where the errors ask for less.
     """
     parts = []

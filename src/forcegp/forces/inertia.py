@@ -241,7 +241,6 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
     friction explains is no noise.
 
     Args:
-        rows: the samples.
         M: mass matrix of the file at the samples.
         found: inertia of drives that torques ask for.
     """

@@ -62,8 +62,6 @@ class ForceProcess:
         """A quantity as rows of the latent forces.
 
         Args:
-            system: robot and contacts.
-            at: n states.
             z: the quantity, with Coulomb friction of contacts.
 
         Returns:
@@ -137,8 +135,6 @@ class ForcePosterior:
         """A quantity at n states as rows of the processes, with its prior mean as target.
 
         Args:
-            system: robot and contacts.
-            at: n states.
             z: the quantity, without Coulomb friction of contacts.
         """
         # W = B E, target o + B m (eqs. 12 and 15)
@@ -183,8 +179,6 @@ class ForceSamples:
         """Sampled joint force Q and dissipative contact force Q_z.
 
         Args:
-            system: robot and contacts.
-            at: n states.
             sample: `(n,)` which sample each state belongs to; all samples at all states by default.
 
         Returns:
@@ -206,7 +200,6 @@ class ForceSamples:
         """Q̄ = Q + Q_z of one sample per trajectory, the force field of a rollout.
 
         Args:
-            system: robot and contacts.
             at: samples × k states, of which the s-th run of k belongs to sample s.
 
         Returns:
@@ -247,8 +240,6 @@ def draw_samples(
     """Draw force functions from the posterior.
 
     Args:
-        posterior: what to draw from.
-        count: number of functions.
         generator: source of randomness, on the CPU.
         features: random features per component; by default as many as the kind of posterior needs.
     """
@@ -273,11 +264,6 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 
     corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which accelerations
     never show, is left out.
-
-    Args:
-        posterior: over latent forces.
-        system: robot and contacts.
-        at: n states.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)

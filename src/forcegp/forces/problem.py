@@ -326,8 +326,6 @@ def total_over(
 
     Args:
         problem: robot, priors and noise; its own training data are not read.
-        hyperparameters: learned and held.
-        basis: basis functions.
         pieces: the samples; may be a generator.
         begin: totals of the pieces before.
         after: called after each piece.
@@ -408,7 +406,6 @@ def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit
 
     Args:
         problem: with the samples that are conditioned on.
-        hyperparameters: of the priors.
         limit: maximum number of inducing points of one prior.
     """
     training = problem.training
@@ -459,14 +456,6 @@ def forces_and_constant(
     # f | y ~ N(k Wᵀ Σ⁻¹ y, k − k Wᵀ Σ⁻¹ W k), Σ = W k Wᵀ + I (eqs. 22 to 24)
     latent = ExactPosterior.of(problem.priors, params, rows.blocks)
     return ForcePosterior(problem.process_at(hyperparameters), latent), rows.constant
-
-
-def log_likelihood(posterior: ForcePosterior) -> float:
-    """log p(y) of the rows without their constant, or its lower bound."""
-    latent = posterior.latent
-    if isinstance(latent, ExactPosterior):
-        return float(latent.log_likelihood())
-    return -latent.negative_bound
 
 
 def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[str, ...]]:

@@ -32,11 +32,7 @@ class KernelPart:
     params: Parameters
 
     def features(self, x: Features) -> FeatureMap:
-        """φ of a finite part: features whose products are the kernel exactly.
-
-        Args:
-            x: any inputs, whose widths count.
-        """
+        """φ of a finite part: features whose products are the kernel exactly."""
         # Such a draw takes no random number, so any generator does.
         return self.kernel.draw(self.params, x, 1, torch.Generator())
 
@@ -195,7 +191,6 @@ class ProcessBasis:
         """k(x, x) of the whole kernel `(components, n)`.
 
         Args:
-            features: kernel inputs.
             values: V(x), as `values` gives it.
         """
         # k(x, x) = k_rest(x, x) + |φ(x)|²
@@ -327,8 +322,6 @@ def latent_basis(
     """Basis functions of processes with given inducing points.
 
     Args:
-        processes: the processes.
-        params: log-hyperparameters, `<process>.<name>`.
         inducing: kernel inputs of the inducing points of each process, of any number, none included.
         components: number of components of each process.
     """

@@ -101,7 +101,6 @@ def draw_priors(
     Args:
         processes, params, blocks: as given to `gram`.
         measured: whether any row depends on each process.
-        count: number of functions.
         generator: source of randomness, on the CPU.
         features: random features per component.
 
@@ -134,8 +133,6 @@ def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> 
     length-scales all components share is evaluated once for all of them, and so is a product of such terms.
 
     Args:
-        kernel: the kernel, of k components.
-        params: its log-hyperparameters.
         X: n points.
         w: `(k, n, samples)`.
 
@@ -199,7 +196,6 @@ def draw_functions(
     """Functions with given weights of the basis functions, and what these miss drawn from the prior.
 
     Args:
-        basis: basis functions.
         weights: drawn from their posterior `(size, samples)`.
         generator: source of randomness, on the CPU.
         features: random features of each component's prior.

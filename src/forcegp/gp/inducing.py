@@ -60,9 +60,6 @@ def select_inducing(
     A process that no row shows, or whose kernel has a finite number of features, gets none.
 
     Args:
-        processes: the processes.
-        params: log-hyperparameters.
-        blocks: the candidates.
         rows: number of rows that will be conditioned on, of which these are a part; all by default.
         limit: most points of one process.
         share: missed variance of all rows, as a fraction of what the noise leaves of them, at which to stop.

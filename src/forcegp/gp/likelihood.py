@@ -255,11 +255,6 @@ def negative_log_likelihood(priors: Sequence[Process], params: Parameters, block
 
     Value and gradient come from one factorisation.
 
-    Args:
-        priors: the force priors.
-        params: log-hyperparameters, `<prior>.<name>`.
-        blocks: whitened rows.
-
     Returns:
         The scalar.
 

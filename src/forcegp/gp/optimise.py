@@ -155,11 +155,8 @@ def minimise(
 
     Args:
         objective: maps the tensors to a scalar, differentiably.
-        start: initial tensors by name.
-        options: how to learn.
         analytical: names of the analytical parameters θ_A, which have an ADAM of their own.
         bounds: box of each tensor, for L-BFGS.
-        progress: called after each evaluation.
         first_step: largest change of an entry in the first step of L-BFGS in a box.
 
     Raises:

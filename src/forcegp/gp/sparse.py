@@ -150,11 +150,6 @@ class SparsePosterior:
     ) -> SparsePosterior:
         """The posterior that `tensors` belong to.
 
-        Args:
-            processes: the processes.
-            params: log-hyperparameters.
-            tensors: as given by `tensors`.
-
         Raises:
             ModelError: a tensor is missing, or does not fit the processes.
         """
@@ -188,14 +183,14 @@ class SparsePosterior:
         return torch.cholesky_solve(self.moments.v[:, None], self.L)[:, 0]
 
     @property
-    def negative_bound(self) -> float:
-        """The negative collapsed bound, no smaller than the exact negative log likelihood (Titsias 2009)."""
-        # −F = ½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ], log|A| = 2 Σ log L_ii
+    def log_likelihood(self) -> float:
+        """The collapsed bound of log p(y), no larger than that of exact inference (Titsias 2009)."""
+        # F = −½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ], log|A| = 2 Σ log L_ii
         moments = self.moments
         fit = moments.yy - moments.v @ self.weights
         log_determinant = 2.0 * self.L.diagonal().abs().log().sum()
         constant = moments.rows * math.log(2.0 * math.pi)
-        return float(0.5 * (fit + log_determinant + constant + moments.missed.sum()))
+        return -float(0.5 * (fit + log_determinant + constant + moments.missed.sum()))
 
     @property
     def residual(self) -> float:
@@ -322,7 +317,6 @@ class SparsePosterior:
         """Functions from the posterior.
 
         Args:
-            count: number of functions.
             generator: source of randomness, on the CPU.
             features: random features per component.
         """

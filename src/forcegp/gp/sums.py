@@ -120,7 +120,6 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
     """Sum over the samples of blocks, in memory that does not depend on their number.
 
     Args:
-        basis: basis functions.
         blocks: whitened rows; may be a generator.
         chunk: samples whose basis functions are held at a time.
     """

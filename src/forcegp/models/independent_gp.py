@@ -193,7 +193,7 @@ def fitted(
     processes = training.processes()
     posteriors = tuple(ExactPosterior.of([prior], hyperparameters, [block]) for prior, block, _ in processes)
     pairs = zip(posteriors, processes, strict=True)
-    value = sum(float(p.log_likelihood() - constant) for p, (_, _, constant) in pairs)
+    value = sum(p.log_likelihood - float(constant) for p, (_, _, constant) in pairs)
     ended = zip(model.system.robot.joint_names, parts, strict=False)
     result = FitResult(
         converged=all(part.converged for part in parts),

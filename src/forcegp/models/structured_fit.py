@@ -32,7 +32,6 @@ from forcegp.forces.problem import (
     Problem,
     forces_and_constant,
     is_sparse,
-    log_likelihood,
     lost_by_inducing,
     typical,
 )
@@ -525,11 +524,6 @@ def conditioned(
     """Condition forces on the data of a problem at given hyperparameters.
 
     Args:
-        specification: what is conditioned.
-        problem: data, robot and inference.
-        hyperparameters: of priors, noise and robot.
-        learned: how they were learned.
-        warnings: doubts that have come up.
         learned_on: number of samples that they were learned on.
         forces: result of conditioning, where the data of the problem are only a part of the log.
 
@@ -540,7 +534,7 @@ def conditioned(
     noise = {m.quantity: typical(problem.noise_at(hyperparameters, i)) for i, m in measured}
     posterior, constant = forces or forces_and_constant(*problem.with_coulomb_errors(hyperparameters))
     lost, more_points = lost_by_inducing(posterior)
-    likelihood, jitter = log_likelihood(posterior) - float(constant), posterior.latent.jitter
+    likelihood, jitter = posterior.latent.log_likelihood - float(constant), posterior.latent.jitter
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     training, system = problem.training, problem.system_at(hyperparameters)
     correlation, doubts = doubts_of(posterior, system, training, problem.power)

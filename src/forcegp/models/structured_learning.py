@@ -358,13 +358,7 @@ def learned(
     """Learn what is free in a search, and record it; where nothing is free, prepare the problem alone.
 
     Args:
-        spec: the model.
-        problem: all samples.
-        search: what is learned and what is held.
         file: records the evaluations; learning that finds it goes on from there, to the same bits.
-        progress: called after each evaluation.
-        begin: where to begin.
-        neighbours: see `solve`.
 
     Raises:
         ModelError: the file belongs to other learning.
@@ -427,11 +421,6 @@ def solve(
     """Learn what is free in a search, then prepare the problem that is conditioned on.
 
     Args:
-        spec: the model.
-        problem: all samples.
-        search: what is learned and what is held.
-        progress: called after each evaluation.
-        begin: where to begin.
         neighbours: samples as close in time as those of the log, where those of the problem are a part of it.
     """
     part = subset(spec, problem)

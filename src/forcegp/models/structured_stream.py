@@ -57,7 +57,6 @@ class Sample:
         """Contiguous stretches of the log as training data.
 
         Args:
-            spec: the model.
             training: the sample, whose input scales are kept.
 
         Returns:

@@ -38,8 +38,6 @@ def sliding_away(
     """The states where contacts that stick start to slide against the force that would hold them.
 
     Args:
-        system: robot and contacts.
-        at: n states.
         multiplier: λ `(n, m)` of sticking.
         slides: `(n, n_contacts)` bool, which contacts slide.
         speeds: at which, by name [m/s].
@@ -83,7 +81,6 @@ def arrested(
     The impulse is that of an impact on the tangential rows, q̇ ← q̇ − L A q̇.
 
     Args:
-        system: robot and contacts.
         rough: contacts with friction.
         before, after: the equations of motion at both ends of the step.
         closed: `(n, n_contacts)` bool, contacts that are closed at both.

@@ -91,8 +91,6 @@ def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFricti
     """A force field at states with the dry friction of joints apart.
 
     Args:
-        system: robot and contacts.
-        at: n states.
         force: posterior mean, samples, or a prior mean alone, Q̄.
 
     Example:
