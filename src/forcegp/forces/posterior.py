@@ -173,29 +173,6 @@ class ForceSamples:
         """Number of samples."""
         return self.functions.count
 
-    def forces(
-        self, system: ConstrainedSystem, at: States, sample: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Sampled joint force Q and dissipative contact force Q_z.
-
-        Args:
-            sample: `(n,)` which sample each state belongs to; all samples at all states by default.
-
-        Returns:
-            Q and Q_z `(samples, n, nq)`, or `(n, nq)` where `sample` is given [N m, N].
-        """
-        # Q = m + Σ E f over joint forces, Q_z = Σ E f over contact forces (eq. 18)
-        Q = self.posterior.process.mean(system, at)
-        Q = Q if sample is not None else Q.expand(self.count, *Q.shape)
-        Q_z = torch.zeros_like(Q)
-        for p, prior in enumerate(self.posterior.priors):
-            features = self.posterior.process.features(p, system, at)
-            latent = self.functions.latent(p, features, sample) + self.posterior.shift(p, features)
-            force = (prior.operator(system, at) @ latent[..., None])[..., 0]
-            Q, Q_z = (Q, Q_z + force) if prior.target == CONTACT else (Q + force, Q_z)
-        # Q_z ← Q̄ − Q, with Coulomb friction in Q̄
-        return Q, with_coulomb(system, at, Q + Q_z, self.posterior.process.coulomb) - Q
-
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Q̄ = Q + Q_z of one sample per trajectory, the force field of a rollout.
 
