@@ -58,7 +58,7 @@ HALVINGS = 40
 """Steps that find the least inertia across an axis."""
 MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """The inertial parameters of a link, about its origin [kg, kg m, kg m²]."""
-FIGURES = ("damping", "friction", "armature", *MOMENTS)
+FIGURES = ("damping", "friction", *MOMENTS, "armature")
 """Names of the figures of a joint."""
 
 
@@ -263,10 +263,13 @@ class _Reader:
 
     @property
     def scale(self) -> Tensor | None:
-        """Prior standard deviation of the inertial parameters `(nq, 10)`; `None` where they were kept."""
+        """Prior standard deviations of links and drives `(nq, 11)`; `None` where all was kept."""
+        robot = self.fit.system.robot
         for prior in self.fit.force_priors:
             if isinstance(prior, InertialPrior):
-                return prior.scale(self.fit.system.robot).reshape(-1, len(MOMENTS))
+                links = prior.scale(robot)[: robot.nq * len(MOMENTS)].view(-1, len(MOMENTS))
+                drives = links.new_tensor(prior.drives or robot.nq * [0.0])
+                return torch.cat([links, drives[:, None]], dim=-1)
         return None
 
     def robots(self, draws: int) -> list[tuple[RobotModel, Curve]]:
@@ -327,7 +330,11 @@ class _Reader:
         damping, friction, left, offset = _projected(self.speeds, curve)
         robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction)
         if self.scale is not None:
-            robot = _moved(robot, delta.reshape(self.scale.shape) * self.scale)
+            links, drives = delta.split([robot.nq * len(MOMENTS), delta.numel() - robot.nq * len(MOMENTS)])
+            robot = _moved(robot, links.view(robot.nq, -1) * self.scale[:, :-1])
+            if len(drives):
+                armature = (robot.armature + drives * self.scale[:, -1]).clamp(min=0.0)
+                robot = robot.replace(armature=armature)
         prior = next((p for p in self.fit.force_priors if isinstance(p, PayloadPrior)), None)
         if prior is not None:
             robot = prior.around(load).loaded(robot)
@@ -434,8 +441,9 @@ def _physical(inertia: Tensor) -> bool:
 
 def _figures(robot: RobotModel) -> Tensor:
     """The figures of each joint that a fit may change `(nq, 13)`, in the order of `FIGURES`."""
-    drives = torch.stack([robot.damping, robot.friction, robot.armature], dim=-1)
-    return torch.cat([drives, inertial_parameters(robot.mass, robot.com, robot.inertia)], dim=-1)
+    friction = torch.stack([robot.damping, robot.friction], dim=-1)
+    links = inertial_parameters(robot.mass, robot.com, robot.inertia)
+    return torch.cat([friction, links, robot.armature[:, None]], dim=-1)
 
 
 def _parameters(
@@ -445,7 +453,7 @@ def _parameters(
     before, after = _figures(file), _figures(robot)
     std, prior = torch.stack([_figures(each) for each in samples]).std(0), after.abs()
     if scale is not None:
-        prior[:, -len(MOMENTS) :] = scale
+        prior[:, 2:] = scale
     determined = (std > 0.0) & (std <= DETERMINED * prior)
     columns = [x.T.flatten().tolist() for x in (before, after, std, determined)]
     named = ((joint, name) for name in FIGURES for joint in robot.joint_names)

@@ -243,7 +243,7 @@ def trained(
         spec: with the priors of the candidate.
         inertia: of the robot to learn with.
     """
-    spec, pinned = identified(spec) if inertia.identified else (spec, {})
+    spec, pinned = identified(spec, train) if inertia.identified else (spec, {})
     rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.options.standardize)
     few = problem = Task(spec, rows, inertia.robot, pinned).problem()
     if not is_finite(problem.priors):
