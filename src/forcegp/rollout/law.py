@@ -87,6 +87,12 @@ class DryFriction:
     damping: Tensor
 
 
+def posterior_of(force: ForceField) -> ForcePosterior | None:
+    """The posterior that a force field is the mean or a sample of, if any."""
+    force = force.posterior if isinstance(force, ForceSamples) else force
+    return force if isinstance(force, ForcePosterior) else None
+
+
 def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFriction:
     """A force field at states with the dry friction of joints apart.
 
@@ -256,9 +262,8 @@ class ForceLaw(Law):
         return at.eom.motion_under(self.force(system, at))
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
-        force = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
-        known = force.process if isinstance(force, ForcePosterior) else None
-        mean, priors = (force, ()) if known is None else (known.mean, known.priors)
+        known = posterior_of(self.force)
+        mean, priors = (self.force, ()) if known is None else (known.process.mean, known.priors)
         robot = system.robot
         in_mean = isinstance(mean, AnalyticalMean) and "friction" in mean.terms
         declared = in_mean and bool(((robot.friction != 0.0) | (robot.stribeck != 0.0)).any())
@@ -268,15 +273,15 @@ class ForceLaw(Law):
 
     @property
     def rough(self) -> Mapping[str, float]:
-        force = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
-        if not isinstance(force, ForcePosterior):
+        known = posterior_of(self.force)
+        if known is None:
             return {}
-        speeds = {p.contact: 0.0 for p in force.process.priors if isinstance(p, SurfaceForcePrior)}
-        return speeds | {f.contact: SATURATED * float(f.smoothing) for f in force.process.coulomb}
+        speeds = {p.contact: 0.0 for p in known.priors if isinstance(p, SurfaceForcePrior)}
+        return speeds | {f.contact: SATURATED * float(f.smoothing) for f in known.process.coulomb}
 
     def knows_friction(self, system: ConstrainedSystem, at: States) -> bool:
-        posterior = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
-        assert isinstance(posterior, ForcePosterior)
+        posterior = posterior_of(self.force)
+        assert posterior is not None
         with torch.no_grad():
             mean, covariance = posterior.read(system, at, affine_map(system, at, "contact_friction"))
         spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
