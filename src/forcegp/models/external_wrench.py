@@ -15,7 +15,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.data import Dataset
-from forcegp.errors import DataError, ModelError, ParameterError, UnknownNameError
+from forcegp.errors import DataError, ModelError, ParameterError, check_name
 from forcegp.forces.external_wrench import (
     MULTIPLIER_STD,
     MomentumLog,
@@ -125,8 +125,7 @@ def external_wrench(
     external: Mapping[str, float] | None = None,
 ) -> ExternalWrench:
     """The external wrench at the samples of a log; see `StructuredFit.external_wrench`."""
-    if method not in METHODS:
-        raise UnknownNameError("method of estimating a wrench", method, METHODS)
+    check_name("method of estimating a wrench", method, METHODS)
     reading = Reading.of(fit, data, frame, external)
     if method == "acceleration":
         mean, covariance = reading.from_accelerations()

@@ -14,7 +14,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.data.fields import AXES
-from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, UnknownNameError
+from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.measurements import COLUMNS
 from forcegp.forces.noise import warnings_beyond
 from forcegp.forces.quantities import FlatStates, ForceLinearization, linearize_field
@@ -194,8 +194,7 @@ def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:
         UnknownNameError: the quantity cannot be measured, or a contact of the system is not logged.
         NotLoggedError: it is not logged.
     """
-    if quantity not in COLUMNS:
-        raise UnknownNameError("measured quantity", quantity, COLUMNS)
+    check_name("measured quantity", quantity, COLUMNS)
     return COLUMNS[quantity](data, system)
 
 

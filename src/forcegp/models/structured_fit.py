@@ -14,7 +14,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import ModelError, check_name
 from forcegp.files import Record
 from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.measurements import Observation, Training
@@ -389,8 +389,7 @@ class StructuredFit(FittedModel):
         if priors is not None:
             names = [prior.name for prior in self.posterior.priors]
             for name in priors:
-                if name not in names:
-                    raise UnknownNameError("force prior to forget", name, names)
+                check_name("force prior to forget", name, names)
             return self._with(latent.drifting(factor, [names.index(name) for name in priors]))
         if not 0.0 < factor <= 1.0:
             raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)

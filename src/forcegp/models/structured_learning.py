@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.dynamics import mass_matrix
-from forcegp.errors import UnknownNameError
+from forcegp.errors import check_name
 from forcegp.forces.calibration import calibrated_noise, residual_times
 from forcegp.forces.friction_memory import MEMORY, memory_of
 from forcegp.forces.inertia import VOLUME_STATES, Inertia, inertia_of, with_updated_robot
@@ -288,8 +288,7 @@ def check_learned(spec: Specification, learn: Iterable[str]) -> None:
     """
     names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
     for name in learn:
-        if name not in names:
-            raise UnknownNameError("force prior to learn", name, names)
+        check_name("force prior to learn", name, names)
 
 
 def search_of(

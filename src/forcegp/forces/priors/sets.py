@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.errors import UnknownNameError
+from forcegp.errors import check_name
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, JointFrictionPrior, mean_of
@@ -155,6 +155,5 @@ def priors_of(
         return tuple(force_priors)
     if force_priors == "auto":
         return FEW.priors(system) if "actuation" in mean.terms else default_priors(system, mean)
-    if force_priors not in SETS:
-        raise UnknownNameError("set of force priors", force_priors, ("auto", *SETS))
+    check_name("set of force priors", force_priors, ("auto", *SETS))
     return SETS[force_priors].priors(system)
