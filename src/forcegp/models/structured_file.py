@@ -100,6 +100,7 @@ class StructuredSettings(StructuredOptions):
     mean: tuple[str, ...]
     noise: NoiseSettings
     power: float = Field(gt=0.0, le=1.0)
+    correlation_time: float = Field(default=0.0, ge=0.0)
     priors: tuple[dict[str, Any], ...]
     measured: tuple[str, ...]
     constant: tuple[tuple[str, ...], ...]
@@ -292,11 +293,14 @@ def _restored(
     system: ConstrainedSystem,
 ) -> Parts:
     """The fit with its weights as they were; the factorisation waits until a covariance is asked for."""
+    correlation = tensors.get("torque_correlation")
+    if correlation is None and settings.correlation_time > 0.0:  # older models have one for all joints
+        correlation = torch.full_like(system.robot.mass, settings.correlation_time)
     problem = dataclasses.replace(
         spec.problem(training),
         system=spec.system if spec.analytical_parameters is not None else system,
         power=settings.power,
-        correlation=tensors.get("torque_correlation"),
+        correlation=correlation,
         pinned=_below(tensors, "pinned."),
         torque_std=tensors.get("torque_std"),
     )

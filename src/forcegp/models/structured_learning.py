@@ -44,18 +44,9 @@ from forcegp.forces.noise import REGION, TORQUE_NOISE, Noise, external_std, stat
 from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import (
-    AnalyticalMean,
-    JointFrictionPrior,
-)
+from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.priors.sets import PriorSet
-from forcegp.forces.problem import (
-    Problem,
-    is_finite,
-    is_sparse,
-    with_inducing,
-    without_inducing,
-)
+from forcegp.forces.problem import Problem, is_finite, is_sparse, with_inducing, without_inducing
 from forcegp.forces.search import Search, initial
 from forcegp.gp.exact import require_exact_fits
 from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, Progress, reported

@@ -235,9 +235,4 @@ def _restored(basis: LatentBasis, tensors: Mapping[str, Tensor]) -> tuple[Latent
     """The basis and totals that `_tensors` was given; kernel inputs are in the order of the prior."""
     own = LatentBasis.of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
     sums = Sums(*(tensors[f"sums.{i}"] for i in range(len(fields(Sums)))))
-    return own, Totals(
-        sums,
-        tensors["constant"],
-        tensors["samples"],
-        int(tensors["pieces"]),
-    )
+    return own, Totals(sums, tensors["constant"], tensors["samples"], int(tensors["pieces"]))

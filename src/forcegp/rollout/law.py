@@ -36,12 +36,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, NumericalError
 from forcegp.forces.posterior import ForcePosterior, ForceSamples
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import (
-    CoulombFriction,
-    SurfaceForcePrior,
-    coulomb_response,
-    with_coulomb,
-)
+from forcegp.forces.priors.contact import CoulombFriction, SurfaceForcePrior, coulomb_response, with_coulomb
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import ForceField, States, affine_map
 from forcegp.rollout.cone import accelerating, arrested, sliding_away, sticking_contacts
